@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coview_stream.errors import MessageError
+from coview_stream.basemap.joined.map_parts import MapParts
+from coview_stream.errors import MapError, MessageError
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points
 
@@ -47,6 +48,7 @@ class MapView:
         is_ground: (N,) whether a point is the ground, not what stands on it.
         crs: coordinate reference system of the sources as text, None if it is not known.
         sha256: hash of the map.
+        parts: the maps of which it is joined, in whose frames poses are; None of one map.
     """
 
     origin: Floats
@@ -54,13 +56,15 @@ class MapView:
     is_ground: Bools
     crs: str | None
     sha256: str
+    parts: MapParts | None = None
 
     @classmethod
     def of(cls, base_map: BaseMap, count: int = POINTS_OF_FILE) -> MapView:
         """Thin a map's cloud to at most ``count`` points, one for each cell of a grid in space."""
         points = base_map.sampled_points(_SAMPLED * count)
         chosen = points[_thinned(points, count)]
-        return cls(base_map.origin.copy(), chosen, _is_ground(base_map, chosen), base_map.crs, base_map.sha256)
+        parts = MapParts.of(base_map.parameters)
+        return cls(base_map.origin.copy(), chosen, _is_ground(base_map, chosen), base_map.crs, base_map.sha256, parts)
 
     @classmethod
     def of_cloud(cls, points: Points, origin: Floats, count: int = POINTS_OF_FILE) -> MapView:
@@ -99,7 +103,7 @@ class MapView:
             "count": len(packed),
             "ground": int(self.is_ground.sum()),
             "points": base64.b64encode(packed.tobytes()).decode("ascii"),
-        }
+        } | ({} if self.parts is None else {"parts": self.parts.to_json()})
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> MapView:
@@ -128,7 +132,11 @@ class MapView:
             raise MessageError(f"map view: {len(packed)} bytes for {count} points")
         points = np.frombuffer(packed, dtype="<i2").reshape(-1, 3).astype(np.float32) * np.float32(step)
         is_ground = np.arange(count) < ground
-        return cls(np.array(origin, dtype=np.float64), points, is_ground, crs, sha256)
+        try:
+            parts = MapParts.of(data)
+        except MapError as error:
+            raise MessageError(f"map view: {error}") from error
+        return cls(np.array(origin, dtype=np.float64), points, is_ground, crs, sha256, parts)
 
 
 def _thinned(points: Points, count: int) -> np.ndarray:

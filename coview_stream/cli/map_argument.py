@@ -24,13 +24,14 @@ class LocalMap(NamedTuple):
     mirror: Mirror | None = None
 
 
-def add_map(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    """Declare the map's argument, and ``--around``."""
+def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bool = False) -> None:
+    """Declare the map's argument, and ``--around``; ``several``: or more than one."""
     parser.add_argument(
         "map",
-        nargs="?" if optional else None,
+        nargs="+" if several else "?" if optional else None,
         metavar="SITE",
-        help="SITE.coview, a site's directory, or its address: zenoh://SITE, https://..., s3://...",
+        help="SITE.coview, a site's directory, or its address: zenoh://SITE, https://..., s3://..."
+        + ("; several (storeys, sites) are searched together, by name: FLOOR=SITE.coview" if several else ""),
     )
     parser.add_argument(
         "--around", metavar="X,Y,RADIUS", help="of a directory or an address only the tiles that this circle meets"
@@ -91,6 +92,26 @@ def open_map_argument(args: argparse.Namespace) -> LocalMap:
 
     key = None if getattr(args, "verify_key", None) is None else read_verify_key(args.verify_key)
     connect, config = getattr(args, "connect", None) or (), getattr(args, "config", None)
-    found = local_map(str(args.map), args.around, key, getattr(args, "base", "coview"), connect, config)
+    base = getattr(args, "base", "coview")
+    given = args.map if isinstance(args.map, list) else [args.map]
+    if len(given) == 1:
+        found = local_map(str(given[0]), args.around, key, base, connect, config)
+    else:
+        from coview_stream.basemap.joined.join_maps import joined_file
+
+        named = [_named(str(each)) for each in given]
+        paths = [(name, local_map(path, args.around, key, base, connect, config)) for name, path in named]
+        for _, each in paths:
+            if each.mirror is not None:
+                each.mirror.source.close()  # of several maps none is followed
+        found = LocalMap(joined_file([(name, each.path) for name, each in paths], key))
     args.map = found.path
     return found
+
+
+def _named(text: str) -> tuple[str, str]:
+    """Return the name and the path of ``NAME=PATH``, or of a path alone."""
+    name, sign, path = text.partition("=")
+    if sign and name and "/" not in name:
+        return name, path
+    return Path(text.rstrip("/")).name.removesuffix(".coview"), text

@@ -62,7 +62,7 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
 
 
 def initial_guess(text: str) -> PlaceGuess:
-    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees.
+    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees; of several maps, ``MAP:X,Y[,YAW]``.
 
     Raises:
         ConfigError: it is no such text.
@@ -70,13 +70,14 @@ def initial_guess(text: str) -> PlaceGuess:
     from coview_stream.errors import ConfigError
     from coview_stream.localization.search.place_guess import PlaceGuess
 
+    of, _, place = text.rpartition(":")
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in place.split(",")]
         if len(numbers) not in (2, 3):
             raise ValueError
     except ValueError:
         raise ConfigError(f"--initial {text!r}: give X,Y or X,Y,YAW (metres in the map, degrees)") from None
-    return PlaceGuess(numbers[0], numbers[1], math.radians(numbers[2]) if len(numbers) == 3 else None)
+    return PlaceGuess(numbers[0], numbers[1], math.radians(numbers[2]) if len(numbers) == 3 else None, map=of or None)
 
 
 def initial_guesses(texts: Iterable[str], robots: Iterable[str]) -> dict[str, PlaceGuess]:

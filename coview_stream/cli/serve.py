@@ -46,7 +46,7 @@ _MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/streaming.md pr
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; values are checked where they are used."""
-    add_map(parser)
+    add_map(parser, several=True)
     parser.add_argument(
         "--robot", nargs="+", action="extend", required=True, metavar="NAME", help="one or several robots"
     )

@@ -31,6 +31,7 @@ class HypothesesMessage:
             frame, posterior probability, log-likelihood ratio against chance.
         none: probability that the robot is at no place of the map.
         map_sha256: hash of the base map.
+        maps: of several maps, the name of the one that each place is on, in whose frame it is; empty of one map.
     """
 
     stamp_ns: int
@@ -38,14 +39,17 @@ class HypothesesMessage:
     places: Floats
     none: float
     map_sha256: str
+    maps: tuple[str, ...] = ()
 
 
 def encode_hypotheses(message: HypothesesMessage) -> Encoded:
     """Write hypotheses as JSON: ``stamp_ns, robot, map_sha256, none, places``, each place an object."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {name: round(float(value), digits) for name, value, digits in zip(_NAMES, row, _DIGITS, strict=True)}
         for row in message.places
     ]
+    for row, name in zip(rows, message.maps, strict=False):
+        row["map"] = name
     fields = {
         "stamp_ns": message.stamp_ns,
         "robot": message.robot,
@@ -71,9 +75,10 @@ def decode_hypotheses(sample: Sample) -> HypothesesMessage:
         if not isinstance(rows, list) or len(rows) > _MAX_PLACES:
             raise MessageError(f"places: write a list of at most {_MAX_PLACES}")
         places = np.array([_row(each) for each in rows], dtype=np.float64).reshape(-1, len(_NAMES))
+        maps = tuple(text(each, "map") for each in rows) if all("map" in each for each in rows) else ()
         return HypothesesMessage(
             stamp_from(fields.get("stamp_ns")), text(fields, "robot"), places, number(fields.get("none"), "none"),
-            text(fields, "map_sha256"),
+            text(fields, "map_sha256"), maps,
         )  # fmt: skip
     except MessageError as error:
         raise MessageError(f"{sample.key}: {error}") from error

@@ -17,8 +17,8 @@ import numpy as np
 from coview_stream.basemap.map_view import MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
-from coview_stream.messages.hypotheses import decode_hypotheses
-from coview_stream.messages.types import Sample
+from coview_stream.messages.hypotheses import HypothesesMessage, decode_hypotheses
+from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Policy, Transport
@@ -163,7 +163,7 @@ class SessionFeed:
             elif topic.kind == "status":
                 self._take_status(robot, sample)
             else:
-                found = replace(decode_hypotheses(sample), robot=robot)
+                found = self._places_on_view(replace(decode_hypotheses(sample), robot=robot))
                 self._hand_out("hypotheses", lambda sink: sink.hypotheses(found))
         except MessageError as error:
             self._errors.report(sample.key, error)
@@ -178,9 +178,28 @@ class SessionFeed:
     def _take_pose(self, robot: str, topic: Topic, sample: Sample) -> None:
         from coview_stream.messages import decode_pose
 
-        pose = replace(decode_pose(sample, hint=topic.hint), robot=robot)
+        pose = self._on_view(replace(decode_pose(sample, hint=topic.hint), robot=robot))
         self._tracks.setdefault(robot, PoseTrack()).add(pose.stamp_ns, pose.T_map_body)
         self._hand_out("pose", lambda sink: sink.pose(pose))
+
+    def _on_view(self, pose: PoseMessage) -> PoseMessage:
+        """Return a pose in the frame of the view: where several maps are seen side by side, those are in their own."""
+        view = self._maps.get(pose.map_sha256)
+        if view is None or view.parts is None:
+            return pose
+        for part in view.parts:
+            if part.name == pose.frame_id:
+                return replace(pose, T_map_body=part.joined(pose.T_map_body), T_map_odom=None)
+        return pose
+
+    def _places_on_view(self, message: HypothesesMessage) -> HypothesesMessage:
+        view = self._maps.get(message.map_sha256)
+        if view is None or view.parts is None or len(message.maps) != len(message.places):
+            return message
+        shifts = {part.name: part.shift for part in view.parts}
+        places = message.places.copy()
+        places[:, :3] += np.array([shifts.get(name, (0.0, 0.0, 0.0)) for name in message.maps]).reshape(-1, 3)
+        return replace(message, places=places)
 
     def _take_status(self, robot: str, sample: Sample) -> None:
         from coview_stream.messages.json_messages import read_status

@@ -31,6 +31,7 @@ class PlaceGuess:
         yaw: heading of the body's x axis, radians, counter-clockwise from the map's x axis; None: any.
         distance: metres around it that are tried as well, up to :data:`MAX_DISTANCE`.
         angle: radians to either side of ``yaw`` that are tried as well.
+        map: name of the one of several maps in whose frame it is; None of one map.
     """
 
     x: float
@@ -38,6 +39,7 @@ class PlaceGuess:
     yaw: float | None = None
     distance: float = 5.0
     angle: float = float(np.radians(30.0))
+    map: str | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.x, self.y, 0.0 if self.yaw is None else self.yaw)

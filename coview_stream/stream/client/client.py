@@ -185,7 +185,13 @@ class RobotClient:
         return self._transport.query(self.keys.relocalize, timeout=timeout)
 
     def suggest(
-        self, x: float, y: float, yaw: float | None = None, distance: float = 5.0, timeout: float = 5.0
+        self,
+        x: float,
+        y: float,
+        yaw: float | None = None,
+        distance: float = 5.0,
+        timeout: float = 5.0,
+        map: str | None = None,
     ) -> dict[str, Any]:
         """Tell the node where the robot may be: one more place for its search to try, which is never trusted.
 
@@ -195,6 +201,7 @@ class RobotClient:
             yaw: heading, radians, counter-clockwise from the map's x axis; None: any.
             distance: metres around it that are tried as well, 20 at most.
             timeout: seconds.
+            map: name of the one of several maps in whose frame x and y are.
 
         Returns:
             The reply; ``taken`` is False while the place is known.
@@ -204,7 +211,8 @@ class RobotClient:
         """
         self._check_open()
         given = {"x": x, "y": y, "distance": distance} | ({} if yaw is None else {"yaw": yaw})
-        return self._transport.query(self.keys.suggest, {k: repr(float(v)) for k, v in given.items()}, timeout)
+        parameters = {k: repr(float(v)) for k, v in given.items()} | ({} if map is None else {"map": map})
+        return self._transport.query(self.keys.suggest, parameters, timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget all that it knows of this robot; returns its reply. Errors as :meth:`relocalize`."""

@@ -17,11 +17,13 @@ from coview_stream.messages.types import Sample
 
 _MAX_BYTES = 4096  # of a message; set by hand
 _SIGMAS = 2.0  # of a covariance that are tried around its pose; set by hand
-_FIELDS = ("x", "y", "yaw", "distance", "angle")
+_FIELDS = ("x", "y", "yaw", "distance", "angle", "map")
 
 
 def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess of named numbers or their texts: x and y, and perhaps yaw, distance and angle (radians, metres).
+
+    With ``map``, a name, they are in the frame of that one of several maps.
 
     Raises:
         InputError: x or y is missing, a name is unknown, or a value is no number or out of its range.
@@ -31,7 +33,12 @@ def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
         what = f"{unknown[0]!r} is unknown" if unknown else "x or y is missing"
         raise InputError(f"initial pose: {what}; give x, y and perhaps yaw, distance, angle (metres, radians)")
     numbers: dict[str, float] = {}
+    of = fields.get("map")
+    if not isinstance(of, str | None):
+        raise InputError(f"initial pose: map is {str(of)[:40]!r}, which is no name")
     for name, value in fields.items():
+        if name == "map":
+            continue
         if value is None and name == "yaw":
             continue
         try:
@@ -41,7 +48,7 @@ def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
         except (TypeError, ValueError) as error:
             raise InputError(f"initial pose: {name} is {str(value)[:40]!r}, which is no number") from error
     try:
-        return PlaceGuess(**numbers)
+        return PlaceGuess(**numbers, map=of)
     except ConfigError as error:
         raise InputError(f"initial pose: {error}") from error
 
@@ -62,6 +69,7 @@ def decode_guess(sample: Sample) -> PlaceGuess:
         return guess_of_fields({
             "x": pose.T_map_body[0, 3], "y": pose.T_map_body[1, 3], "yaw": yaw_of(pose.T_map_body),
             "distance": min(max(_SIGMAS * spread, 3.0), MAX_DISTANCE), "angle": min(max(_SIGMAS * turn, 0.3), math.pi),
+            "map": None if pose.frame_id in ("", "map") else pose.frame_id,
         })  # fmt: skip
     try:
         fields = json.loads(payload)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.messages.types import CloudMessage, OdometryMessage
@@ -34,11 +35,12 @@ class LidarSession(Session):
         config: NodeConfig | None = None,
         codecs: tuple[str | None, str | None] = (None, None),
         lidar: LidarOdometryConfig | None = None,
+        parts: MapParts | None = None,
     ) -> None:
         """As of a :class:`Session`; ``lidar`` says how odometry is made."""
         self.lidar = lidar or LidarOdometryConfig()
         self._odometry_epoch = 0  # number of the lidar odometry, counted through all resets
-        super().__init__(keys, map_sha256, config, codecs)
+        super().__init__(keys, map_sha256, config, codecs, parts)
 
     def _clear(self) -> None:
         super()._clear()

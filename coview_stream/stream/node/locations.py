@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.clouds.geo_reference import GeoReference
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import yaw_of
@@ -34,19 +35,31 @@ class MapReference:
         self._lock = threading.Lock()
         loaded = BaseMap.load(path, check=False)
         self._sha256 = loaded.sha256
-        self._geo: GeoReference | None = GeoReference(loaded.crs)
+        self._geo = _references(loaded)
 
-    def of(self, sha256: str) -> GeoReference | None:
-        """Return the reference of a map by its hash; None where the file has none, or is another one by now."""
+    def of(self, sha256: str, name: str = "") -> GeoReference | None:
+        """Return the reference of a map by its hash, and of several maps by the name of the one.
+
+        None where the file has none, or is another one by now.
+        """
         with self._lock:
             if sha256 != self._sha256:
                 try:
                     loaded = BaseMap.load(self._path, check=False)
-                    self._sha256, self._geo = loaded.sha256, GeoReference(loaded.crs)
+                    self._sha256, self._geo = loaded.sha256, _references(loaded)
                 except CoViewError as error:
                     log.warning("no latitude and longitude on the new map: %s", error)
-                    self._sha256, self._geo = sha256, None
-            return self._geo if sha256 == self._sha256 else None
+                    self._sha256, self._geo = sha256, {}
+            known = self._geo if sha256 == self._sha256 else {}
+            return known.get(name, known.get(""))
+
+
+def _references(base_map: BaseMap) -> dict[str, GeoReference]:
+    """Return the references of a map's parts by name; of one map its own, without a name."""
+    parts = MapParts.of(base_map.parameters)
+    if parts is None:
+        return {"": GeoReference(base_map.crs)}
+    return {part.name: GeoReference(part.crs) for part in parts}
 
 
 class LocationPublisher:
@@ -57,7 +70,7 @@ class LocationPublisher:
 
     def __call__(self, pose: PoseMessage) -> None:
         """Publish a pose."""
-        geo = self._reference.of(pose.map_sha256)
+        geo = self._reference.of(pose.map_sha256, pose.frame_id)
         if geo is not None and (message := location_of(pose, geo)) is not None:
             self._publisher.put(encode_location(message, self._encoding))
 

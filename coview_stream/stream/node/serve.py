@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.trust import Trust
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
@@ -269,6 +270,7 @@ def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
     from coview_stream.stream.node.session import Session
 
     codecs = (options.cloud_codec, options.odometry_codec)
+    parts = MapParts.of(BaseMap.load(options.map_path, check=False).parameters)
     if options.lidar is None:
-        return [Session(keys, map_sha256, options.node, codecs=codecs) for keys in options.keys]
-    return [LidarSession(keys, map_sha256, options.node, codecs=codecs, lidar=options.lidar) for keys in options.keys]
+        return [Session(keys, map_sha256, options.node, codecs, parts) for keys in options.keys]
+    return [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]

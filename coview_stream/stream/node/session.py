@@ -9,6 +9,9 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 
+import numpy as np
+
+from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
 from coview_stream.geometry.protection import ProtectionLevel
@@ -57,10 +60,20 @@ class Session:
         map_sha256: str,
         config: NodeConfig | None = None,
         codecs: tuple[str | None, str | None] = (None, None),
+        parts: MapParts | None = None,
     ) -> None:
-        """Begin without any message; ``codecs`` force those of clouds and odometry."""
+        """Begin without any message.
+
+        Args:
+            keys: of the robot's messages.
+            map_sha256: of the map.
+            config: rates and limits.
+            codecs: of clouds and odometry, against what they say themselves.
+            parts: the maps of which the map is joined; None of one map.
+        """
         self.keys = keys
         self.map_sha256 = map_sha256
+        self.parts = parts
         self.config = config or NodeConfig()
         self.codecs = codecs
         self._lock = threading.RLock()
@@ -208,7 +221,14 @@ class Session:
                 self._hint.offer(T_map_body, calibration)
 
     def guess_place(self, guess: PlaceGuess) -> bool:
-        """Have the search try a place that somebody names; return False, and do nothing, while a place is known."""
+        """Have the search try a place that somebody names; return False, and do nothing, while a place is known.
+
+        Raises:
+            InputError: one of several maps has to be named, and none of that name is there.
+        """
+        if self.parts is not None:
+            shift = self.parts.named(guess.map).shift
+            guess = replace(guess, x=guess.x + shift[0], y=guess.y + shift[1], map=None)
         with self._lock:
             if self.robot_state.correction is not None:
                 return False
@@ -305,9 +325,25 @@ class Session:
     # ---- what is published
 
     def pose(self) -> PoseMessage | None:
-        """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING."""
+        """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING.
+
+        Of several maps it is in the frame of the one that the robot is on, whose name is its ``frame_id``.
+        """
         with self._lock:
-            return self.robot_state.pose(self.odometry)
+            pose = self.robot_state.pose(self.odometry)
+        if pose is None or self.parts is None:
+            return pose
+        part = self.parts.at(pose.T_map_body[:3, 3])
+        T_map_odom = None if pose.T_map_odom is None else part.own(pose.T_map_odom)
+        return replace(pose, T_map_body=part.own(pose.T_map_body), T_map_odom=T_map_odom, frame_id=part.name)
+
+    def map_name(self) -> str | None:
+        """Return which of several maps the robot is on; None while that is not known, and where there is one map."""
+        with self._lock:
+            correction = self.robot_state.correction
+            if self.parts is None or correction is None or not self.robot_state.state.has_place:
+                return None
+            return self.parts.at(correction.T_map_body[:3, 3]).name
 
     def state(self) -> tuple[State, str]:
         """Return the state and one clause that gives its reason."""
@@ -335,7 +371,13 @@ class Session:
             if seen is None or self.robot_state.state.has_place:
                 return None
             stamp_ns = round(seen.stamp * 1e9)
-            return HypothesesMessage(stamp_ns, self.keys.robot, seen.places, seen.none, self.map_sha256)
+            message = HypothesesMessage(stamp_ns, self.keys.robot, seen.places, seen.none, self.map_sha256)
+        if self.parts is None:
+            return message
+        of = [self.parts.at(place[:3]) for place in message.places]
+        places = message.places.copy()
+        places[:, :3] -= np.array([part.shift for part in of]).reshape(-1, 3)
+        return replace(message, places=places, maps=tuple(part.name for part in of))
 
     @property
     def calibration(self) -> Calibration | None:

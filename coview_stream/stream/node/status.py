@@ -159,6 +159,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "reason": reason,
         "version": __version__,
         "map_sha256": session.map_sha256,
+        **({} if session.parts is None else {"map": session.map_name()}),
         "odometry": session.odometry_source,
         "uptime_s": round(uptime, 1),
         "last_frame_ns": known.last_frame_ns,

@@ -1,0 +1,126 @@
+"""Maps joined: the robot is found on the right one, in its frame, and on none where two are alike."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.joined import join_maps as joining
+from coview_stream.basemap.joined.join_maps import join_maps, joined_file
+from coview_stream.basemap.joined.map_parts import MapPart, MapParts
+from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.shapes import check_arrays
+from coview_stream.clouds.files import write_cloud
+from coview_stream.errors import InputError, MapError
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.state import State
+
+pytestmark = pytest.mark.slow
+
+RADIUS = 30.0
+FAR = np.array([512_003.0, 5_403_210.0, 287.0])
+
+
+@pytest.fixture(scope="module")
+def upper(tmp_path_factory):
+    """The map of another small world, in UTM-like coordinates."""
+    path = tmp_path_factory.mktemp("upper") / "upper.las"
+    write_cloud(path, small_world.sample_map(small_world.boxes(seed=77)) + FAR)
+    return BaseMap.build(path, radius=RADIUS)
+
+
+@pytest.fixture(scope="module")
+def both(world_map, upper):
+    return join_maps({"ground": world_map, "upper": upper})
+
+
+def follow(base_map, drive):
+    localizer = Localizer(base_map)
+    return [localizer.step(c, T, 0.5 * k) for k, (c, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True))]
+
+
+def test_robot_is_found_on_its_map_and_its_pose_is_in_that_maps_frame(both, world_drive):
+    parts = MapParts.of(both.parameters)
+    for name, drive, zero in (
+        ("ground", world_drive, np.zeros(3)),
+        ("upper", small_world.record(small_world.boxes(seed=77)), FAR),
+    ):
+        fixes = follow(both, drive)
+        posed = [k for k, fix in enumerate(fixes) if fix.T_map_body is not None]
+        assert posed, name
+        for k in posed:
+            part = parts.at(fixes[k].T_map_body[:3, 3])
+            assert part.name == name
+            truth = drive.T_map_body[k].copy()
+            truth[:3, 3] += zero
+            assert pose_error(part.own(fixes[k].T_map_body), truth)[0] < 0.08
+            np.testing.assert_allclose(part.joined(part.own(fixes[k].T_map_body)), fixes[k].T_map_body, atol=1e-8)
+
+
+def test_robot_that_fits_two_maps_alike_is_on_neither(world_map, world_drive):
+    fixes = follow(join_maps({"first": world_map, "second": world_map}), world_drive)
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert State.AMBIGUOUS in {fix.state for fix in fixes}
+
+
+def test_joined_map_is_a_map(both, world_map, upper, tmp_path):
+    check_arrays(both.arrays, both.config)
+    assert len(both) == len(world_map) + len(upper)
+    both.save(tmp_path / "both.coview")
+    again = BaseMap.load(tmp_path / "both.coview")
+    parts = MapParts.of(again.parameters)
+    assert [part.name for part in parts] == ["ground", "upper"]
+    assert [part.sha256 for part in parts] == [world_map.sha256, upper.sha256]
+    for part, base_map in zip(parts, (world_map, upper), strict=True):
+        centre = base_map.stations[len(base_map) // 2].astype(np.float64)
+        points, normals = base_map.crop(centre, 12.0)
+        move = np.array(part.shift) + base_map.origin
+        moved, turned = again.crop(centre + move, 12.0)
+        np.testing.assert_allclose(moved, points + move, atol=2e-3)
+        np.testing.assert_allclose(turned, normals, atol=1e-6)
+        assert part.begin < centre[0] + move[0] < part.end
+    gap = parts[1].begin - parts[0].end
+    assert gap == pytest.approx(0.0, abs=160.0)
+    view = MapView.from_json(json.loads(json.dumps(MapView.of(again, 500).to_json())))
+    assert list(view.parts) == list(parts)
+
+
+def test_maps_that_do_not_go_together_are_named(world_map):
+    finer = BaseMap(
+        world_map.arrays, world_map.parameters | {"config": world_map.parameters["config"] | {"voxel": 0.5}}
+    )
+    with pytest.raises(MapError, match=r"a and b differ in voxel \(0.25 and 0.5\)"):
+        join_maps({"a": world_map, "b": finer})
+    with pytest.raises(MapError, match="no maps"):
+        join_maps({})
+
+
+def test_file_of_joined_maps_is_made_once(world_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path))
+    path = joined_file([("a", world_file), ("b", world_file)])
+    monkeypatch.setattr(joining, "join_maps", None)
+    assert joined_file([("a", world_file), ("b", world_file)]) == path
+    with pytest.raises(MapError, match="two maps are called a"):
+        joined_file([("a", world_file), ("a", world_file)])
+
+
+def test_parts_are_read_strictly():
+    part = MapPart("a", "0" * 64, None, (1.0, 2.0, 3.0), -5.0, 5.0)
+    told = MapParts([part]).to_json()
+    assert list(MapParts.of({"parts": told})) == [part]
+    assert MapParts.of({}) is None
+    for broken in (
+        [], [*told, *told], [{}], "x", [{**told[0], "shift": [0.0, 0.0]}], [{**told[0], "shift": [float("nan"), 0, 0]}],
+        [{**told[0], "name": ""}], [{**told[0], "crs": 3}],
+    ):  # fmt: skip
+        with pytest.raises(MapError, match="parts cannot be read"):
+            MapParts.of({"parts": broken})
+    with pytest.raises(InputError, match="no map is called 'b': this node has a"):
+        MapParts([part]).named("b")
+    with pytest.raises(InputError, match="no map is named"):
+        MapParts([part]).named(None)
