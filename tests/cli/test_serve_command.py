@@ -172,8 +172,8 @@ def test_serve_options_reach_node_config(monkeypatch, world_file):
     assert asked[0].keys[0].pose.endswith("/TypeHashNotSupported")
     lidar = asked[0].lidar
     assert (lidar.gravity, lidar.max_speed) == ((0.0, 0.1, -9.8), 9.0)
-    assert [s.odometry_source for s in serve.make_sessions(asked[0], "")] == ["kiss-icp"]
-    assert serve.make_sessions(asked[0], "")[0].lidar is lidar
+    (session,) = serve.make_sessions(asked[0], BaseMap.load(world_file))
+    assert (session.odometry_source, session.lidar) == ("kiss-icp", lidar)
 
 
 def test_max_payload_reaches_the_transport(monkeypatch, world_file):

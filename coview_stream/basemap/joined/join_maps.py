@@ -21,7 +21,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.joined.map_parts import MapPart, MapParts
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.working_file import cache_folder, evict
+from coview_stream.basemap.site.cache import cache_folder, evict
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
 from coview_stream.errors import MapError

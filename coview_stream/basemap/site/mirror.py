@@ -14,11 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from coview_stream.basemap.signature import VerifyKey
+from coview_stream.basemap.site.cache import cache_folder, evict
 from coview_stream.basemap.site.manifest import FILE, LayerEntry, Manifest, TileEntry
 from coview_stream.basemap.site.part import Around, part_file, tiles_around
 from coview_stream.basemap.site.site_source import SiteSource
 from coview_stream.basemap.site.tile_store import TileStore
-from coview_stream.basemap.site.working_file import cache_folder, evict
 from coview_stream.errors import MapError, TransportError, warn
 
 log = logging.getLogger("coview_stream.maps")

@@ -9,9 +9,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+from coview_stream.basemap.site.cache import cache_folder
 from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.working_file import cache_folder
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError, MapError
 

@@ -108,7 +108,7 @@ def open_node(
     transport = None
     try:
         # for its errors and hash, while the engines start: they map it themselves
-        sha256, engines = start_engines(options, children)
+        base_map, engines = start_engines(options, children)
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.maps.map_follower import MapFollower
@@ -128,7 +128,7 @@ def open_node(
         )
         elections = Elections(options.keys, options.node.status_rate, needs_connection=bool(options.connect))
         elections.declare(transport)
-        sessions = make_sessions(options, sha256)
+        sessions = make_sessions(options, base_map)
         for session in sessions:
             if (guess := options.guesses.get(session.keys.robot)) is not None:
                 session.guess_place(guess)
@@ -195,8 +195,8 @@ def _add_health(node: Node, options: ServeOptions, notifier: Notifier) -> None:
 
 def start_engines(
     options: ServeOptions, children: Mapping[str, EngineChild], base_map: BaseMap | None = None
-) -> tuple[str, dict[str, EngineProcess]]:
-    """Check the map and have the engines begin to open it; return its hash and them.
+) -> tuple[BaseMap, dict[str, EngineProcess]]:
+    """Check the map and have the engines begin to open it; return it and them.
 
     Args:
         options: of the node.
@@ -228,7 +228,7 @@ def start_engines(
         for engine in engines.values():
             engine.close()
         raise
-    return base_map.sha256, engines
+    return base_map, engines
 
 
 def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) -> OpenedMap | None:
@@ -250,12 +250,12 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     children = start_children(options.lidar is not None)
     engines: dict[str, EngineProcess] = {}
     try:
-        sha256, engines = start_engines(options, children, base_map)
+        _, engines = start_engines(options, children, base_map)
         for engine in engines.values():
             engine.wait_prepared(cancelled)
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        return OpenedMap(sha256, engines, make_sessions(options, sha256))
+        return OpenedMap(base_map.sha256, engines, make_sessions(options, base_map))
     except BaseException:
         for engine in engines.values():
             engine.close()
@@ -264,13 +264,13 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
         raise
 
 
-def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
+def make_sessions(options: ServeOptions, base_map: BaseMap) -> list[Session]:
     """Return a session for each robot, which makes its odometry if the options ask for that."""
     from coview_stream.stream.node.lidar_session import LidarSession
     from coview_stream.stream.node.session import Session
 
     codecs = (options.cloud_codec, options.odometry_codec)
-    parts = MapParts.of(BaseMap.load(options.map_path, check=False).parameters)
+    parts, map_sha256 = MapParts.of(base_map.parameters), base_map.sha256
     if options.lidar is None:
         return [Session(keys, map_sha256, options.node, codecs, parts) for keys in options.keys]
     return [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]

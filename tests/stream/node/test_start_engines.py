@@ -55,7 +55,7 @@ def loads(monkeypatch):
 
     def load(path, verify_key=None):
         made.append(path)
-        return SimpleNamespace(sha256="b" * 64, identity=None, require_features=lambda _: None)
+        return SimpleNamespace(parameters={}, sha256="b" * 64, identity=None, require_features=lambda _: None)
 
     monkeypatch.setattr(serve, "BaseMap", SimpleNamespace(load=load))
     return made
