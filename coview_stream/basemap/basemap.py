@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap import file_format, tiles
-from coview_stream.basemap.likelihood_field import field_arrays
+from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, field_of
 from coview_stream.basemap.shapes import check_arrays
 from coview_stream.basemap.signature import SigningKey, VerifyKey, read_verify_key
 from coview_stream.basemap.station_grid import StationGrid
@@ -122,8 +122,9 @@ class BaseMap:
         Args:
             path: the file; or the directory of a site, or a part of one, whose working file is made first where it is
                 not there.
-            check: compare its content with its checksum, for which the whole file is read; without, :attr:`sha256` is
-                what the file says: for one that another process has just checked.
+            check: compare its content with its checksum, for which the whole file is read, a site's working file only
+                the first time; without, :attr:`sha256` is what the file says: for one that another process has just
+                checked.
             verify_key: public key, or its PEM file, that the map has to be signed with; its content is compared with
                 the signed hashes then, whatever ``check`` says. A
                 :class:`~coview_stream.basemap.trust.Trust` names a file that has been compared already, and is not
@@ -138,12 +139,11 @@ class BaseMap:
         trust = Trust(verify_key) if isinstance(verify_key, VerifyKey) else verify_key
         place = Path(path)
         if place.is_dir() or place.suffix == ".tiles":
-            from coview_stream.basemap.site.part import read_part
-            from coview_stream.basemap.site.working_file import working_file
+            from coview_stream.basemap.site.working_file import open_site
 
-            place, keys = (place, None) if place.is_dir() else read_part(place)
-            place, trust = working_file(place, None if trust is None else trust.key, keys=keys), None
-        file = file_format.open_file(place, check, trust)
+            place, file = open_site(place, check, None if trust is None else trust.key)
+        else:
+            file = file_format.open_file(place, check, trust)
         loaded = cls(file.arrays, file.parameters, file.sha256)
         loaded.path, loaded.identity = place.absolute(), file.identity
         check_arrays(loaded._arrays, loaded.config)
@@ -155,8 +155,11 @@ class BaseMap:
         Raises:
             MapError: that fails.
         """
-        self.sha256 = file_format.save(Path(path), self._arrays, self.parameters, sign_key)
+        self.sha256 = file_format.save(Path(path), self._saved(), self.parameters, sign_key)
         return self.sha256
+
+    def _saved(self) -> file_format.Arrays:
+        return {name: array for name, array in self._arrays.items() if not name.startswith(LAYERS)}
 
     def __len__(self) -> int:
         """Return the number of stations."""
@@ -266,8 +269,8 @@ class BaseMap:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays: the size of its file, but for a few kB."""
-        return sum(array.nbytes for array in self._arrays.values())
+        """Bytes of all arrays that :meth:`save` writes: the size of the map in one file, but for a few kB."""
+        return sum(array.nbytes for array in self._saved().values())
 
     def release(self) -> None:
         """Let the memory go that the file's pages take; what is used again is read again."""
@@ -333,10 +336,9 @@ class BaseMap:
             surveyed, corner = arrays["surveyed"] > 0, arrays["surveyed_corner"]
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
         try:
-            kept = [arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")]
-            field = kernels.FieldMap(*kept)
+            field = field_of(arrays)
             _ = field.layers
-            for array in kept:  # only the layers are looked up
+            for array in (field.tiles, field.occupied, field.ground, field.edge):  # only the layers are looked up
                 file_format.release(array)
             return field
         except (KeyError, ValueError) as error:

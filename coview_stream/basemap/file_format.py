@@ -52,7 +52,8 @@ _MAX_ARRAYS = 256  # set by hand: ten times what a map has
 _CHUNK = 1 << 22  # bytes written or hashed at a time
 _CACHE_LINE = 64  # bytes
 _TYPES = {
-    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U8": "|u1",
+    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U16": "<u2",
+    "U8": "|u1",
 }  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
@@ -150,7 +151,9 @@ def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
     return open_file(path, check)[:3]
 
 
-def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loaded:
+def open_file(
+    path: Path, check: bool = True, trust: Trust | None = None, checked: FileIdentity | None = None
+) -> Loaded:
     """Memory-map a map, signed or not.
 
     The whole file is read once, to compare it with its checksum, if ``check``; after that only the pages used are in
@@ -161,6 +164,8 @@ def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loa
         check: compare its content with its checksum. A file that has to be signed is compared with its signed hashes
             in any case, unless ``trust`` says that this has been done.
         trust: demands a signature.
+        checked: of a file whose content has been compared with its checksum already; it is not read again if it is
+            still that.
 
     Raises:
         MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
@@ -195,7 +200,7 @@ def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loa
             digest = str(metadata.get("sha256"))
             if trust is not None and trust.verified != identity:
                 trusting.check_sections(header, lambda name: _read(file, start, header[name]))
-            elif trust is None and check:
+            elif trust is None and check and checked != identity:
                 digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
             parameters = json.loads(metadata["parameters"])
             if not isinstance(parameters, dict):

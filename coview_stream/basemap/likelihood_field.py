@@ -7,7 +7,9 @@ Square cells of half a metre, in tiles of 16 m that are stored only where the ma
 * ground: height of the lowest surface at the cell's middle.
 * edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
 
-It is made with the map, memory-mapped with it, and takes 48 MB per km2.
+It is made with the map, memory-mapped with it, and takes 48 MB per km2. It is looked up in other rasters that are made
+of these when a map is opened (:class:`~coview_kernels.reference.field.FieldLayers`), and takes 88 MB per km2 in memory
+then; files that need not be small hold those as well, and nothing is in memory but what is looked up.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels.reference.field import CELL, EDGE_STEP, NO_GROUND, NOT_SURVEYED, TILE
+from coview_kernels import FieldMap
+from coview_kernels.reference.field import CELL, EDGE_STEP, NO_GROUND, NOT_SURVEYED, TILE, FieldLayers
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import max_filter, min_filter
@@ -32,6 +35,10 @@ _DROP = 2.0  # metres: what falls less is no wall
 _REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
 _OVERHANG = 3  # cells, odd: a wall stands this close to the edge
 _NOTHING = np.float32(-1e6)
+FIELD_ARRAYS = ("field.tiles", "field.occupied", "field.ground", "field.edge")
+LAYERS = "field.layers."
+"""Names of a field's arrays in a map's file, and what the names of its layers begin with."""
+
 _Number = TypeVar("_Number", bound=np.generic)
 
 
@@ -75,6 +82,29 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
         "field.ground": centimetres.astype(np.int16),
         "field.edge": np.clip(np.floor(over), 0, 255).astype(np.uint8),
     }
+
+
+def layers_arrays(arrays: Arrays) -> Arrays:
+    """Return the rasters in which a field is looked up, for a file that need not be small.
+
+    Args:
+        arrays: of the map, with those of :func:`field_arrays`.
+    """
+    layers = field_of(arrays).layers
+    return {f"{LAYERS}{name}": values for name, values in layers._asdict().items()}
+
+
+def field_of(arrays: Arrays) -> FieldMap:
+    """Return the field that a map's arrays hold, with its layers if these are there.
+
+    Raises:
+        KeyError: an array is missing. ValueError: one is not what it should be.
+    """
+    stored = None
+    if f"{LAYERS}table" in arrays:
+        stored = FieldLayers(*(arrays[f"{LAYERS}{name}"] for name in FieldLayers._fields))
+    tiles, occupied, ground, edge = (arrays[name] for name in FIELD_ARRAYS)
+    return FieldMap(tiles, occupied, ground, edge, stored)
 
 
 def _tiles(known: Bools) -> tuple[Ints, Ints]:

@@ -14,6 +14,7 @@ what of the scan the map explains there (:class:`FieldScores`). All is looking u
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -24,6 +25,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, Mask, as_finite64, as_float32
 from coview_kernels.launch import Launch
+from coview_kernels.mapped import Windows
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
@@ -82,15 +84,18 @@ class FieldMap:
         occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set where the cell has a point at height z.
         ground: (T, 32, 32) int16 centimetres above the tile's height, or one of the two values below.
         edge: (T, 32, 32) uint8 quarter metres above the tile's height, 0 for none.
+        stored: the layers, if they have been made before, say memory-mapped; None makes them at first use.
 
     Raises:
-        ValueError: an array has another shape or type, or the map is too large for the indices of a kernel.
+        ValueError: an array has another shape or type, the layers are not those of the tiles, or the map is too large
+            for the indices of a kernel.
     """
 
     tiles: I32
     occupied: I64
     ground: I16
     edge: U8
+    stored: FieldLayers | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.tiles), TILE, TILE)
@@ -108,6 +113,25 @@ class FieldMap:
         )
         if len(self.tiles) >= _MAX_TILES or (len(self.tiles) and float(np.prod(high - low + 2.0)) >= _MAX_TABLE):
             raise ValueError(f"{len(self.tiles)} tiles from {low} to {high} are too many for one map")
+        if self.stored is not None:
+            self._check(self.stored)
+
+    def _check(self, layers: FieldLayers) -> None:
+        """Compare layers with the tiles, as kernels go by the numbers in their table; their rasters are believed."""
+        table, base = self._table()
+        tiles, (rows, columns) = len(base), table.shape
+        for name, kind, shape in (
+            ("table", np.int32, table.shape),
+            ("base", np.float32, base.shape),
+            ("bits", np.int64, (tiles, TILE, TILE, 2)),
+            ("surface", np.int32, (tiles, TILE, TILE)),
+            ("coarse", np.uint16, _coarse_shape(rows, columns)),
+        ):
+            array = getattr(layers, name)
+            if array.shape != shape or array.dtype != kind:
+                raise ValueError(f"layer {name} is {array.dtype} {array.shape}, expected {np.dtype(kind)} {shape}")
+        if not (np.array_equal(layers.table, table) and np.array_equal(layers.base, base)):
+            raise ValueError("the layers are not those of the tiles")
 
     @cached_property
     def corner(self) -> I64:
@@ -116,19 +140,25 @@ class FieldMap:
 
     @cached_property
     def layers(self) -> FieldLayers:
-        """The rasters as they are looked up; 20 bytes a cell, made at first use."""
-        shape = self.tiles[:, :2].max(axis=0, initial=0).astype(np.int64) - self.corner + 2
-        table = np.zeros(np.maximum(shape, 2), dtype=np.int32)
-        row, column = (self.tiles[:, :2] - self.corner).T
-        table[row, column] = np.arange(1, len(self.tiles) + 1)
-        tiles = len(self.tiles) + 1
+        """The rasters as they are looked up; 22 bytes a cell, made at first use unless they are stored."""
+        if self.stored is not None:
+            return self.stored
+        table, base = self._table()
+        tiles = len(base)
         bits = np.zeros((tiles, TILE, TILE, 2), dtype=np.int64)
         bits[1:, ..., 1] = self.occupied
         _fill_near(bits, table)
         surface = np.full((tiles, TILE, TILE), NOT_SURVEYED & 0xFFFF, dtype=np.int32)
         surface[1:] = (self.edge.astype(np.int32) << 16) | (self.ground.astype(np.int32) & 0xFFFF)
-        base = np.concatenate([[0.0], self.tiles[:, 2]]).astype(np.float32)
         return FieldLayers(table, base, bits, surface, _coarse(bits, table))
+
+    def _table(self) -> tuple[I32, F32]:
+        """Return the number of each tile (R, C), 0 for none, and the height (T + 1,) that each counts from."""
+        shape = self.tiles[:, :2].max(axis=0, initial=0).astype(np.int64) - self.corner + 2
+        table = np.zeros(np.maximum(shape, 2), dtype=np.int32)
+        row, column = (self.tiles[:, :2] - self.corner).T
+        table[row, column] = np.arange(1, len(self.tiles) + 1)
+        return table, np.concatenate([[0.0], self.tiles[:, 2]]).astype(np.float32)
 
 
 def field_scores(
@@ -153,8 +183,33 @@ def field_scores(
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre a kilometre from the corner
-    pose, counts = runtime.dispatch(_native, reference.field_scores, layers, plan, start - corner)
+    pose, counts = start - corner, np.zeros((len(start), 7), dtype=np.int32)
+    for some in _groups(layers, pose):
+        pose[some], counts[some] = runtime.dispatch(_native, reference.field_scores, layers, plan, pose[some])
     return FieldScores(pose + corner, *np.ascontiguousarray(counts.T))
+
+
+def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
+    """Yield which hypotheses to score together: all, or in a large mapped field those on one window after another.
+
+    What the scan reaches of neighbouring windows stays in memory until the last group is done.
+    """
+    windows = Windows(layers.bits)
+    if not windows.several:
+        yield slice(None)
+        return
+    rows, columns = np.clip(
+        np.floor(start[:, 1::-1] / (TILE * CELL)).astype(np.int64), 0, np.array(layers.table.shape) - 1
+    ).T
+    tile = layers.table[rows, columns]
+    if len(np.unique(windows.number(tile))) <= 1:  # the surroundings of one robot: they stay in memory
+        yield slice(None)
+        return
+    for window in windows:
+        chosen = np.flatnonzero((tile >= window.start) & (tile < window.stop))
+        if len(chosen):
+            yield chosen
+    windows.release()
 
 
 def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
@@ -231,12 +286,17 @@ def _coarse(bits: I64, table: I32) -> U16:
     out[:-1] |= metres[1:]
     out[:, 1:] |= metres[:, :-1]
     out[:, :-1] |= metres[:, 1:]
-    planes = np.zeros((32, columns * half // 8 + 1, len(out)), dtype=np.uint16)
+    planes = np.zeros(_coarse_shape(rows, columns), dtype=np.uint16)
     for level, plane in enumerate(planes):
         packed = np.packbits((out >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
         plane[:-1] = packed
         plane[:-2] |= packed[1:] << np.uint16(8)
     return planes
+
+
+def _coarse_shape(rows: int, columns: int) -> tuple[int, int, int]:
+    half = TILE // 2
+    return 32, columns * half // 8 + 1, rows * half
 
 
 def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:

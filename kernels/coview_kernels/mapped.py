@@ -39,6 +39,14 @@ class Windows:
         """Whether there are more than one."""
         return self._step < self._rows
 
+    def number(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+        """Return the numbers of the windows that rows are in."""
+        return rows.astype(np.int64) // max(1, self._step)
+
+    def release(self) -> None:
+        """Release all of it."""
+        self._release(slice(0, self._rows))
+
     def __iter__(self) -> Iterator[slice]:
         """Yield slices of rows, in order."""
         for start in range(0, self._rows, max(1, self._step)):

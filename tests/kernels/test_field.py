@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import coview_kernels as kernels
-from coview_kernels import reference
+from coview_kernels import mapped, reference
 from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
-from coview_kernels.reference.field import NO_GROUND, TILE, Plan
+from coview_kernels.mapped import Windows
+from coview_kernels.reference.field import NO_GROUND, TILE, FieldLayers, Plan
 
 
 def street(rng: np.random.Generator) -> tuple[FieldMap, np.ndarray]:
@@ -128,3 +132,44 @@ def test_wrong_shapes_and_poses_are_refused(scene: tuple[FieldMap, FieldScan, np
         kernels.field_scores(field, scan, [pose * np.nan])
     with pytest.raises(ValueError, match="structure"):
         kernels.field_scores(field, FieldScan(scan.structure[:, :2], scan.low, scan.free), [pose])
+
+
+def test_stored_layers_are_looked_up_instead(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, _, others = scene
+    stored = replace(field, stored=FieldLayers(*(np.array(each) for each in field.layers)))
+    assert stored.layers is stored.stored
+    for one, other in zip(*(kernels.field_scores(each, scan, others) for each in (field, stored)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", FieldLayers._fields)
+def test_layers_that_are_not_those_of_the_tiles_are_refused(
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], name: str
+):
+    field = scene[0]
+    with pytest.raises(ValueError, match=name):
+        replace(field, stored=field.layers._replace(**{name: getattr(field.layers, name)[:-1]}))
+    with pytest.raises(ValueError, match=name):
+        replace(field, stored=field.layers._replace(**{name: getattr(field.layers, name).astype(np.uint32)}))
+
+
+def test_table_that_points_elsewhere_is_refused(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field = scene[0]
+    with pytest.raises(ValueError, match="not those of the tiles"):
+        replace(field, stored=field.layers._replace(table=field.layers.table + 1))
+
+
+def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    field, scan, pose, others = scene
+    np.save(tmp_path / "bits.npy", field.layers.bits)
+    bits = np.load(tmp_path / "bits.npy", mmap_mode="r")
+    stored = replace(field, stored=field.layers._replace(bits=bits))
+    monkeypatch.setattr(mapped, "LARGE", 1 << 14)
+    monkeypatch.setattr(mapped, "WINDOW", 2 * bits[0].nbytes)
+    assert len(list(Windows(bits))) == 5
+    starts = np.vstack([others, pose, np.add(pose, [500.0, -300.0, 0.0, 0.0])])  # some beside the map
+    for poses in (starts, pose[None]):
+        for one, other in zip(*(kernels.field_scores(each, scan, poses) for each in (field, stored)), strict=True):
+            np.testing.assert_array_equal(one, other)

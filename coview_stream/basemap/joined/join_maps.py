@@ -20,6 +20,7 @@ from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.joined.map_parts import MapPart, MapParts
+from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, layers_arrays
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.cache import cache_folder, evict
 from coview_stream.basemap.station_index import StationIndex
@@ -27,7 +28,7 @@ from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats, Ints
 
-_CODE = 1
+_CODE = 2
 """Counts changes of what is made of the same maps."""
 
 _MIN_GAP = 300.0
@@ -99,7 +100,8 @@ def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None 
     path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_CODE}.coview"
     if not path.is_file():
         joined = join_maps(maps)
-        file_format.save(path, joined.arrays, joined.parameters)
+        layers = layers_arrays(joined.arrays) if FIELD_ARRAYS[0] in joined.arrays else {}
+        file_format.save(path, joined.arrays | layers, joined.parameters)
         evict(cache_folder(), keep=path)
     return path
 
@@ -158,12 +160,11 @@ def _surveyed(maps: Sequence[BaseMap], moves: Sequence[Floats], block: float) ->
 
 
 def _fields(maps: Sequence[BaseMap], moves: Sequence[Floats]) -> Arrays:
-    names = [name for name in maps[0].arrays if name.startswith("field.")]
-    if any(name not in each.arrays for each in maps for name in names):
+    if any(name not in each.arrays for each in maps for name in FIELD_ARRAYS):
         return {}  # it is made when it is first used
     found: Arrays = {
         name: np.concatenate([np.asarray(each.arrays[name]) for each in maps])
-        for name in names
+        for name in FIELD_ARRAYS
         if name != "field.tiles"
     }
     tiles = []
@@ -171,7 +172,7 @@ def _fields(maps: Sequence[BaseMap], moves: Sequence[Floats]) -> Arrays:
         rows = np.array(each.arrays["field.tiles"])
         rows[:, :2] += _tiles(move, FIELD_CELL * FIELD_TILE)[::-1].astype(np.int32)
         tiles.append(rows)
-    return {**found, "field.tiles": np.concatenate(tiles)} if names else {}
+    return {**found, "field.tiles": np.concatenate(tiles)}
 
 
 def _features(maps: Sequence[BaseMap], moves: Sequence[Floats]) -> Arrays:

@@ -7,16 +7,20 @@ it is trusted as far as the user's other files are: it lies in a folder that nob
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from coview_stream.basemap.trust import FileIdentity
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import ConfigError, MapError
 
 _GB = 1e9
 _MAX_GB = 20.0  # set by hand
+_MARK = ".checked"  # suffix of the small file beside one that has been compared with its checksum
 
 
 def cache_folder() -> Path:
@@ -38,7 +42,7 @@ def evict(folder: Path, keep: Path | None = None) -> None:
     found = []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):
-            found.append((path.stat().st_mtime, _size(path), path))
+            found.append((_last_used(path), _size(path), path))
     total, bound = sum(size for _, size, _ in found), _bound()
     for _, size, path in sorted(found):
         if total <= bound:
@@ -46,6 +50,32 @@ def evict(folder: Path, keep: Path | None = None) -> None:
         if path != keep:
             _remove(path)  # who has mapped it keeps it until it ends
             total -= size
+
+
+def checked(path: Path) -> FileIdentity | None:
+    """Return what a file of the cache was when its content was last compared with its checksum; None if it never was.
+
+    It counts as used now.
+    """
+    mark = path.with_suffix(_MARK)
+    try:
+        os.utime(mark)
+        return FileIdentity(*map(int, json.loads(mark.read_text())))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def remember_checked(path: Path, identity: FileIdentity) -> None:
+    """Keep that the content of a file of the cache has been compared with its checksum."""
+    with contextlib.suppress(OSError), atomic_path(path.with_suffix(_MARK)) as part:
+        part.write_text(json.dumps(list(identity)))
+
+
+def _last_used(path: Path) -> float:
+    times = [path.stat().st_mtime]
+    with contextlib.suppress(OSError):
+        times.append(path.with_suffix(_MARK).stat().st_mtime)
+    return max(times)
 
 
 def _size(path: Path) -> int:
@@ -59,6 +89,7 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
+        path.with_suffix(_MARK).unlink(missing_ok=True)
 
 
 def _bound() -> float:

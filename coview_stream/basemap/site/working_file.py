@@ -2,24 +2,54 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
+import logging
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from coview_stream.basemap import file_format
+from coview_stream.basemap.likelihood_field import layers_arrays
 from coview_stream.basemap.signature import VerifyKey
+from coview_stream.basemap.site import cache
 from coview_stream.basemap.site.assemble import assemble
-from coview_stream.basemap.site.cache import cache_folder, evict, lock
 from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.part import read_part
 from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.errors import MapError
 
-_CODE = 1
+log = logging.getLogger("coview_stream.maps")
+
+_CODE = 2
 """Counts changes of what is made of the same layers."""
+
+
+def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, file_format.Loaded]:
+    """Return the working file of a site and what is in it; one that is damaged is made again.
+
+    Args:
+        place: directory of the site, or the file of a part of it.
+        check: compare its content with its checksum, unless that has been done since it was written.
+        verify_key: has to have signed the site.
+
+    Raises:
+        MapError: as :func:`working_file`.
+    """
+    directory, keys = (place, None) if place.is_dir() else read_part(place)
+    path = working_file(directory, verify_key, keys=keys)
+    checked = cache.checked(path)
+    try:
+        loaded = file_format.open_file(path, check, checked=checked)
+    except MapError as error:
+        log.warning("%s; it is made again", error)
+        path.unlink(missing_ok=True)
+        path = working_file(directory, verify_key, keys=keys)
+        loaded = file_format.open_file(path, check)
+    if check and loaded.identity != checked:
+        cache.remember_checked(path, loaded.identity)
+    return path, loaded
 
 
 def working_file(
@@ -43,17 +73,15 @@ def working_file(
     if verify_key is not None:
         manifest.check_signature(verify_key, str(directory))
     part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
-    folder = cache_folder()
+    folder = cache.cache_folder()
     path = folder / f"{manifest.sha256[:40]}{part}.{_CODE}.coview"
-    with lock(path):
+    with cache.lock(path):
         if path.is_file():
-            with contextlib.suppress(OSError):
-                os.utime(path)  # the newest is used last
             return path
         with _bar(f"{directory}: made ready for this machine", progress) as step:
             arrays, parameters = assemble(manifest, TileStore(directory), step, keys)
-        file_format.save(path, arrays, parameters)
-        evict(folder, keep=path)
+        file_format.save(path, arrays | layers_arrays(arrays), parameters)
+        cache.evict(folder, keep=path)
     return path
 
 

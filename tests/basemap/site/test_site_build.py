@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from nightly import nightly
 
+from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site import tile_build
 from coview_stream.basemap.site.executors import ProcessExecutor, SerialExecutor
@@ -184,7 +187,36 @@ def test_working_file_is_made_once_and_again_where_the_site_changes(site, cache,
     first, again = BaseMap.load(site), BaseMap.load(site)
     assert first.path == again.path
     assert first.sha256 == again.sha256
-    assert [path.suffix for path in sorted(cache.iterdir())] == [".coview", ".lock"]
+    assert [path.suffix for path in sorted(cache.iterdir())] == [".checked", ".coview", ".lock"]
+
+
+def test_working_file_is_compared_with_its_checksum_once_and_made_again_where_it_is_damaged(site, cache, monkeypatch):
+    path, compared = BaseMap.load(site).path, []
+    digest = file_format._digest
+    monkeypatch.setattr(file_format, "_digest", lambda *args: compared.append(1) or digest(*args))
+    BaseMap.load(site)
+    assert not compared
+    path.with_suffix(".checked").write_text("[1]")
+    BaseMap.load(site)
+    assert len(compared) == 1
+    with path.open("r+b") as file:
+        file.seek(-9, os.SEEK_END)
+        last = file.read(1)
+        file.seek(-9, os.SEEK_END)
+        file.write(bytes([last[0] ^ 1]))
+    assert len(BaseMap.load(site))  # it was made again
+    assert len(compared) == 4  # damaged, written, compared
+
+
+def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not(site, cache, tmp_path):
+    base_map = BaseMap.load(site)
+    assert isinstance(base_map.field.layers.bits, np.memmap)
+    base_map.save(tmp_path / "one.coview")
+    one = BaseMap.load(tmp_path / "one.coview")
+    assert not isinstance(one.field.layers.bits, np.memmap)
+    assert one.nbytes == base_map.nbytes
+    for stored, made in zip(base_map.field.layers, one.field.layers, strict=True):
+        np.testing.assert_array_equal(stored, made)
 
 
 def test_damaged_and_swapped_layers_are_named(site, cache, tmp_path):

@@ -55,8 +55,8 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
             begin = time.monotonic()
             service.process.send_signal(signal.SIGSTOP)
             until(lambda: said[-1][1] != first, 20.0)
-            service.tracks(5.0)  # it knew the place
-            assert time.monotonic() - begin < 15.0  # four statuses, of a busy machine
+            service.tracks(20.0)
+            assert time.monotonic() - begin < 40.0  # four statuses, of a busy machine
 
             service.process.send_signal(signal.SIGCONT)
             time.sleep(3.0)  # what it had still to say
@@ -69,7 +69,7 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
             second.terminate()  # it says that it ends
             begin = time.monotonic()
             until(lambda: said[-1][1] == first, 10.0)
-            service.tracks(5.0)
+            service.tracks(20.0)
             assert max(service.errors()) < FALSE
         finally:
             service.process.send_signal(signal.SIGCONT)
