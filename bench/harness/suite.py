@@ -91,6 +91,7 @@ BENCHMARKS = {
     "joint": Benchmark("fusion.joint", "whether fuse --joint pays: errors of two runs, and the distance between them"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
     "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
+    "fleet": Benchmark("stream.fleet", "hundreds of robots on a fleet of nodes, of which one is killed", limit_s=900.0),
     "fuzz": Benchmark("fuzz.fuzz", "untrusted bytes into every decoder and reader, within limits"),
     "soak": Benchmark(
         "soak.soak", "hours with a fault every minute: false poses, stuck states, time to recover, leaks"

@@ -101,7 +101,7 @@ class Drive:
 
     def T_odom_body(self, content: float) -> Pose:
         """Return the odometry, between frames as well."""
-        return _between(_run(self._world).poses, self._at(content))
+        return _odometry(self._world, round(self._at(content), 6))
 
     def truth(self, stamp_ns: int) -> Pose:
         """Return the true T_map_body at a published stamp."""
@@ -128,6 +128,11 @@ def _between(poses: Floats, at: float) -> Pose:
 @functools.cache
 def _run(world: Path) -> Run:
     return open_run(world / "run")
+
+
+@functools.lru_cache(20_000)  # shared by the robots of a process, likewise
+def _odometry(world: Path, at: float) -> Pose:
+    return _between(_run(world).poses, at)
 
 
 @functools.cache  # shared by the robots of a process

@@ -103,7 +103,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_verify_key(parser)
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operations.md)")
-    operation.add_argument("--node", metavar="NAME", help="the node's own name in its keys (the first robot's)")
+    operation.add_argument(
+        "--node",
+        metavar="NAME",
+        help="the node's own name in its keys (the first robot's; of a fleet the host's and a number)",
+    )
+    operation.add_argument(
+        "--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet, each on one of them"
+    )
     operation.add_argument(
         "--metrics",
         nargs="?",
@@ -115,6 +122,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_view(operation)
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
     operation.add_argument("--quiet", action="store_true", help="log errors only")
+
+
+def fleet_name(text: str | None) -> str | None:
+    """Return the name of a fleet; ConfigError where it is no part of a key."""
+    from coview_stream.stream.transport.key_expressions import check_chunk
+
+    return None if text is None else check_chunk(text, "--fleet")
+
+
+def default_node(args: argparse.Namespace) -> str:
+    """Return the name of a node that is given none: nodes of a fleet have the same robots."""
+    import os
+    import socket
+
+    return str(args.robot[0]) if args.fleet is None else f"{socket.gethostname()}-{os.getpid()}"
 
 
 def _host_port(text: str) -> str:
@@ -179,8 +201,8 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
-        node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
-        args.geo, initial_guesses(args.initial, args.robot), source.mirror,
+        node_keys(args.base, args.node or default_node(args)), args.metrics, verify_key,
+        args.geo, initial_guesses(args.initial, args.robot), source.mirror, fleet_name(args.fleet), args.base,
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []

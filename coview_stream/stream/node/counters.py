@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -101,7 +101,7 @@ class Counters:
 
     def to_json(self) -> dict[str, int]:
         """Plain data for the status."""
-        return asdict(self)
+        return dict(vars(self))
 
 
 class ErrorLog:

@@ -95,6 +95,7 @@ class NodeHealth:
                     "counters": session.counters.to_json(),
                 }
                 for session in list(node.sessions)
+                if node.endpoints[session.keys.robot].active
             },
         }
 

@@ -197,11 +197,11 @@ def _parsed(data: bytes) -> LastPose:
     T = np.asarray(document["T_map_body"], dtype=np.float64)
     if not is_pose(T):
         raise ValueError("T_map_body is not a finite rigid 4x4 transform")
-    known = _calibration(document.get("calibration"))
+    known = read_calibration(document.get("calibration"))
     return LastPose(str(document["robot"]), str(document["map_sha256"]), int(document["stamp_ns"]), T, known)
 
 
-def _calibration(plain: Any) -> Calibration | None:
+def read_calibration(plain: Any) -> Calibration | None:
     """Return a calibration as :func:`save` wrote it; ValueError, TypeError or KeyError for another thing."""
     if plain is None:
         return None

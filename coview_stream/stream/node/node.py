@@ -18,6 +18,7 @@ from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.engine_feed import EngineFeed
 from coview_stream.stream.node.engine_process import EngineRunner
+from coview_stream.stream.node.fleet import FleetShares
 from coview_stream.stream.node.jobs import Job
 from coview_stream.stream.node.robot_endpoints import RobotEndpoints
 from coview_stream.stream.node.scheduling import Rate
@@ -89,7 +90,7 @@ class Node:
         pose_format: str | None = None,
         odometry: EngineRunner | None = None,
         background: Mapping[str, Callable[[threading.Event], None]] | None = None,
-        elections: Elections | None = None,
+        elections: Elections | FleetShares | None = None,
     ) -> None:
         self.sessions = sessions if isinstance(sessions, list) else list(sessions)  # in place: others look at it
         self.transport = transport

@@ -12,6 +12,7 @@ from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import Encoded, PoseMessage, Sample
 from coview_stream.stream.node.election import Elections
+from coview_stream.stream.node.fleet import FleetShares
 from coview_stream.stream.node.initial_pose import decode_guess, guess_of_fields
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
@@ -40,7 +41,7 @@ class RobotEndpoints:
         reporter: Reporter,
         wake_engines: Callable[[Session], None],
         pose_format: str | None = None,
-        elections: Elections | None = None,
+        elections: Elections | FleetShares | None = None,
     ) -> None:
         self._elections = elections
         self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
@@ -52,6 +53,9 @@ class RobotEndpoints:
         self._bare = session.keys.bare and pose_format is None
         self._publisher: Publisher | None = None
         self.beside: list[Callable[[PoseMessage], None]] = []  # called with every pose that goes out
+        self.waits = False
+        """Whether it listens only from :meth:`listen` on, not once it is declared."""
+        self._endings: list[Callable[[], None]] = []  # of subscriptions
 
     @property
     def session(self) -> Session:
@@ -74,14 +78,36 @@ class RobotEndpoints:
         keys, transport = self.session.keys, self._transport
         self._publisher = self._pose_publisher(node_id, number)
         self._reporter.declare(self.session)
-        if self.session.odometry_source == "robot":
-            transport.subscribe(keys.odometry, self.on_odometry, "all")
-        transport.subscribe(keys.cloud, self.on_cloud, "newest")
+        if not self.waits:
+            self.listen()
         transport.answer(keys.relocalize, self.relocalize)
         transport.answer(keys.reset, self.reset)
         transport.answer(keys.suggest, self.suggest)
         transport.subscribe(keys.initial_pose, self.on_initial_pose, "all")
         transport.announce(keys.alive)
+
+    @property
+    def listening(self) -> bool:
+        """Whether clouds and odometry are taken in."""
+        return bool(self._endings)
+
+    @property
+    def active(self) -> bool:
+        """Whether this node serves the robot or stands by for it; not where another node of its fleet serves it."""
+        return self.listening or not self.waits
+
+    def listen(self) -> None:
+        """Take clouds and odometry in from now on."""
+        keys, transport = self.session.keys, self._transport
+        if self.session.odometry_source == "robot":
+            self._endings.append(transport.subscribe(keys.odometry, self.on_odometry, "all"))
+        self._endings.append(transport.subscribe(keys.cloud, self.on_cloud, "newest"))
+
+    def stop_listening(self) -> None:
+        """Take no clouds and no odometry in: nobody has to send them here."""
+        endings, self._endings = self._endings, []
+        for end in endings:
+            end()
 
     def _pose_publisher(self, node_id: str, number: int) -> Publisher:
         keys = self.session.keys
@@ -148,6 +174,8 @@ class RobotEndpoints:
 
     def publish_pose(self, now: float) -> None:
         """Let time pass in the session, and publish the pose if it is known."""
+        if not self.active:
+            return
         with self._switching:
             self._publish_pose(now)
         self._reporter.report_change(self.session)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +57,8 @@ class ServeOptions:
         geo: encoding in which poses go out as places on Earth as well; None: they do not.
         guesses: of the places of robots, by name: tried, never trusted.
         mirror: of the site that the map is a copy of, whose changes are followed; None of a map that is here.
+        fleet: name of the fleet of nodes that share the robots; None: this one serves all, or stands by for all.
+        base: first part of the fleet's keys.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
     """
 
@@ -79,6 +82,8 @@ class ServeOptions:
     geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
     mirror: Mirror | None = None
+    fleet: str | None = None
+    base: str = "coview"
 
 
 def open_node(
@@ -113,6 +118,8 @@ def open_node(
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.maps.map_follower import MapFollower
         from coview_stream.stream.node.election import Elections
+        from coview_stream.stream.node.fleet import LEASE_MS, FleetShares
+        from coview_stream.stream.node.fleet_member import FleetMember
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.locations import LocationPublisher, MapReference
         from coview_stream.stream.node.map_view import MapViewAnswer
@@ -124,9 +131,16 @@ def open_node(
 
         reference = None if options.geo is None else MapReference(options.map_path)
         transport = open_transport(
-            options.connect, options.listen, options.zenoh_config, options.node.max_payload, check_silence=True
-        )
-        elections = Elections(options.keys, options.node.status_rate, needs_connection=bool(options.connect))
+            options.connect, options.listen, options.zenoh_config, options.node.max_payload,
+            check_silence=options.fleet is None,  # another session would hear the other nodes' robots
+            lease_ms=None if options.fleet is None else LEASE_MS,
+        )  # fmt: skip
+        elections: Elections | FleetShares
+        if options.fleet is None:
+            elections = Elections(options.keys, options.node.status_rate, needs_connection=bool(options.connect))
+        else:
+            name = uuid.uuid4().hex[:12]
+            elections = FleetShares(options.fleet, options.keys, options.base, options.node.status_rate, name)
         elections.declare(transport)
         sessions = make_sessions(options, base_map)
         for session in sessions:
@@ -155,6 +169,10 @@ def open_node(
             node.run_beside("map source", follower.run)
         node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
+        if isinstance(elections, FleetShares):
+            for endpoints in node.endpoints.values():
+                endpoints.waits = True
+            node.run_beside("fleet", FleetMember(elections, node.endpoints, transport).run)
         map_view = MapViewAnswer(options.map_path, lambda: node.map_sha256)
         for keys in options.keys:
             transport.answer(keys.map_view, map_view)

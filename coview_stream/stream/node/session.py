@@ -27,6 +27,7 @@ from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of
 from coview_stream.stream.node.engine_queue import EngineQueue
 from coview_stream.stream.node.frame_sync import FrameSync
+from coview_stream.stream.node.handover import Handover
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, OdometryJob, Result, SearchJob
 from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
 from coview_stream.stream.node.robot_state import RobotState, StateHistory
@@ -219,6 +220,33 @@ class Session:
         with self._lock:
             if self.robot_state.correction is None and not self._hint.forgotten:
                 self._hint.offer(T_map_body, calibration)
+
+    def give_up(self) -> None:
+        """Forget everything, for another node goes on with the robot."""
+        with self._lock:
+            self._hint = PoseHint()
+            self._guess = None
+            self._clear()
+
+    def handover(self) -> Handover | None:
+        """Return where the robot is, for another node that goes on with it; None while that is not known."""
+        with self._lock:
+            correction = self.robot_state.correction
+            if correction is None or not self.robot_state.state.has_place:
+                return None
+            return Handover(self.map_sha256, correction.T_map_odom, self.robot_state.calibration)
+
+    def take_over(self, known: Handover) -> bool:
+        """Go on with a robot that another node has followed: its place becomes a hypothesis with the next frame.
+
+        Returns False, and does nothing, while no odometry has come.
+        """
+        with self._lock:
+            newest = self.odometry.newest
+            if newest is None:
+                return False
+            self.hint_pose(known.T_map_odom @ newest.T_odom_body, known.calibration)
+            return True
 
     def guess_place(self, guess: PlaceGuess) -> bool:
         """Have the search try a place that somebody names; return False, and do nothing, while a place is known.

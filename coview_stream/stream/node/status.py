@@ -14,6 +14,7 @@ from coview_stream.messages.hypotheses import encode_hypotheses
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections
+from coview_stream.stream.node.fleet import FleetShares
 from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status_size import encode_status
@@ -47,7 +48,7 @@ class Reporter:
         sessions: Sequence[Session],
         transport: Transport,
         errors: RateLimitedErrors,
-        elections: Elections | None = None,
+        elections: Elections | FleetShares | None = None,
     ) -> None:
         self._elections = elections
         self.changed = threading.Event()

@@ -64,9 +64,16 @@ class MemoryTransport:
 
     # for the node or client under test
 
-    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
         """Call ``handler`` within each matching publication; nothing is ever queued, so both policies are the same."""
-        self._subscriptions.append((check_expression(key, "key"), handler, policy))
+        subscription = (check_expression(key, "key"), handler, policy)
+        self._subscriptions.append(subscription)
+
+        def end() -> None:
+            if subscription in self._subscriptions:
+                self._subscriptions.remove(subscription)
+
+        return end
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher; it stays readable in :attr:`publishers`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
@@ -41,7 +41,6 @@ class Subscription:
     due: float = 0.0
     wait: float = _SILENT
     handling: bool = False
-    serial: threading.Lock = field(default_factory=threading.Lock)  # of the handler's calls
 
 
 class SubscriptionCheck:
@@ -73,6 +72,10 @@ class SubscriptionCheck:
         found = Subscription(key, self._clock(), self._clock() + _SILENT)
         self._all.append(found)
         return found
+
+    def remove(self, subscription: Subscription) -> None:
+        """Check a subscription no more."""
+        self._all = [each for each in self._all if each is not subscription]
 
     def heard(self, subscription: Subscription) -> None:
         """Note a sample."""

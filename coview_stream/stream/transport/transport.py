@@ -51,8 +51,11 @@ class Connection:
 class Transport(Protocol):
     """A publish/subscribe session. Handlers are called on a thread of the subscription's own, one call at a time."""
 
-    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
-        """Call ``handler`` for what is published on ``key`` (a key expression). Its errors are logged."""
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
+        """Call ``handler`` for what is published on ``key`` (a key expression). Its errors are logged.
+
+        Returns what ends the subscription, which may be called from any thread and more than once.
+        """
         ...
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:

@@ -85,7 +85,9 @@ def zenoh_errors(what: str) -> Iterator[None]:
         raise TransportError(f"{what}: zenoh failed inside: {reason(error)}") from error
 
 
-def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None) -> Any:
+def compose(
+    connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None, lease_ms: int | None = None
+) -> Any:
     """Build a ``zenoh.Config``.
 
     Settings of the file have precedence over our defaults; ``connect`` and ``listen`` replace its endpoints. Without
@@ -96,6 +98,7 @@ def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path 
         connect: endpoints to connect to, for example ``tcp/10.0.0.1:7447``.
         listen: endpoints to listen on.
         path: a zenoh configuration, JSON5 or YAML.
+        lease_ms: how long others wait for a sign of life before they take us for dead; None leaves it at zenoh's 10 s.
 
     Raises:
         TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
@@ -115,6 +118,8 @@ def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path 
     for key, value in _DEFAULTS.items():
         if _is_unset(config, key):
             _insert(config, key, value)
+    if lease_ms is not None and "lease" not in _COMMENT.sub("", text):
+        _insert(config, "transport/link/tx/lease", lease_ms)
     if "shared_memory" not in _COMMENT.sub("", text):  # set or not, it reads the same: ask the file's text
         _insert(config, _SHARED_MEMORY, False)
     _check(config, path)

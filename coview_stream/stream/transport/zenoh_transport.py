@@ -15,6 +15,7 @@ from coview_stream.errors import TransportError
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.inboxes import THREADS, Inboxes
 from coview_stream.stream.transport.subscription_check import Subscription, SubscriptionCheck
 from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
@@ -33,7 +34,7 @@ _CLOSE_TIMEOUT = 1.0  # of zenoh's own closing, which says goodbye on a link tha
 _JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice within 0.1
 _EXIT_TIMEOUT = 10.0  # for each thread to end with the process: longer than any attempt to open
 _TOKEN_TIMEOUT = 1.0  # for answers to a question for tokens
-_QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
+_QUEUE = 1024  # samples; 5 s of 200 Hz odometry
 
 
 def open_transport(
@@ -42,6 +43,7 @@ def open_transport(
     config: Path | None = None,
     max_payload: int | None = None,
     check_silence: bool = False,
+    lease_ms: int | None = None,
 ) -> ZenohTransport:
     """Open a zenoh session.
 
@@ -55,6 +57,7 @@ def open_transport(
         max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
         check_silence: open the session anew once another one hears what this one does not, see
             :mod:`coview_stream.stream.transport.subscription_check`; only of a client.
+        lease_ms: how long others wait for a sign of life from this session; None leaves it at zenoh's 10 s.
 
     Raises:
         TransportError: if the configuration is wrong or an endpoint cannot be listened on.
@@ -63,7 +66,7 @@ def open_transport(
 
     # RUST_LOG=zenoh=warn prints why a router refuses us; without it this is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
-    return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload, check_silence)
+    return ZenohTransport(zenoh_config.compose(connect, listen, config, lease_ms), max_payload, check_silence)
 
 
 class ZenohTransport:
@@ -82,6 +85,7 @@ class ZenohTransport:
         self._publishers: list[ZenohPublisher] = []
         self._check = SubscriptionCheck(self._listen, self._reopen, self._guard)
         self._answers = Answers(self._guard)
+        self._inboxes = Inboxes(self._guard)
         self._writer = Writer(self._guard)
         self._session: Any = None
         # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
@@ -90,26 +94,50 @@ class ZenohTransport:
         if check_silence and self._waits and not zenoh_config.has_identity(config):
             self._start("subscription check", self._check.run, self._closing)
 
-    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
-        """Call ``handler`` on a thread of its own; ``newest`` keeps one unread sample, ``all`` queues 1024.
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
+        """Call ``handler`` on one of our threads; ``newest`` keeps one unread sample, ``all`` the newest 1024.
+
+        Samples of a subscription are handled one at a time, in order. Returns what ends the subscription.
 
         Raises:
             TransportError: if ``key`` is no key expression or the transport is closed.
         """
         import zenoh
 
-        size = 1 if policy == "newest" else _QUEUE
-        channel = zenoh.handlers.RingChannel if policy == "newest" else zenoh.handlers.FifoChannel
-
         self._require_key(key)
         subscription = self._check.add(key)
+        inbox = self._inboxes.open(key, self._receiver(subscription, handler), 1 if policy == "newest" else _QUEUE)
+        declared: list[Any] = []
+        ended = threading.Event()
 
         def declare(session: Any) -> None:
-            subscriber = session.declare_subscriber(key, channel(size))
+            if ended.is_set():
+                return
+            callback = zenoh.handlers.Callback(inbox.put, indirect=False)
+            subscriber = session.declare_subscriber(key, callback)
+            declared[:] = [subscriber]
             self._declared.append(subscriber)
-            self._start(f"subscriber {key}", self._receive, subscription, subscriber, handler)
+            if not any(thread.name.startswith("coview inboxes") for thread in self._threads):
+                for number in range(THREADS):
+                    self._start(f"inboxes {number + 1}", self._inboxes.run)
+
+        def end() -> None:
+            ended.set()
+            inbox.close()
+            self._check.remove(subscription)
+            with self._lock:
+                if declare in self._declarations:
+                    self._declarations.remove(declare)
+                ending = [subscriber for subscriber in declared if subscriber in self._declared]
+                for subscriber in ending:
+                    self._declared.remove(subscriber)
+                declared.clear()
+            for subscriber in ending:
+                with self._guard.catch(key):
+                    subscriber.undeclare()
 
         self._declare(key, declare)
+        return end
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
@@ -229,6 +257,7 @@ class ZenohTransport:
             self._end_session(session)
         self._writer.end()
         self._answers.end()
+        self._inboxes.end()
         end = time.monotonic() + _JOIN_TIMEOUT
         for thread in self._threads:
             if thread is not threading.current_thread():
@@ -362,17 +391,19 @@ class ZenohTransport:
         self._threads.append(thread)
         thread.start()
 
-    def _receive(self, subscription: Subscription, subscriber: Any, handler: Callable[[Sample], None]) -> None:
+    def _receiver(self, subscription: Subscription, handler: Callable[[Sample], None]) -> Callable[[Any], None]:
+        """Return what a subscription's inbox calls with each of zenoh's samples."""
         import zenoh
 
-        for sample in subscriber:  # ends when the session closes
+        def handle(sample: Any) -> None:
             if self._closing.is_set():
                 return
             self._check.heard(subscription)
             if sample.kind == zenoh.SampleKind.PUT:
-                # one call at a time, also while the thread of a session before this one still ends
-                with subscription.serial, self._guard.catch(subscription.key):
-                    subscription.handling = True
+                subscription.handling = True
+                try:
                     handler(plain(sample, self._max_payload))
-                subscription.handling = False
-            del sample  # it may be large, and must not live until the next one comes
+                finally:
+                    subscription.handling = False
+
+        return handle

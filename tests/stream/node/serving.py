@@ -23,7 +23,7 @@ FALSE = 1.0  # metres: the world is 68 m wide and its poses are good to a few ce
 class Service:
     """A process that serves a copy of a map, and a robot that goes to and fro on it, ten frames a second."""
 
-    def __init__(self, world_file, drive, folder, router="", robots_router="", **environment):
+    def __init__(self, world_file, drive, folder, router="", robots_router="", arguments=(), **environment):
         """Listen, and be connected to, unless the endpoints of a router are given: the node's, and the robot's."""
         self.folder, self.drive = folder, drive
         self.map = folder / "site.coview"
@@ -40,7 +40,7 @@ class Service:
         self.process = subprocess.Popen(
             python_command(
                 "coview_stream", "serve", str(self.map), "--robot", "r1", *where,
-                "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json",
+                "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json", *arguments,
             ),
             env=python_environment() | notices | environment,
             stderr=subprocess.PIPE,
@@ -79,8 +79,8 @@ class Service:
             self._log.append(line)
 
     def robot(self):
-        """What the node says of the robot."""
-        return self.health()["robots"]["r1"]
+        """What the node says of the robot; None where another one of its fleet has it."""
+        return self.health()["robots"].get("r1")
 
     def health(self):
         try:

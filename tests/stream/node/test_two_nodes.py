@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -82,13 +83,13 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
 class Other:
     """Another process that serves the robot of a service."""
 
-    def __init__(self, service, router):
+    def __init__(self, service, router, *arguments):
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
         command = ("serve", str(service.map), "--robot", "r1", "--connect", router, "--no-state")
         self.process = subprocess.Popen(
-            python_command("coview_stream", *command, "--metrics", self.metrics),
+            python_command("coview_stream", *command, "--metrics", self.metrics, *arguments),
             env=python_environment(),
             stderr=subprocess.DEVNULL,
         )
@@ -97,11 +98,19 @@ class Other:
         """What it says of the robot; None while it cannot be asked."""
         try:
             with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
-                return json.load(answer)["robots"]["r1"]
+                return json.load(answer)["robots"].get("r1")
         except urllib.error.HTTPError as error:  # not ready
-            return json.load(error)["robots"]["r1"]
+            return json.load(error)["robots"].get("r1")
         except OSError:
             return None
+
+    def answers(self):
+        """Whether it can be asked and is ready."""
+        try:
+            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
+                return bool(json.load(answer)["ready"]["ok"])
+        except OSError:  # not ready among them
+            return False
 
     def wait(self, state="TRACKING"):
         until(lambda: (told := self.robot()) is not None and told["state"] == state, 60.0)
@@ -187,3 +196,49 @@ def test_network_in_two_parts_has_one_node_again(world_file, slow_drive, tmp_pat
             if other is not None:
                 other.end()
             service.end()
+
+
+@nightly
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_of_a_fleet_one_node_serves_and_another_goes_on_when_it_dies_or_hangs(world_file, slow_drive, tmp_path, end):
+    fleet = ("--fleet", "yard")
+    with Router() as router:
+        service = Service(
+            world_file, slow_drive, tmp_path, router=router.endpoint, robots_router=router.endpoint, arguments=fleet
+        )
+        other = Other(service, router.endpoint, *fleet)
+        try:
+            until(lambda: other.answers(), 60.0)
+            service.tracks(60.0)
+            first = only_server(service, service, other)
+            victim = (service, other)[first].process
+            count = len(service.poses)
+            victim.send_signal(end)
+            until(lambda: len(service.poses) > count + 5, 20.0)
+            gap = max(b - a for (a, _), (b, _) in itertools.pairwise(service.poses[count - 5 :]))
+            assert gap < 6.0, "of a busy machine; 3 s on an idle one"
+            if end is signal.SIGSTOP:
+                victim.send_signal(signal.SIGCONT)  # it takes its robot back, and nobody else serves it
+                until(lambda: serving_now(service, other) == first, 30.0)
+                assert only_server(service, service, other) == first
+            assert max(service.errors()) < FALSE
+        finally:
+            service.process.send_signal(signal.SIGCONT)
+            other.process.send_signal(signal.SIGCONT)
+            other.end()
+            service.end()
+
+
+def only_server(service, *nodes):
+    """After some time to settle: which of the nodes of a fleet has the robot; its poses come once."""
+    time.sleep(3.0)
+    count = len(service.poses)
+    time.sleep(3.0)
+    assert 15 < len(service.poses) - count < 45  # ten a second, not twice as many
+    return serving_now(*nodes)
+
+
+def serving_now(*nodes):
+    """Which of the nodes has the robot, None unless it is one."""
+    has = [k for k, node in enumerate(nodes) if (told := node.robot()) is not None and told["serves"]]
+    return has[0] if len(has) == 1 else None

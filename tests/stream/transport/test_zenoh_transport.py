@@ -226,7 +226,7 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
         transport.answer("c", lambda _: {})
         publisher = transport.publisher("d", "data")
         mine = {thread for thread in threading.enumerate() if thread.name.startswith("coview ")}
-        assert {"coview subscriber a", "coview subscriber b", "coview answers"} <= {thread.name for thread in mine}
+        assert {"coview inboxes 1", "coview answers"} <= {thread.name for thread in mine}
         start = time.monotonic()
         transport.close()
         assert time.monotonic() - start < 1.0
@@ -322,3 +322,32 @@ def test_config_file_overrides_defaults_and_options_override_its_endpoints(tmp_p
     mode, _, listen, _, shared, _ = settings(compose(path=path), *keys)
     assert (mode, shared) == ("router", True)
     assert listen["router"] == ["tcp/[::]:7447"]
+
+
+def test_subscription_that_is_ended_hears_nothing(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+    node, robot = pair
+    heard: list[bytes] = []
+    others: list[bytes] = []
+    end = node.subscribe("coview/r1/in/cloud", lambda sample: heard.append(bytes(sample.payload)), "newest")
+    node.subscribe("coview/r1/in/odom", lambda sample: others.append(bytes(sample.payload)), "all")
+    cloud, odom = (robot.publisher(f"coview/r1/in/{name}", "report") for name in ("cloud", "odom"))
+
+    def sent() -> bool:
+        cloud.put(Encoded(b"1", ""))
+        odom.put(Encoded(b"2", ""))
+        return bool(heard and others)
+
+    until(sent)
+    end()
+    end()  # more than once does no harm
+    count, other = len(heard), len(others)
+    until(lambda: sent() and len(others) > other + 3)
+    assert len(heard) == count
+    again = node.subscribe("coview/r1/in/cloud", lambda sample: heard.append(b"again"), "newest")
+    until(lambda: sent() and b"again" in heard)
+    again()
+
+
+def test_lease_is_what_is_asked_for_unless_the_file_says() -> None:
+    assert "2000" in str(compose(lease_ms=2000).get_json("transport/link/tx/lease"))
+    assert "10000" in str(compose().get_json("transport/link/tx/lease"))
