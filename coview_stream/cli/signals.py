@@ -29,9 +29,10 @@ class Stop:
 
     def request(self) -> None:
         """Ask to end; safe in a signal handler."""
-        self.requested = True
         with contextlib.suppress(OSError):  # full or closed: it has been asked before
             os.write(self._write, _ASKED)
+        # last: whoever sees it may close the pipe, whose numbers may be those of another file then
+        self.requested = True
 
     def now(self) -> float:
         """Return the steady clock, seconds."""

@@ -56,6 +56,14 @@ def test_stop_can_be_requested_and_used_from_other_threads():
     assert found == [False]
 
 
+def test_request_is_seen_only_after_it_was_written(monkeypatch):
+    stop, seen = Stop(), []
+    monkeypatch.setattr(os, "write", lambda *_: seen.append(stop.requested))
+    stop.request()
+    assert (seen, stop.requested) == ([False], True)  # or the pipe might be closed, and another one have its number
+    stop.close()
+
+
 def test_stop_clock_is_monotonic():
     stop = Stop()
     before = stop.now()
