@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_kernels.mapped import release
 from coview_stream.basemap import file_format, tiles
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, field_of
 from coview_stream.basemap.shapes import check_arrays
@@ -275,7 +276,7 @@ class BaseMap:
     def release(self) -> None:
         """Let the memory go that the file's pages take; what is used again is read again."""
         for array in self._arrays.values():
-            file_format.release(array)
+            release(array)
 
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
         """Return the descriptors (M, R, S) of one channel.
@@ -339,7 +340,7 @@ class BaseMap:
             field = field_of(arrays)
             _ = field.layers
             for array in (field.tiles, field.occupied, field.ground, field.edge):  # only the layers are looked up
-                file_format.release(array)
+                release(array)
             return field
         except (KeyError, ValueError) as error:
             raise MapError(f"the map's likelihood field cannot be used ({error}); build it again") from error

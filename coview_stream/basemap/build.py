@@ -24,7 +24,7 @@ from coview_stream.clouds.cloud_head import check_together, extent_in_words, hea
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points
 
 _MIN_POINTS = 1000  # set by hand
@@ -131,7 +131,21 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
 
     The neighbours bridge the shadows of buildings, which have no points but were surveyed.
     """
+    return surveyed_around(cells_of(points, block), block)
+
+
+def cells_of(points: Points, block: float) -> Ints:
+    """Return column and row (K, 2) of the block-sized cells that hold points (N, 3), each once."""
     cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
+    low = cells.min(axis=0, initial=0)
+    columns, rows = (cells - low).T
+    grid = np.zeros((int(rows.max(initial=-1)) + 1, int(columns.max(initial=-1)) + 1), dtype=bool)
+    grid[rows, columns] = True
+    return np.asarray(np.argwhere(grid)[:, ::-1] + low)
+
+
+def surveyed_around(cells: Ints, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
+    """Return the mask of :func:`surveyed_cells` of cells (K, 2) that hold points."""
     low = cells.min(axis=0) - _SURVEY_MARGIN
     columns, rows = (cells - low).T
     grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import mmap
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from coview_kernels.mapped import release
 from coview_stream.basemap import trust as trusting
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.trust import FileIdentity, Trust
@@ -274,17 +274,11 @@ def _read(file: BinaryIO, start: int, entry: dict[str, Any]) -> Iterator[bytes]:
 
 
 def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
-    """Cut an array's bytes into chunks."""
+    """Cut an array's bytes into chunks; the memory of one that is mapped from a file goes as they are used."""
     data = array.reshape(-1).view(np.uint8)
     for begin in range(0, len(data), _CHUNK):
         yield data[begin : begin + _CHUNK].data
-
-
-def release(array: npt.NDArray[Any]) -> None:
-    """Let the memory of a memory-mapped array go; it is read from the file again when it is touched."""
-    mapped = getattr(array, "_mmap", None)
-    if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
-        mapped.madvise(mmap.MADV_DONTNEED)
+        release(array)
 
 
 def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[bytes | memoryview]]) -> str:

@@ -14,12 +14,14 @@ then; files that need not be small hold those as well, and nothing is in memory 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import FieldMap
+from coview_kernels.field import Zeros
 from coview_kernels.reference.field import CELL, EDGE_STEP, NO_GROUND, NOT_SURVEYED, TILE, FieldLayers
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
@@ -84,13 +86,16 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
     }
 
 
-def layers_arrays(arrays: Arrays) -> Arrays:
+def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[], object] = lambda: None) -> Arrays:
     """Return the rasters in which a field is looked up, for a file that need not be small.
 
     Args:
         arrays: of the map, with those of :func:`field_arrays`.
+        zeros: makes the arrays that they are written to; None makes them in memory.
+        done: called after each batch.
     """
-    layers = field_of(arrays).layers
+    field = field_of(arrays)
+    layers = field.layers if zeros is None else field.made_layers(zeros, done)
     return {f"{LAYERS}{name}": values for name, values in layers._asdict().items()}
 
 

@@ -26,7 +26,9 @@ Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
 _SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
-_TIERS, _SAMPLED = ("station_codes", "station_codes.rest"), "station_codes.sample"
+CODES = ("station_codes", "station_codes.rest")
+"""Names of the tiers' codes in a map's file."""
+_SAMPLED = "station_codes.sample"
 
 
 @dataclass(frozen=True)
@@ -77,16 +79,16 @@ class StationIndex:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
         """Return the index of these channels that a map's file holds, None if it holds none that can be used."""
-        if any(name not in arrays for tier in _TIERS for name in _names(tier)) or _SAMPLED not in arrays:
+        if any(name not in arrays for tier in CODES for name in _names(tier)) or _SAMPLED not in arrays:
             return None
-        sample, stations = arrays[_SAMPLED], len(arrays[_TIERS[0]])
+        sample, stations = arrays[_SAMPLED], len(arrays[CODES[0]])
         if sample.ndim != 4 or sample.shape[:2] != (len(channels), len(sampled_stations(stations))):
             return None
         count, _, rings, sectors = sample.shape
         # kernels look up what the shapes promise
         shapes = (stations, 16, 16), (16, 16, rings * count, 2), (16, 2, 16), (33,)
         tiers = []
-        for tier in _TIERS:
+        for tier in CODES:
             codes, basis, step, norm = (arrays[name] for name in _names(tier))
             if codes.dtype != np.int16 or (codes.shape, basis.shape, step.shape, norm.shape) != shapes:
                 return None
@@ -97,7 +99,7 @@ class StationIndex:
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
         found = {_SAMPLED: np.stack(list(self._descriptors.values()))}
-        for tier, codes in zip(_TIERS, (self.codes, self.rest), strict=True):
+        for tier, codes in zip(CODES, (self.codes, self.rest), strict=True):
             basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
             found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
         return found

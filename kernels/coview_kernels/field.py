@@ -14,10 +14,10 @@ what of the scan the map explains there (:class:`FieldScores`). All is looking u
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,14 @@ _MAX_TILES, _MAX_TABLE = 1 << 20, 1 << 21  # tiles with layers, and all of them:
 
 
 _BATCH = 512  # tiles at a time, so that intermediate arrays stay small
+_BAND = 16  # rows of tiles at a time, likewise
+
+Zeros = Callable[[str, tuple[int, ...], type[np.generic]], npt.NDArray[Any]]
+"""Returns a writable array of zeros by name, shape and type: where a layer is made."""
+
+
+def _in_memory(name: str, shape: tuple[int, ...], kind: type[np.generic]) -> npt.NDArray[Any]:
+    return np.zeros(shape, dtype=kind)
 
 
 class FieldScores(NamedTuple):
@@ -141,16 +149,29 @@ class FieldMap:
     @cached_property
     def layers(self) -> FieldLayers:
         """The rasters as they are looked up; 22 bytes a cell, made at first use unless they are stored."""
-        if self.stored is not None:
-            return self.stored
+        return self.made_layers() if self.stored is None else self.stored
+
+    def made_layers(self, zeros: Zeros = _in_memory, done: Callable[[], object] = lambda: None) -> FieldLayers:
+        """Make the rasters, batch by batch.
+
+        Args:
+            zeros: makes the arrays that they are written to.
+            done: called after each batch; may release their memory where they are mapped from files.
+        """
         table, base = self._table()
         tiles = len(base)
-        bits = np.zeros((tiles, TILE, TILE, 2), dtype=np.int64)
-        bits[1:, ..., 1] = self.occupied
-        _fill_near(bits, table)
-        surface = np.full((tiles, TILE, TILE), NOT_SURVEYED & 0xFFFF, dtype=np.int32)
-        surface[1:] = (self.edge.astype(np.int32) << 16) | (self.ground.astype(np.int32) & 0xFFFF)
-        return FieldLayers(table, base, bits, surface, _coarse(bits, table))
+        bits = zeros("bits", (tiles, TILE, TILE, 2), np.int64)
+        surface = zeros("surface", (tiles, TILE, TILE), np.int32)
+        surface[:1] = NOT_SURVEYED & 0xFFFF
+        for start in range(0, tiles - 1, _BATCH):
+            part, into = slice(start, start + _BATCH), slice(start + 1, start + 1 + _BATCH)
+            bits[into, ..., 1] = self.occupied[part]
+            surface[into] = (self.edge[part].astype(np.int32) << 16) | (self.ground[part].astype(np.int32) & 0xFFFF)
+            done()
+        _fill_near(bits, table, done)
+        coarse = zeros("coarse", _coarse_shape(*table.shape), np.uint16)
+        _fill_coarse(coarse, bits, table, done)
+        return FieldLayers(table, base, bits, surface, coarse)
 
     def _table(self) -> tuple[I32, F32]:
         """Return the number of each tile (R, C), 0 for none, and the height (T + 1,) that each counts from."""
@@ -250,7 +271,7 @@ def _spread(points: F32, count: int) -> F32:
     return points[np.arange(count) * len(points) // count] if len(points) > count else points
 
 
-def _fill_near(bits: I64, table: I32) -> None:
+def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
     """Set the first bits of (T + 1, 32, 32, 2) within half a metre of the second ones: also in the six neighbours."""
     row, column = np.nonzero(table)
     for start in range(0, len(row), _BATCH):
@@ -267,31 +288,35 @@ def _fill_near(bits: I64, table: I32) -> None:
         near = (words | (words << one) | (words >> rest) | (words >> one) | (words << rest)).view(np.int64)
         near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
         bits[table[rows, columns], ..., 0] = near
+        done()
 
 
-def _coarse(bits: I64, table: I32) -> U16:
-    """Return (32, W / 8, H) uint16 planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
-    half = TILE // 2
+def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:
+    """Fill (32, W / 8, H) planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
+    half, (rows, columns) = TILE // 2, table.shape
     folded = np.zeros((len(bits), half, half), dtype=np.uint32)
     for start in range(0, len(bits), _BATCH):
         cells = np.ascontiguousarray(bits[start : start + _BATCH, ..., 1]).view(np.uint64).reshape(-1, half, 2, half, 2)
         folded[start : start + _BATCH] = _pairs(
             cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1]
         )
-    rows, columns = table.shape
-    metres = folded[table].transpose(0, 2, 1, 3).reshape(rows * half, columns * half)
+        done()
     one, rest = np.uint32(1), np.uint32(31)
-    out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
-    out[1:] |= metres[:-1]
-    out[:-1] |= metres[1:]
-    out[:, 1:] |= metres[:, :-1]
-    out[:, :-1] |= metres[:, 1:]
-    planes = np.zeros(_coarse_shape(rows, columns), dtype=np.uint16)
-    for level, plane in enumerate(planes):
-        packed = np.packbits((out >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
-        plane[:-1] = packed
-        plane[:-2] |= packed[1:] << np.uint16(8)
-    return planes
+    for start in range(0, rows, _BAND):
+        stop = min(start + _BAND, rows)
+        seen = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band is enough, and a tile has that
+        metres = folded[table[seen]].transpose(0, 2, 1, 3).reshape(-1, columns * half)
+        out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
+        out[1:] |= metres[:-1]
+        out[:-1] |= metres[1:]
+        out[:, 1:] |= metres[:, :-1]
+        out[:, :-1] |= metres[:, 1:]
+        own = out[(start - seen.start) * half : (stop - seen.start) * half]
+        for level, plane in enumerate(planes[..., start * half : stop * half]):
+            packed = np.packbits((own >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
+            plane[:-1] = packed
+            plane[:-2] |= packed[1:] << np.uint16(8)
+        done()
 
 
 def _coarse_shape(rows: int, columns: int) -> tuple[int, int, int]:

@@ -65,6 +65,13 @@ class Windows:
         self._map.madvise(mmap.MADV_DONTNEED, begin, min(end, len(self._map)) - begin)
 
 
+def release(array: npt.NDArray[Any]) -> None:
+    """Let the memory of an array that is mapped from a file go; it is read again when it is touched."""
+    whole = _map_of(array)
+    if whole is not None:
+        whole.madvise(mmap.MADV_DONTNEED)
+
+
 def _map_of(array: npt.NDArray[Any]) -> mmap.mmap | None:
     """Return the file's map that an array lies in, None of one in memory or one that can be written to."""
     base: Any = array

@@ -175,24 +175,33 @@ class StationCodes:
         return np.arange(0, stations, -(-stations // _SAMPLE) or 1)
 
     @classmethod
-    def empty_tiers(cls, sample: Sequence[npt.NDArray[Any]], count: int, stations: int) -> list[StationCodes]:
+    def empty_tiers(
+        cls, sample: Sequence[npt.NDArray[Any]], count: int, stations: int, into: Sequence[I16] | None = None
+    ) -> list[StationCodes]:
         """Return codes of which none is filled in yet, learned from the descriptors of a sample.
 
         Args:
             sample: descriptors (K, R, S) of :meth:`learned_from`, one array per channel.
             count: of tiers, each of what those before leave out.
             stations: that are to be coded.
+            into: arrays (M, 16, 16) for the codes of each tier; None makes them.
 
         Raises:
             ValueError: the channels' shapes differ.
         """
         _check_shapes(sample)
         sectors, spectra = sample[0].shape[2], _spectra(_columns(sample))
-        empty = np.empty((stations, _ROWS, _LANES), dtype=np.int16)
+        if into is None:
+            into = [np.empty(cls.shape_of(stations), dtype=np.int16) for _ in range(count)]
         return [
-            cls(empty.copy(), basis, _steps(spectra, basis), np.zeros(2 * _LANES + 1, dtype=np.float32), sectors)
-            for basis in _eigenvectors(spectra, count)
+            cls(codes, basis, _steps(spectra, basis), np.zeros(2 * _LANES + 1, dtype=np.float32), sectors)
+            for codes, basis in zip(into, _eigenvectors(spectra, count), strict=True)
         ]
+
+    @staticmethod
+    def shape_of(stations: int) -> tuple[int, int, int]:
+        """Return the shape of the codes of so many stations."""
+        return stations, _ROWS, _LANES
 
     @staticmethod
     def encode_tiers(tiers: Sequence[StationCodes], part: slice, descriptors: Sequence[npt.NDArray[Any]]) -> None:

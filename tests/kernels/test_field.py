@@ -142,6 +142,20 @@ def test_stored_layers_are_looked_up_instead(scene: tuple[FieldMap, FieldScan, n
         np.testing.assert_array_equal(one, other)
 
 
+def test_layers_made_in_small_batches_are_the_same(
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+):
+    field, whole = scene[0], scene[0].layers
+    monkeypatch.setattr("coview_kernels.field._BATCH", 3)
+    monkeypatch.setattr("coview_kernels.field._BAND", 2)
+    assert whole.table.shape[0] > 4
+    names = []
+    made = field.made_layers(lambda name, shape, kind: names.append(name) or np.zeros(shape, kind))
+    assert names == ["bits", "surface", "coarse"]
+    for one, other in zip(made, whole, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("name", FieldLayers._fields)
 def test_layers_that_are_not_those_of_the_tiles_are_refused(
     scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], name: str

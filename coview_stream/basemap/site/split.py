@@ -10,8 +10,10 @@ import numpy as np
 from coview_stream.basemap import file_format
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.signature import SigningKey
+from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import Progress, assemble
 from coview_stream.basemap.site.cloud_layer import cloud_layer, square_metres
+from coview_stream.basemap.site.earlier import PARAMETER
 from coview_stream.basemap.site.grid import TILE, Key, SiteGrid
 from coview_stream.basemap.site.layer_bytes import encode
 from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry, in_order
@@ -88,8 +90,10 @@ def join(directory: Path, path: Path, key: SigningKey | None = None, progress: P
         MapError: no site, a layer is missing or damaged, or the file cannot be written.
     """
     file_format.check_target(path)
-    arrays, parameters = assemble(Manifest.load(directory), TileStore(directory), progress)
-    return file_format.save(path, arrays, parameters, key)
+    with ArrayFiles(path.resolve().parent) as into:
+        arrays, parameters = assemble(Manifest.load(directory), TileStore(directory), into, progress)
+        del parameters[PARAMETER]
+        return file_format.save(path, arrays, parameters, key)
 
 
 def _features(arrays: Arrays, key: Key, tile: float) -> Arrays:

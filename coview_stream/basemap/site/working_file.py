@@ -10,10 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from coview_stream.basemap import file_format
-from coview_stream.basemap.likelihood_field import layers_arrays
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site import cache
-from coview_stream.basemap.site.assemble import assemble
+from coview_stream.basemap.site.array_files import ArrayFiles
+from coview_stream.basemap.site.assemble import assemble, layers
+from coview_stream.basemap.site.earlier import VERSION, earlier_file, remember_file
 from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.part import read_part
@@ -21,9 +22,6 @@ from coview_stream.basemap.site.tile_store import TileStore
 from coview_stream.errors import MapError
 
 log = logging.getLogger("coview_stream.maps")
-
-_CODE = 2
-"""Counts changes of what is made of the same layers."""
 
 
 def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, file_format.Loaded]:
@@ -58,7 +56,9 @@ def working_file(
     progress: bool | None = None,
     keys: Collection[Key] | None = None,
 ) -> Path:
-    """Return the working file of a site, made now if it is not there: half a minute for a tenth of a km2.
+    """Return the working file of a site, made now if it is not there.
+
+    That takes some seconds a tile, less where an earlier one of the site has the same tiles.
 
     Args:
         directory: of the site.
@@ -72,17 +72,27 @@ def working_file(
     manifest = Manifest.load(directory)
     if verify_key is not None:
         manifest.check_signature(verify_key, str(directory))
-    part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
-    folder = cache.cache_folder()
-    path = folder / f"{manifest.sha256[:40]}{part}.{_CODE}.coview"
+    folder, path = cache.cache_folder(), _path(manifest, keys)
     with cache.lock(path):
         if path.is_file():
             return path
-        with _bar(f"{directory}: made ready for this machine", progress) as step:
-            arrays, parameters = assemble(manifest, TileStore(directory), step, keys)
-        file_format.save(path, arrays | layers_arrays(arrays), parameters)
+        with _bar(f"{directory}: made ready for this machine", progress) as step, ArrayFiles(folder) as into:
+            earlier = earlier_file(directory)
+            arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
+            file_format.save(path, arrays | layers(arrays, into), parameters)
+        remember_file(directory, path)
         cache.evict(folder, keep=path)
     return path
+
+
+def working_path(directory: Path, keys: Collection[Key] | None = None) -> Path:
+    """Return where the working file of a site is or would be, or of some tiles; MapError where it is no site."""
+    return _path(Manifest.load(directory), keys)
+
+
+def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
+    part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
+    return cache.cache_folder() / f"{manifest.sha256[:40]}{part}.{VERSION}.coview"
 
 
 @contextmanager

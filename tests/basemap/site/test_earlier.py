@@ -1,0 +1,121 @@
+"""Working files made out of earlier ones: the same tiles are taken, others are made; a bad file is as good as none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap import file_format
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
+from coview_stream.basemap.site import earlier
+from coview_stream.basemap.site.earlier import PARAMETER, earlier_file
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.site_build import build_site
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.working_file import working_file
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import map_preset
+
+FAR = np.array([512_003.0, 5_120_005.0, 100.0])
+"""Puts the corner of four tiles into the small world."""
+
+
+@pytest.fixture(scope="module")
+def site(map_points, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    write_cloud(folder / "a.las", map_points + FAR)
+    build_site(folder / "a.las", folder / "site", map_preset("slam", learned=False))
+    return folder / "site"
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """Number of tiles taken from an earlier file, each time that a working file is made."""
+    counts, real = [], earlier.Earlier.__init__
+
+    def count(self, *args):
+        real(self, *args)
+        counts.append(len(self))
+
+    monkeypatch.setattr(earlier.Earlier, "__init__", count)
+    return counts
+
+
+def keys_of(site):
+    return [(tile.column, tile.row) for tile in Manifest.load(site).tiles]
+
+
+def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, taken, monkeypatch, tmp_path):
+    some = set(keys_of(site)[1:3])
+    part = file_format.open_file(working_file(site, keys=some)).arrays
+    whole = file_format.open_file(working_file(site)).arrays
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "another"))
+    anew = file_format.open_file(working_file(site)).arrays
+    assert taken == [0, 2, 0]
+    assert whole.keys() == anew.keys()
+    for name in anew:
+        if name.startswith("station_codes") and "sample" not in name:
+            assert whole[name].shape == anew[name].shape  # in other terms
+        else:
+            np.testing.assert_array_equal(whole[name], anew[name], err_msg=name)
+    for name in FIELD_ARRAYS:
+        assert len(part[name]) < len(whole[name])
+    own = (part["stations"][:, None] == whole["stations"][None]).all(axis=2).argmax(axis=1)
+    np.testing.assert_array_equal(part["station_codes"], whole["station_codes"][own])
+
+
+def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken):
+    working_file(site, keys=set(keys_of(site)[:1]))
+    base_map = BaseMap.load(site)
+    assert taken == [0, 1]
+    index = base_map.station_index
+    wanted = np.arange(0, len(base_map.stations), 97)
+    right = 0
+    for station in wanted:
+        described = base_map.descriptors_of(station)
+        scores = index.best(index.query({name: values.astype(np.float32) for name, values in described.items()}))
+        away = np.linalg.norm(base_map.stations[scores.argmin()] - base_map.stations[station])
+        right += away < 3.0
+    assert right >= 0.9 * len(wanted)
+
+
+def test_tile_whose_neighbour_was_not_there_is_made_again(site, cache, taken, tmp_path):
+    manifest = Manifest.load(site)
+    mirror, there = tmp_path / "mirror", manifest.tiles[0]
+    store = TileStore(mirror)
+    layers = [layer.sha256 for tile in manifest.tiles[:1] for layer in tile.layers.values()]
+    for sha in layers:
+        store.put(TileStore(site).path(sha).read_bytes())
+    manifest.save(mirror)
+    working_file(mirror, keys={(there.column, there.row)})
+    for sha in manifest.hashes():
+        store.put(TileStore(site).path(sha).read_bytes())
+    working_file(mirror)
+    assert taken == [0, 0]
+
+
+def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
+    first = working_file(site, keys=set(keys_of(site)[:2]))
+    with first.open("r+b") as file:
+        file.seek(-4000, 2)
+        file.write(b"\xff" * 4000)
+    working_file(site)
+    assert taken == [0, 0]
+    assert earlier_file(site) != first
+    earlier._pointer(site).write_text('"../../elsewhere.coview"')
+    assert earlier_file(site) is None
+
+
+def test_parameters_name_the_tiles(site, cache):
+    loaded = file_format.open_file(working_file(site))
+    rows = loaded.parameters[PARAMETER]
+    assert len({state for state, *_ in rows}) == len(rows) == 4
+    assert sum(count for _, _, count, _, _ in rows) == len(loaded.arrays["stations"])
+    assert sum(count for *_, count in rows) == len(loaded.arrays["field.tiles"])
