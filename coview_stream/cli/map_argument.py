@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import VerifyKey
     from coview_stream.basemap.site.mirror import Mirror
+    from coview_stream.basemap.site.served_site import ServedSite
 
 
 class LocalMap(NamedTuple):
@@ -18,10 +19,12 @@ class LocalMap(NamedTuple):
     Attributes:
         path: what :meth:`BaseMap.load` takes.
         mirror: of a site elsewhere, None of a map that is here.
+        site: whose changes or robots can be followed; None where that was not asked for, and of one file.
     """
 
     path: Path
     mirror: Mirror | None = None
+    site: ServedSite | None = None
 
 
 def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bool = False) -> None:
@@ -45,6 +48,7 @@ def local_map(
     base: str = "coview",
     connect: Sequence[str] = (),
     config: Path | None = None,
+    follows: bool = False,
 ) -> LocalMap:
     """Return the map on this machine that a command was given; of an address, what has been fetched and checked.
 
@@ -55,6 +59,7 @@ def local_map(
         base: first part of zenoh keys.
         connect: zenoh endpoints, for ``zenoh://SITE``.
         config: a zenoh configuration, likewise.
+        follows: whether the site's changes, and with ``around`` its robots, are to be followed.
 
     Raises:
         ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.
@@ -65,6 +70,7 @@ def local_map(
 
     from coview_stream.basemap.site.manifest import Manifest, is_site
     from coview_stream.basemap.site.part import Around, part_file, tiles_around
+    from coview_stream.basemap.site.served_site import ServedSite
     from coview_stream.basemap.site.site_source import is_site_address
     from coview_stream.errors import ConfigError
 
@@ -73,17 +79,27 @@ def local_map(
         from coview_stream.stream.maps.fetch_map import open_mirror
 
         mirror = open_mirror(name, circle, verify_key, base, connect, config)
-        return LocalMap(mirror.map_path, mirror)
+        if not follows:
+            return LocalMap(mirror.map_path, mirror)
+        served = ServedSite(mirror.directory, mirror, circle)
+        return LocalMap(served.map_path, mirror, served)
     path = Path(name)
     if circle is None:
         return LocalMap(path)
     if not is_site(path):
         raise ConfigError(f"--around: {name} is no directory of tiles; `coview-stream convert` makes one")
+    if follows:
+        served = ServedSite(path, None, circle)
+        return LocalMap(served.map_path, None, served)
     return LocalMap(part_file(path, tiles_around(Manifest.load(path), circle), str(circle)))
 
 
-def open_map_argument(args: argparse.Namespace) -> LocalMap:
+def open_map_argument(args: argparse.Namespace, follows: bool = False) -> LocalMap:
     """Return the map that parsed arguments name, and put its path in the place of ``args.map``.
+
+    Args:
+        args: the arguments.
+        follows: as of :func:`local_map`; of several maps none is followed.
 
     Raises:
         As of :func:`local_map`; InputError: the key cannot be read.
@@ -95,7 +111,7 @@ def open_map_argument(args: argparse.Namespace) -> LocalMap:
     base = getattr(args, "base", "coview")
     given = args.map if isinstance(args.map, list) else [args.map]
     if len(given) == 1:
-        found = local_map(str(given[0]), args.around, key, base, connect, config)
+        found = local_map(str(given[0]), args.around, key, base, connect, config, follows)
     else:
         from coview_stream.basemap.joined.join_maps import joined_file
 
@@ -103,7 +119,7 @@ def open_map_argument(args: argparse.Namespace) -> LocalMap:
         paths = [(name, local_map(path, args.around, key, base, connect, config)) for name, path in named]
         for _, each in paths:
             if each.mirror is not None:
-                each.mirror.source.close()  # of several maps none is followed
+                each.mirror.source.close()
         found = LocalMap(joined_file([(name, each.path) for name, each in paths], key))
     args.map = found.path
     return found

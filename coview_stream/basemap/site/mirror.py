@@ -15,6 +15,7 @@ from pathlib import Path
 
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.cache import cache_folder, evict
+from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import FILE, LayerEntry, Manifest, TileEntry
 from coview_stream.basemap.site.part import Around, part_file, tiles_around
 from coview_stream.basemap.site.site_source import SiteSource
@@ -35,14 +36,14 @@ class Mirror:
     Attributes:
         source: where the site is.
         directory: of the mirror, itself a site.
-        around: only tiles within this circle are fetched; None: all.
+        circles: only tiles that these meet are fetched; none: all.
         offline: why the source could not be asked the last time; empty where it could.
     """
 
     def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
         """Take the source; nothing is asked for yet. MapError: the cache cannot be used."""
         self.source = source
-        self.around = around
+        self.circles: tuple[Around, ...] = () if around is None else (around,)
         self.offline = ""
         self._verify_key = verify_key
         name = hashlib.sha256(source.name.encode()).hexdigest()[:16]
@@ -51,11 +52,11 @@ class Mirror:
 
     @property
     def map_path(self) -> Path:
-        """What a map is opened from: the mirror, or the part of it that the circle meets."""
-        if self.around is None:
+        """What a map is opened from: the mirror, or the part of it that the circles meet."""
+        if not self.circles:
             return self.directory
         manifest = Manifest.load(self.directory)
-        return part_file(self.directory, tiles_around(manifest, self.around), str(self.around))
+        return part_file(self.directory, tiles_around(manifest, *self.circles), str(self.circles[0]))
 
     def open(self, progress: Progress | None = None) -> Path:
         """Bring it up to date if the source can be asked, and return :attr:`map_path`.
@@ -97,7 +98,7 @@ class Mirror:
             before = Manifest.load(self.directory)
         except MapError:
             before = None
-        keys = None if self.around is None else tiles_around(manifest, self.around)
+        keys = tiles_around(manifest, *self.circles) if self.circles else None
         wanted = {
             layer.sha256: (layer, tile)
             for tile in manifest.tiles
@@ -121,6 +122,14 @@ class Mirror:
         elif changed:
             evict(cache_folder(), keep=self.directory)
         return changed or bool(missing)
+
+    def fetched(self, manifest: Manifest) -> set[Key]:
+        """Return the tiles of a manifest that are all there."""
+        return {
+            (tile.column, tile.row)
+            for tile in manifest.tiles
+            if all(self._store.holds(layer.sha256, layer.bytes) for layer in tile.layers.values())
+        }
 
     def _fetched(self, layer: LayerEntry, tile: TileEntry) -> bytes:
         for left in reversed(range(_TRIES)):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError, MapError
+
+log = logging.getLogger("coview_stream.maps")
 
 SUFFIX = ".tiles"
 _FORMAT = "coview-part"
@@ -52,12 +55,25 @@ class Around:
         return ",".join(f"{value:.15g}" for value in (self.x, self.y, self.radius))
 
 
-def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
-    """Return the tiles that a circle meets.
+def tiles_around(manifest: Manifest, *circles: Around) -> set[Key]:
+    """Return the tiles that circles meet.
 
     Raises:
         MapError: there is none; how far the nearest one is, is said.
     """
+    near, nearest = set(), []
+    for around in circles:
+        distances = _distances(manifest, around)
+        near |= {key for key, distance in distances.items() if distance <= around.radius}
+        nearest.append(min(distances.values(), default=math.inf))
+    if not near:
+        away = f"the nearest is {min(nearest):.0f} m away" if manifest.tiles else "it has none"
+        raise MapError(f"around {circles[0]}: no tile of the site is there, {away}; check the coordinates")
+    return near
+
+
+def _distances(manifest: Manifest, around: Around) -> dict[Key, float]:
+    """Return how far each tile is from the middle of a circle, metres."""
     x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
 
     def away(column: int, row: int) -> float:
@@ -66,12 +82,7 @@ def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
         )
         return math.hypot(*beside)
 
-    found = {key: away(*key) for tile in manifest.tiles if (key := (tile.column, tile.row))}
-    near = {key for key, distance in found.items() if distance <= around.radius}
-    if not near:
-        nearest = f"the nearest is {min(found.values()):.0f} m away" if found else "it has none"
-        raise MapError(f"around {around}: no tile of the site is there, {nearest}; check the coordinates")
-    return near
+    return {(tile.column, tile.row): away(tile.column, tile.row) for tile in manifest.tiles}
 
 
 def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
@@ -106,6 +117,33 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
         return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise MapError(f"{path}: names no part of a site ({error}); use --around again") from error
+
+
+def keep_places(directory: Path, name: str, places: Mapping[str, tuple[float, float]]) -> None:
+    """Write where robots were on a part of a site, for the next start; what goes wrong is left to the log."""
+    path = _places_file(directory, name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(json.dumps({robot: list(place) for robot, place in places.items()}).encode())
+    except OSError as error:
+        log.warning("%s: cannot be written (%s)", path, error.strerror)
+
+
+def kept_places(directory: Path, name: str) -> dict[str, tuple[float, float]]:
+    """Return what :func:`keep_places` has written, nothing where there is no such file, or another one."""
+    try:
+        with _places_file(directory, name).open("rb") as file:
+            data = json.loads(file.read(_MAX_BYTES))
+        found = {str(robot): (float(x), float(y)) for robot, (x, y) in data.items()}
+        return {robot: place for robot, place in found.items() if all(map(math.isfinite, place))}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _places_file(directory: Path, name: str) -> Path:
+    place = hashlib.sha256(f"{directory.resolve()}\n{name}".encode()).hexdigest()[:16]
+    return cache_folder() / "parts" / f"{place}.places"
 
 
 def site_directory(path: Path) -> Path | None:

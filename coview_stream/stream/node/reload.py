@@ -67,6 +67,11 @@ class MapReloader:
         self._busy = False
         self.last: dict[str, Any] = {"result": "none", "map_sha256": node.map_sha256, "error": None}
 
+    @property
+    def busy(self) -> bool:
+        """Whether a change is going on, or has been asked for."""
+        return self._busy or self._asked.is_set()
+
     def request(self) -> dict[str, Any]:
         """Ask for a change; return what is known of the newest one. Asked for during a change, another one follows."""
         self._asked.set()
@@ -77,8 +82,8 @@ class MapReloader:
         while not stopping.is_set():
             if not self._asked.wait(0.1):
                 continue
-            self._asked.clear()
             self._busy = True
+            self._asked.clear()
             self._on_change(True)
             try:
                 self._change(stopping)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.basemap.signature import VerifyKey
+from coview_stream.basemap.site.part import site_directory
 from coview_stream.basemap.trust import Trust
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
@@ -23,7 +24,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.site.mirror import Mirror
+    from coview_stream.basemap.site.served_site import ServedSite
     from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.reload import OpenedMap
@@ -56,7 +57,7 @@ class ServeOptions:
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
         geo: encoding in which poses go out as places on Earth as well; None: they do not.
         guesses: of the places of robots, by name: tried, never trusted.
-        mirror: of the site that the map is a copy of, whose changes are followed; None of a map that is here.
+        site: that the map is of, if its changes or its robots are followed; None otherwise.
         fleet: name of the fleet of nodes that share the robots; None: this one serves all, or stands by for all.
         base: first part of the fleet's keys.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
@@ -81,7 +82,7 @@ class ServeOptions:
     verify_key: VerifyKey | None = None
     geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
-    mirror: Mirror | None = None
+    site: ServedSite | None = None
     fleet: str | None = None
     base: str = "coview"
 
@@ -164,8 +165,10 @@ def open_node(
             lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
         )
         node.run_beside("reload", reloader.run)
-        if options.mirror is not None:
-            node.map_follower = follower = MapFollower(options.mirror, node.reload)
+        if options.site is not None:
+            node.map_follower = follower = MapFollower(
+                options.site, node.reload, lambda: whereabouts(node.sessions), lambda: reloader.busy
+            )
             node.run_beside("map source", follower.run)
         node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
@@ -227,13 +230,17 @@ def start_engines(
     base_map = base_map or BaseMap.load(options.map_path, verify_key=options.verify_key)
     # what has been verified here they need not read again, as long as the file is the same
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
+    path = options.map_path
+    if base_map.path is not None and site_directory(path) is not None:
+        # the site may change while they are started again: they open the very file, of which the hash is known
+        path, trust = base_map.path, None
     missing = base_map.require_features(options.reloc)
     if missing is not None:
         log.warning("%s: %s", options.map_path, missing)
     reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
     engines = {
         kind: EngineProcess(
-            kind, str(options.map_path), base_map.sha256, None,
+            kind, str(path), base_map.sha256, None,
             registration=options.registration, reloc=reloc, risk=options.risk,
             sensor_leans=options.lidar is None, child=child, trust=trust,
         )
@@ -260,8 +267,12 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     Raises:
         MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.
     """
+    from coview_stream.stream.maps.prepare_map import prepare_map
     from coview_stream.stream.node.reload import OpenedMap
 
+    prepare_map(options.map_path, cancelled)
+    if cancelled():
+        raise CancelledError("the node is no longer wanted")
     base_map = BaseMap.load(options.map_path, verify_key=options.verify_key)
     if base_map.sha256 == served:
         return None
@@ -292,3 +303,8 @@ def make_sessions(options: ServeOptions, base_map: BaseMap) -> list[Session]:
     if options.lidar is None:
         return [Session(keys, map_sha256, options.node, codecs, parts) for keys in options.keys]
     return [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]
+
+
+def whereabouts(sessions: Sequence[Session]) -> dict[str, tuple[float, float] | None]:
+    """Return where robots are, or may be, in the map's frame, by name; None where nothing is known of it."""
+    return {session.keys.robot: session.whereabouts() for session in sessions}

@@ -365,6 +365,27 @@ class Session:
         T_map_odom = None if pose.T_map_odom is None else part.own(pose.T_map_odom)
         return replace(pose, T_map_body=part.own(pose.T_map_body), T_map_odom=T_map_odom, frame_id=part.name)
 
+    def whereabouts(self) -> tuple[float, float] | None:
+        """Return x and y in the map's frame of where the robot is or, if that is not known, may be.
+
+        That is where somebody says that it is, else where it was, else the most probable place that the search
+        considers, if it is more probable than none; None where there is nothing of that.
+        """
+        with self._lock:
+            correction = self.robot_state.correction
+            if correction is not None:
+                at = correction.T_map_body[:2, 3]
+            elif self._guess is not None:
+                at = np.array([self._guess.x, self._guess.y])
+            elif self._hint.known is not None:
+                at = self._hint.known[:2, 3]
+            else:
+                seen = self.queue.considered
+                if seen is None or not len(seen.places) or seen.places[0, 4] <= seen.none:
+                    return None
+                at = seen.places[0, :2]
+        return float(at[0]), float(at[1])
+
     def map_name(self) -> str | None:
         """Return which of several maps the robot is on; None while that is not known, and where there is one map."""
         with self._lock:

@@ -17,8 +17,11 @@ from sockets import free_endpoint, until
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.mirror import Mirror
+from coview_stream.basemap.site.part import Around, part_file, read_part
+from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.working_file import working_path
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import ConfigError, TransportError
@@ -26,6 +29,7 @@ from coview_stream.stream.maps.map_address import source_of
 from coview_stream.stream.maps.map_follower import MapFollower
 from coview_stream.stream.maps.map_keys import MapKeys
 from coview_stream.stream.maps.map_server import MapServer
+from coview_stream.stream.maps.prepare_map import prepare_map
 from coview_stream.stream.maps.zenoh_source import ZenohSource
 from coview_stream.stream.transport.zenoh_config import compose
 
@@ -116,7 +120,7 @@ def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, si
     mirror = Mirror(source)
     mirror.open()
     calls, stopping = [], threading.Event()
-    follower = MapFollower(mirror, lambda: calls.append(1), period=0.05)
+    follower = MapFollower(ServedSite(mirror.directory, mirror), lambda: calls.append(1), period=0.05)
     thread = threading.Thread(target=follower.run, args=(stopping,))
     thread.start()
     try:
@@ -133,6 +137,40 @@ def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, si
     finally:
         stopping.set()
         thread.join()
+
+
+def test_tiles_are_fetched_as_robots_come_to_them(source, server, site):
+    start = Around(511_950.0, 5_120_050.0, 30.0)
+    mirror = Mirror(source, None, start)
+    mirror.open()
+    served = ServedSite(mirror.directory, mirror, start)
+    place, busy, calls, stopping = {"r1": None}, [], [], threading.Event()
+    follower = MapFollower(served, lambda: calls.append(1), lambda: place, lambda: bool(busy), period=0.05)
+    thread = threading.Thread(target=follower.run, args=(stopping,))
+    thread.start()
+    try:
+        busy.append(1)
+        place["r1"] = (512_050.0, 5_120_050.0)
+        assert not stopping.wait(0.3)
+        assert not calls  # a change is being taken over
+        busy.clear()
+        until(lambda: calls)
+        assert follower.last["around"] == [[*place["r1"], 30.0]]
+        directory, keys = read_part(served.map_path)
+        assert (directory, len(keys)) == (mirror.directory.resolve(), 1)
+        assert len(mirror.fetched(Manifest.load(mirror.directory))) == 2
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_working_file_of_a_part_is_made_by_another_process(site):
+    part = part_file(site, [(0, 0)], "test")
+    prepare_map(part, lambda: False)
+    assert working_path(site, [(0, 0)]).is_file()
+    prepare_map(site, lambda: True)  # given up
+    assert not working_path(site).exists()
+    prepare_map(site / "manifest.json", lambda: False)  # one file: there is nothing to do
 
 
 def test_addresses(endpoint):

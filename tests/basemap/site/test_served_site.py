@@ -1,0 +1,108 @@
+"""Sites that follow robots: tiles are fetched as they come to them, kept without a net, and begun with again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.mirror import Mirror
+from coview_stream.basemap.site.part import Around, kept_places, read_part
+from coview_stream.basemap.site.served_site import ServedSite
+from coview_stream.basemap.site.site_build import build_site
+from coview_stream.basemap.site.site_source import DirectorySource
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import map_preset
+from coview_stream.errors import MapError, TransportError
+
+pytestmark = pytest.mark.slow
+
+CORNER = (512_000.0, 5_120_000.0)
+"""Where the four tiles of the site meet."""
+WEST, EAST = (CORNER[0] - 50.0, CORNER[1] + 50.0), (CORNER[0] + 50.0, CORNER[1] + 50.0)
+
+
+@pytest.fixture(scope="module")
+def site(map_points, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("followed")
+    write_cloud(folder / "yard.las", map_points + np.array([CORNER[0] + 3.0, CORNER[1] + 5.0, 100.0]))
+    assert len(build_site(folder / "yard.las", folder / "yard", map_preset("slam", learned=False)).manifest.tiles) == 4
+    return folder / "yard"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+
+
+class Source(DirectorySource):
+    gone = False
+
+    def manifest(self):
+        if self.gone:
+            raise TransportError("yard: nobody answers")
+        return super().manifest()
+
+
+def around(place, radius=30.0):
+    return Around(*place, radius)
+
+
+def tiles(served):
+    return read_part(served.map_path)[1]
+
+
+def test_tiles_follow_the_robots(site):
+    served = ServedSite(site, None, around(WEST))
+    corner = min(tiles(served))
+    assert len(tiles(served)) == 1
+    assert not served.follow({"a": None, "b": None})
+    assert not served.follow({"a": (WEST[0] + 15.0, WEST[1]), "b": None})  # its circle moves on the same tile
+    assert served.follow({"a": EAST, "b": None})
+    assert tiles(served) == {corner, (corner[0] + 1, corner[1])}  # the other robot may be at the start
+    assert served.follow({"a": EAST, "b": EAST})
+    assert tiles(served) == {(corner[0] + 1, corner[1])}
+    assert not served.refresh()  # of a directory nothing is asked
+    with pytest.raises(MapError, match="no tile of the site is there"):
+        served.follow({"a": (0.0, 0.0), "b": (0.0, 0.0)})
+    assert len(tiles(served)) == 1
+    served.close()
+    assert not served.map_path.exists()
+
+
+def test_only_tiles_of_the_route_are_fetched_and_they_are_there_without_the_net(site):
+    source = Source(site)
+    mirror = Mirror(source, None, around(WEST))
+    mirror.open()
+    served = ServedSite(mirror.directory, mirror, around(WEST))
+    assert len(mirror.fetched(Manifest.load(site))) == 1
+    source.gone = True
+    with pytest.raises(TransportError, match="nobody answers"):
+        served.follow({"a": EAST})
+    assert len(tiles(served)) == 1
+    with pytest.raises(TransportError):
+        served.refresh()
+    source.gone = False
+    assert served.refresh()  # what could not be fetched then
+    assert tiles(served) == mirror.fetched(Manifest.load(site)) - {min(mirror.fetched(Manifest.load(site)))}
+    source.gone = True
+    assert served.follow({"a": WEST})  # back, where everything is there
+    assert "nobody answers" in served.offline
+    assert len(tiles(served)) == 1
+
+
+def test_next_start_is_where_the_robots_were_and_at_the_start(site):
+    served = ServedSite(site, None, around(WEST))
+    served.follow({"a": EAST})
+    served.close()
+    assert kept_places(site, str(around(WEST))) == {"a": EAST}
+    assert len(tiles(ServedSite(site, None, around(WEST)))) == 2
+
+
+def test_whole_site_is_not_followed(site):
+    served = ServedSite(site)
+    assert served.map_path == site
+    assert not served.follow({"a": EAST})
+    served.close()
+    assert site.is_dir()
