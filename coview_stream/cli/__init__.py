@@ -13,6 +13,7 @@ import argparse
 import contextlib
 import importlib
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -81,6 +82,18 @@ def _main(argv: Sequence[str] | None) -> int:
         return _fail(_describe(error))
 
 
+def _joined(argv: Sequence[str]) -> list[str]:
+    """Return the arguments with ``--option -1,2`` as ``--option=-1,2``, for argparse takes that for an option."""
+    found: list[str] = []
+    for word in argv:
+        before = found[-1] if found else ""
+        if re.fullmatch(r"-[\d.][^ ]*,.*", word) and re.fullmatch(r"--[a-z-]+", before):
+            found[-1] = f"{before}={word}"
+        else:
+            found.append(word)
+    return found
+
+
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Return the parser with all commands, or with one: the others' modules need not be imported to run that."""
     parser = _Parser(
@@ -99,7 +112,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 def _dispatch(argv: list[str]) -> int:
     try:
-        args = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
+        args = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(_joined(argv))
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
     with naming_missing_libraries(f"{PROGRAM} {args.command}", _EXTRAS.get(args.command)):

@@ -37,7 +37,9 @@ def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bo
         + ("; several (storeys, sites) are searched together, by name: FLOOR=SITE.coview" if several else ""),
     )
     parser.add_argument(
-        "--around", metavar="X,Y,RADIUS", help="of a directory or an address only the tiles that this circle meets"
+        "--around",
+        metavar="X,Y,RADIUS",
+        help="of a directory or an address only the tiles that this circle meets; of `serve` it moves with the robots",
     )
 
 

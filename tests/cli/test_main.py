@@ -125,3 +125,22 @@ def test_closed_stdout_is_no_reason_to_fail(world_file):
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_lists_that_begin_with_a_negative_number_are_values(monkeypatch, capsys):
+    seen = []
+
+    def add(parser):
+        parser.add_argument("--around")
+        parser.add_argument("--level", type=float)
+        parser.add_argument("--initial", action="append")
+        parser.add_argument("site")
+
+    module = SimpleNamespace(HELP="acts", add_arguments=add, run=lambda args: seen.append(args) or 0)
+    monkeypatch.setattr(cli, "COMMANDS", ("act",))
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
+    words = ["--around", "-162.5,111,100", "--level", "-3", "--initial", "-.5,-2", "--initial=-1,2", "site"]
+    assert cli.main(["act", *words]) == 0
+    (args,) = seen
+    assert (args.around, args.level, args.initial, args.site) == ("-162.5,111,100", -3.0, ["-.5,-2", "-1,2"], "site")
+    assert cli.main(["act", "-1,2,3", "site"]) == 2

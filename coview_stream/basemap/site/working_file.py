@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from coview_stream.basemap import file_format
+from coview_stream.basemap import file_format, trust
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site import cache
 from coview_stream.basemap.site.array_files import ArrayFiles
@@ -44,7 +44,8 @@ def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = No
         log.warning("%s; it is made again", error)
         path.unlink(missing_ok=True)
         path = working_file(directory, verify_key, keys=keys)
-        loaded = file_format.open_file(path, check)
+        checked = cache.checked(path)
+        loaded = file_format.open_file(path, check, checked=checked)
     if check and loaded.identity != checked:
         cache.remember_checked(path, loaded.identity)
     return path, loaded
@@ -80,6 +81,8 @@ def working_file(
             earlier = earlier_file(directory)
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
             file_format.save(path, arrays | layers(arrays, into), parameters)
+        with path.open("rb") as file:
+            cache.remember_checked(path, trust.identity(file))  # its checksum is of what was just written
         remember_file(directory, path)
         cache.evict(folder, keep=path)
     return path
