@@ -9,6 +9,8 @@ pages of files, which the system takes back when it needs them.
 from __future__ import annotations
 
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -25,14 +27,15 @@ from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.worlds import MAPPER, prepared_run, world_name
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.working_file import working_file
+from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 SIDE, EDGE, FIRST_SEED = 4, 500.0, 9001
-OPEN_S, SEARCH_S, MEGABYTES, PER_KM2 = 0.5, 1.0, 500.0, 40.0
-"""The targets: seconds to open a site that has its working file, and to find a robot; MB of memory, and of disk."""
+OPEN_S, SEARCH_S, MEGABYTES, PER_KM2, WORKER_MEGABYTES = 0.5, 1.0, 500.0, 40.0, 2000.0
+"""The targets: seconds to open a site that has its working file, and to find a robot; MB of memory, of disk, and of a
+process that builds."""
 
 _CORNER = (400_000.0, 5_600_000.0, 100.0)
 _FRAMES, _DRIVES = 60, 6
@@ -42,7 +45,8 @@ _SEARCHING = 0.05  # seconds: a step that took less did not search
 
 def options(parser: ArgumentParser) -> None:
     """Add the size."""
-    parser.add_argument("--side", type=int, default=SIDE, help=f"towns of 500 m along each edge of the city ({SIDE})")
+    words = f"towns of 500 m along each edge of the city ({SIDE}); several: how all grows, too"
+    parser.add_argument("--side", type=int, nargs="+", default=[SIDE], help=words)
 
 
 def towns(side: int) -> list[SimulationConfig]:
@@ -58,46 +62,75 @@ def towns(side: int) -> list[SimulationConfig]:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield what building took, then what opening and searching take."""
-    side = 1 if asked.quick else asked.side
+    """Yield what building, opening and searching take, and how they grow with the points."""
+    sides = [1] if asked.quick else asked.side
+    found: dict[int, dict[str, float]] = {side: {} for side in sides}
+    for side in sides:
+        yield from _figures(side, found[side])
+    if len(sides) > 1:
+        points = np.log10([found[side]["points"] for side in sides])
+        for name in found[sides[0]]:
+            if name != "points":
+                slope = np.polyfit(points, np.log10([found[side][name] for side in sides]), 1)[0]
+                yield informs(f"city/slope over the points: {name}", float(slope), "")
+
+
+def _figures(side: int, found: dict[str, float]) -> Iterator[Row]:
+    """Yield the figures of one city, and keep those that grow."""
     below = folder() / f"city{side}"
     worlds = [prepared_run(below, config) for config in towns(side)]
     site = below / "site"
     title = f"city/{side * side} towns"
     made = {"towns": [world_name(config) for config in towns(side)], "code": fingerprint(*MAPPER)}
-    built = remembered(below / "built.json", made, lambda: _built(worlds, site))
+    built = remembered(below / "built.json", made, lambda: isolated(_built, worlds, site))
     manifest = Manifest.load(site)
     area = side * side * (EDGE / 1e3) ** 2
+    found["points"] = float(built["points"])
+    found["build, seconds"] = built["seconds"]
+    found["build, memory"] = built["megabytes"]
     yield informs(f"{title}: stations", sum(tile.stations for tile in manifest.tiles), "")
-    yield informs(f"{title}: points", sum(tile.points for tile in manifest.tiles) / 1e6, "million")
+    yield informs(f"{title}: points read", built["points"] / 1e6, "million")
     yield informs(f"{title}: build, two workers", built["seconds"], "s")
+    yield informs(f"{title}: points a second and worker", built["points"] / built["seconds"] / 2.0, "")
+    yield bounded(f"{title}: memory of a worker, peak", built["megabytes"], "MB", WORKER_MEGABYTES)
     yield bounded(f"{title}: directory, per km2", manifest.nbytes / 1e6 / area, "MB", PER_KM2)
-    os.environ.setdefault("COVIEW_CACHE", str(below / "cache"))
-    first = isolated(_first_opened, site)
-    yield informs(f"{title}: working file made, if it was not there", first["seconds"], "s")
+    os.environ["COVIEW_CACHE"] = str(below / "cache")
+    first = remembered(
+        below / "first.json", {"site": manifest.sha256, "code": fingerprint()}, lambda: isolated(_first_opened, site)
+    )
+    found["first opening, seconds"], found["first opening, memory"] = first["seconds"], first["peak"]
+    yield informs(f"{title}: working file made, the first time", first["seconds"], "s")
     yield informs(f"{title}: memory for that, peak", first["peak"], "MB")
-    found = isolated(_searched, site, worlds[:: max(1, len(worlds) // _DRIVES)][:_DRIVES])
-    yield bounded(f"{title}: load", found["load"], "s", OPEN_S)
-    yield informs(f"{title}: localizer, and the first robot found, with compilation", found["first"], "s")
-    searches = [step for step in found["steps"] if step > _SEARCHING] or [np.nan]
-    yield informs(f"{title}: steps until later robots are found, median", float(np.median(searches)), "s")
-    yield bounded(f"{title}: steps until later robots are found, longest", max(searches), "s", SEARCH_S)
-    yield bounded(f"{title}: memory, resident at the end", found["VmRSS"], "MB", MEGABYTES)
-    yield informs(f"{title}: of it, without pages of files", found["RssAnon"], "MB")
-    yield informs(f"{title}: memory, peak", found["VmHWM"], "MB")
-    yield informs(f"{title}: robots found in their first {_FRAMES} frames", found["found"], f"of {found['drives']}")
-    yield judged(f"{title}: false poses", f"{found['false']} of {found['poses']}", "none", found["false"] == 0)
+    seen = isolated(_searched, site, worlds[:: max(1, len(worlds) // _DRIVES)][:_DRIVES])
+    yield bounded(f"{title}: load", seen["load"], "s", OPEN_S)
+    yield informs(f"{title}: localizer, and the first robot found, with compilation", seen["first"], "s")
+    if searches := [step for step in seen["steps"] if step > _SEARCHING]:
+        found["search, seconds"] = float(np.median(searches))
+        yield informs(f"{title}: steps until later robots are found, median", found["search, seconds"], "s")
+        yield bounded(f"{title}: steps until later robots are found, longest", max(searches), "s", SEARCH_S)
+    found["search, memory"] = seen["VmRSS"]
+    yield bounded(f"{title}: memory, resident at the end", seen["VmRSS"], "MB", MEGABYTES)
+    yield informs(f"{title}: of it, without pages of files", seen["RssAnon"], "MB")
+    yield informs(f"{title}: memory, peak", seen["VmHWM"], "MB")
+    yield informs(f"{title}: robots found in their first {_FRAMES} frames", seen["found"], f"of {seen['drives']}")
+    yield judged(f"{title}: false poses", f"{seen['false']} of {seen['poses']}", "none", seen["false"] == 0)
 
 
-def _built(worlds: list[Path], site: Path) -> dict[str, Any]:
+def _built(worlds: list[Path], site: Path) -> dict[str, float]:
+    """Build the site, and tell how many points that read, its seconds, and the memory of its largest process."""
     sources = [str(world / "base.laz") for world in worlds]
     words = ("-m", "coview_stream", "build", *sources, "-o", f"{site}/", "--workers", "2", "--no-learned")
+    shutil.rmtree(site, ignore_errors=True)
     begin = time.monotonic()
     subprocess.run(today().command(*words), env=today().environment(), check=True, stdout=sys.stderr)
-    return {"seconds": time.monotonic() - begin}
+    seconds = time.monotonic() - begin
+    megabytes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
+    points = int(Manifest.load(site).parameters["source_points"])
+    return {"seconds": seconds, "megabytes": megabytes, "points": points}
 
 
 def _first_opened(site: Path) -> dict[str, float]:
+    working_path(site).unlink(missing_ok=True)
     begin = time.monotonic()
     working_file(site)
     return {"seconds": time.monotonic() - begin, "peak": peak_megabytes()}

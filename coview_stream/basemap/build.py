@@ -137,9 +137,11 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
 def cells_of(points: Points, block: float) -> Ints:
     """Return column and row (K, 2) of the block-sized cells that hold points (N, 3), each once."""
     cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
-    low = cells.min(axis=0, initial=0)
+    if not len(cells):
+        return cells
+    low = cells.min(axis=0)
     columns, rows = (cells - low).T
-    grid = np.zeros((int(rows.max(initial=-1)) + 1, int(columns.max(initial=-1)) + 1), dtype=bool)
+    grid = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1), dtype=bool)
     grid[rows, columns] = True
     return np.asarray(np.argwhere(grid)[:, ::-1] + low)
 

@@ -152,7 +152,11 @@ def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
 
 
 def open_file(
-    path: Path, check: bool = True, trust: Trust | None = None, checked: FileIdentity | None = None
+    path: Path,
+    check: bool = True,
+    trust: Trust | None = None,
+    checked: FileIdentity | None = None,
+    opened: Callable[[BinaryIO], object] | None = None,
 ) -> Loaded:
     """Memory-map a map, signed or not.
 
@@ -166,6 +170,7 @@ def open_file(
         trust: demands a signature.
         checked: of a file whose content has been compared with its checksum already; it is not read again if it is
             still that.
+        opened: called with the file before anything is read of it.
 
     Raises:
         MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
@@ -176,6 +181,8 @@ def open_file(
     except OSError as error:
         raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
     with file:
+        if opened is not None:
+            opened(file)
         identity = trusting.identity(file)
         header, start = _header(path, file)
         metadata = header.get("__metadata__", {})

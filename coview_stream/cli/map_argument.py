@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.joined.served_maps import ServedMaps
     from coview_stream.basemap.signature import VerifyKey
     from coview_stream.basemap.site.mirror import Mirror
     from coview_stream.basemap.site.served_site import ServedSite
@@ -24,7 +25,7 @@ class LocalMap(NamedTuple):
 
     path: Path
     mirror: Mirror | None = None
-    site: ServedSite | None = None
+    site: ServedSite | ServedMaps | None = None
 
 
 def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bool = False) -> None:
@@ -101,7 +102,7 @@ def open_map_argument(args: argparse.Namespace, follows: bool = False) -> LocalM
 
     Args:
         args: the arguments.
-        follows: as of :func:`local_map`; of several maps none is followed.
+        follows: as of :func:`local_map`; of several maps only changes are followed, not robots.
 
     Raises:
         As of :func:`local_map`; InputError: the key cannot be read.
@@ -115,16 +116,30 @@ def open_map_argument(args: argparse.Namespace, follows: bool = False) -> LocalM
     if len(given) == 1:
         found = local_map(str(given[0]), args.around, key, base, connect, config, follows)
     else:
-        from coview_stream.basemap.joined.join_maps import joined_file
-
-        named = [_named(str(each)) for each in given]
-        paths = [(name, local_map(path, args.around, key, base, connect, config)) for name, path in named]
-        for _, each in paths:
-            if each.mirror is not None:
-                each.mirror.source.close()
-        found = LocalMap(joined_file([(name, each.path) for name, each in paths], key))
+        found = _several([_named(str(each)) for each in given], args.around, key, base, connect, config, follows)
     args.map = found.path
     return found
+
+
+def _several(
+    maps: Sequence[tuple[str, str]],
+    around: str | None,
+    verify_key: VerifyKey | None,
+    base: str,
+    connect: Sequence[str],
+    config: Path | None,
+    follows: bool,
+) -> LocalMap:
+    """Return several maps as one, by their names; the arguments are those of :func:`local_map`."""
+    from coview_stream.basemap.joined.served_maps import ServedMaps
+
+    found = [(name, local_map(path, around, verify_key, base, connect, config)) for name, path in maps]
+    mirrors = [each.mirror for _, each in found if each.mirror is not None]
+    served = ServedMaps([(name, each.path) for name, each in found], mirrors)
+    if follows and mirrors:
+        return LocalMap(served.map_path, None, served)
+    served.close()
+    return LocalMap(served.map_path)
 
 
 def _named(text: str) -> tuple[str, str]:

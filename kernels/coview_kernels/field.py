@@ -294,18 +294,11 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
 def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:
     """Fill (32, W / 8, H) planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
     half, (rows, columns) = TILE // 2, table.shape
-    folded = np.zeros((len(bits), half, half), dtype=np.uint32)
-    for start in range(0, len(bits), _BATCH):
-        cells = np.ascontiguousarray(bits[start : start + _BATCH, ..., 1]).view(np.uint64).reshape(-1, half, 2, half, 2)
-        folded[start : start + _BATCH] = _pairs(
-            cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1]
-        )
-        done()
     one, rest = np.uint32(1), np.uint32(31)
     for start in range(0, rows, _BAND):
         stop = min(start + _BAND, rows)
         seen = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band is enough, and a tile has that
-        metres = folded[table[seen]].transpose(0, 2, 1, 3).reshape(-1, columns * half)
+        metres = _folded(bits, table[seen], done).transpose(0, 2, 1, 3).reshape(-1, columns * half)
         out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
         out[1:] |= metres[:-1]
         out[:-1] |= metres[1:]
@@ -317,6 +310,19 @@ def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object])
             plane[:-1] = packed
             plane[:-2] |= packed[1:] << np.uint16(8)
         done()
+
+
+def _folded(bits: I64, table: I32, done: Callable[[], object]) -> npt.NDArray[np.uint32]:
+    """Return the structure (R, C, 16, 16) of a table's tiles in cells of a metre, a bit for each metre of height."""
+    half, tiles = TILE // 2, table.reshape(-1)
+    folded = np.zeros((len(tiles), half, half), dtype=np.uint32)
+    used = np.flatnonzero(tiles)
+    for start in range(0, len(used), _BATCH):
+        some = used[start : start + _BATCH]
+        cells = bits[tiles[some], ..., 1].view(np.uint64).reshape(-1, half, 2, half, 2)
+        folded[some] = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
+        done()
+    return folded.reshape(*table.shape, half, half)
 
 
 def _coarse_shape(rows: int, columns: int) -> tuple[int, int, int]:

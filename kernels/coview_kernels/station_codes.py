@@ -131,6 +131,9 @@ class StationCodes:
         sectors: number of shifts S.
     """
 
+    LEARNED = _SAMPLE
+    """Stations from which codes are learned at most: of more, as many evenly."""
+
     MAX_STATIONS = 2**31 // (_ROWS * _LANES) - 1
     """More could not be numbered by the kernels' 32 bits."""
 

@@ -22,7 +22,7 @@ from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.joined.map_parts import MapPart, MapParts
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, layers_arrays
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.cache import cache_folder, evict
+from coview_stream.basemap.site.cache import cache_folder, evict, remember_written
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
 from coview_stream.errors import MapError
@@ -89,12 +89,8 @@ def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None 
         verify_key: has to have signed each of them.
 
     Raises:
-        MapError: a map cannot be loaded, two have one name, or they cannot be joined.
+        MapError: a map cannot be loaded, or they cannot be joined.
     """
-    names = [name for name, _ in paths]
-    for name in names:
-        if names.count(name) > 1:
-            raise MapError(f"two maps are called {name}: name them, as in first={paths[names.index(name)][1]}")
     maps = {name: BaseMap.load(path, verify_key=verify_key) for name, path in paths}
     key = repr([(name, each.sha256) for name, each in maps.items()])
     path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_CODE}.coview"
@@ -102,7 +98,8 @@ def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None 
         joined = join_maps(maps)
         layers = layers_arrays(joined.arrays) if FIELD_ARRAYS[0] in joined.arrays else {}
         file_format.save(path, joined.arrays | layers, joined.parameters)
-        evict(cache_folder(), keep=path)
+        remember_written(path)
+        evict(cache_folder(), path)
     return path
 
 

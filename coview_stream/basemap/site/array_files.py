@@ -7,13 +7,14 @@ so that a full disk is an error and not a signal.
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import mmap
 import os
 import tempfile
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ class ArrayFiles:
     def __init__(self, folder: Path) -> None:
         """Make them in this folder."""
         self._folder = folder
-        self._files: dict[str, IO[bytes]] = {}
+        self._files: dict[str, io.FileIO] = {}
         self._shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         self._mapped: list[Array] = []
 
@@ -74,9 +75,11 @@ class ArrayFiles:
         kind, (before, *rest) = self._shapes[name]
         if kind != rows.dtype or tuple(rest) != rows.shape[1:]:
             raise ValueError(f"rows of {name} are {rows.dtype} {rows.shape[1:]}, not {kind} {tuple(rest)}")
+        content = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
         with self._room():
-            file.write(np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data)
-            file.flush()
+            file.seek(before * kind.itemsize * math.prod(rest))  # not behind what a failure has left
+            while len(content):
+                content = content[file.write(content) :]
         self._shapes[name] = kind, (before + len(rows), *rest)
         return before
 
@@ -88,7 +91,8 @@ class ArrayFiles:
         view = out.reshape(-1).view(np.uint8).data
         done = 0
         while done < len(view):
-            count = os.preadv(self._files[name].fileno(), [view[done:]], begin * width + done)
+            self._files[name].seek(begin * width + done)
+            count = self._files[name].readinto(view[done:])
             if not count:
                 raise MapError(f"{self._folder}: a file of the map that is being made was cut off")
             done += count
@@ -118,11 +122,11 @@ class ArrayFiles:
             file.close()
         self._files.clear()
 
-    def _new(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> IO[bytes]:
+    def _new(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> io.FileIO:
         if name in self._files:
             raise ValueError(f"{name} is there already")
         with self._room():
-            self._files[name] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
+            self._files[name] = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
         self._shapes[name] = kind, shape
         return self._files[name]
 

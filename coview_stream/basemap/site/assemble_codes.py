@@ -33,6 +33,7 @@ def station_codes(clouds: TileClouds, earlier: Earlier, into: ArrayFiles, step: 
     stations = sum(counts.values())
     made = [into.zeros(name, StationCodes.shape_of(stations), np.int16) for name in CODES]
     tiers, wanted = earlier.tiers(made), sampled_stations(stations)
+    takes = tiers is not None
     if tiers is None:
         learned = StationCodes.learned_from(stations)
         some, kept = _together(clouds, np.union1d(learned, wanted))
@@ -43,7 +44,7 @@ def station_codes(clouds: TileClouds, earlier: Earlier, into: ArrayFiles, step: 
         kept = _together(clouds, wanted)[1]
     begin = 0
     for key, count in counts.items():
-        taken = earlier.stations(key)
+        taken = earlier.stations(key) if takes else None
         if taken is None:
             for part, numbers in _described(clouds, np.arange(begin, begin + count), [key]):
                 StationCodes.encode_tiers(tiers, slice(int(numbers[0]), int(numbers[-1]) + 1), list(part.values()))

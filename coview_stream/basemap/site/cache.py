@@ -13,8 +13,9 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
-from coview_stream.basemap.trust import FileIdentity
+from coview_stream.basemap.trust import FileIdentity, identity
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import ConfigError, MapError
 
@@ -37,8 +38,11 @@ def cache_folder() -> Path:
     return folder
 
 
-def evict(folder: Path, keep: Path | None = None) -> None:
-    """Delete what has not been used for longest, working files and mirrors, until the cache is within its bound."""
+def evict(folder: Path, *keep: Path) -> None:
+    """Delete what has not been used for longest, working files and mirrors, until the cache is within its bound.
+
+    Files that a process holds (:func:`hold`) and those to keep stay.
+    """
     found = []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):
@@ -47,9 +51,32 @@ def evict(folder: Path, keep: Path | None = None) -> None:
     for _, size, path in sorted(found):
         if total <= bound:
             break
-        if path != keep:
-            _remove(path)  # who has mapped it keeps it until it ends
+        if path not in keep and not _is_held(path):
+            _remove(path)
             total -= size
+
+
+def hold(file: BinaryIO) -> None:
+    """Have an open file of the cache stay there as long as it, or what is mapped of it, is open in any process."""
+    with contextlib.suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+
+def _is_held(path: Path) -> bool:
+    if path.is_dir():
+        return False
+    try:
+        import fcntl
+
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (ImportError, OSError):
+        return False
+    return False
 
 
 def checked(path: Path) -> FileIdentity | None:
@@ -65,10 +92,16 @@ def checked(path: Path) -> FileIdentity | None:
         return None
 
 
-def remember_checked(path: Path, identity: FileIdentity) -> None:
+def remember_checked(path: Path, state: FileIdentity) -> None:
     """Keep that the content of a file of the cache has been compared with its checksum."""
     with contextlib.suppress(OSError), atomic_path(path.with_suffix(_MARK)) as part:
-        part.write_text(json.dumps(list(identity)))
+        part.write_text(json.dumps(list(state)))
+
+
+def remember_written(path: Path) -> None:
+    """Keep that a file of the cache has just been written with the checksum of its content."""
+    with path.open("rb") as file:
+        remember_checked(path, identity(file))
 
 
 def _last_used(path: Path) -> float:

@@ -91,8 +91,13 @@ class Earlier:
         return np.asarray(self._arrays[name][part])
 
     def tiers(self, into: Sequence[I16]) -> list[StationCodes] | None:
-        """Return codes in the file's terms that are to be filled in; None if no tile of it is taken."""
+        """Return codes in the file's terms that are to be filled in; None if none of it are taken.
+
+        None are where they were learned from fewer stations than codes of all these would be.
+        """
         if self._index is None or not self._spans:
+            return None
+        if len(self._index) < min(len(into[0]), StationCodes.LEARNED):
             return None
         tiers = self._index.codes, self._index.rest
         return [

@@ -6,6 +6,7 @@ The manifest is written last, so that the mirror is always one state of the site
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -67,7 +68,7 @@ class Mirror:
         """
         try:
             self.refresh(progress, check=True)
-            os.utime(self.directory)  # the cache keeps what was used last
+            self._use()
         except TransportError as error:
             try:
                 kept = Manifest.load(self.directory)
@@ -90,6 +91,7 @@ class Mirror:
             TransportError: the source cannot be asked; what was fetched is kept. MapError: as of :meth:`open`.
         """
         self.offline = ""
+        self._use()
         raw = self.source.manifest()
         manifest = Manifest.from_bytes(raw, f"{self.source.name}/{FILE}")
         if self._verify_key is not None:
@@ -120,8 +122,13 @@ class Mirror:
         if changed and before is not None:  # one state back: somebody may still stand on it
             self._store.prune(manifest.hashes() | before.hashes())
         elif changed:
-            evict(cache_folder(), keep=self.directory)
+            evict(cache_folder(), self.directory)
         return changed or bool(missing)
+
+    def _use(self) -> None:
+        """Have the cache know that it is used: it keeps what was used last."""
+        with contextlib.suppress(OSError):
+            os.utime(self.directory)
 
     def fetched(self, manifest: Manifest) -> set[Key]:
         """Return the tiles of a manifest that are all there."""

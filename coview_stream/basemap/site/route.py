@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from coview_stream.basemap.site.part import Around
 
@@ -14,10 +15,23 @@ _STEP = 1.0 / 3.0
 """Of the radius: how far a robot goes before its circle moves; set by hand. Two thirds of it always lie ahead."""
 
 
+class Whereabouts(NamedTuple):
+    """Where a robot is, or may be.
+
+    Attributes:
+        place: in the frame of the map's sources.
+        known: whether it is there; else it may be anywhere as well.
+    """
+
+    place: Place
+    known: bool
+
+
 class Route:
     """A circle for each robot, which moves in steps as the robot does.
 
-    A robot that has not been seen yet may be at the start, or where it was when a node ended.
+    A robot whose place is not known may be where it was seen last, if it was; else at the start, or where it was when a
+    node ended; and besides where somebody, or its search, believes that it is.
 
     Attributes:
         start: the circle to begin with.
@@ -28,21 +42,27 @@ class Route:
         self.start = start
         self._before = dict(before or {})
         self._seen: dict[str, Place | None] = dict.fromkeys(self._before)
+        self._possible: dict[str, Place] = {}
 
-    def move(self, places: Mapping[str, Place | None]) -> bool:
-        """Take where the robots are or may be, None where that is not known; return whether a circle has moved.
+    def move(self, robots: Mapping[str, Whereabouts | None]) -> bool:
+        """Take where the robots are or may be, None where nothing is known; return whether a circle has moved.
 
         Only robots that are named have a circle from then on.
         """
         moved = False
-        seen = {robot: self._seen.get(robot) for robot in places}
-        for robot, place in places.items():
-            if place is not None:
-                nearest = min(self._centres(robot), key=lambda centre: math.dist(centre, place))
-                far = math.dist(nearest, place) > _STEP * self.start.radius
-                moved |= far
-                seen[robot] = place if far else nearest
-        self._seen = seen
+        self._seen = {robot: self._seen.get(robot) for robot in robots}
+        self._possible = {robot: place for robot, place in self._possible.items() if robot in robots}
+        for robot, told in robots.items():
+            if told is None:
+                continue
+            nearest = min(self._centres(robot), key=lambda centre: math.dist(centre, told.place))
+            far = math.dist(nearest, told.place) > _STEP * self.start.radius
+            moved |= far
+            if told.known:
+                self._seen[robot] = told.place if far else nearest
+                self._possible.pop(robot, None)
+            elif far:
+                self._possible[robot] = told.place
         return moved
 
     def circles(self) -> list[Around]:
@@ -60,6 +80,7 @@ class Route:
 
     def _centres(self, robot: str) -> list[Place]:
         seen = self._seen.get(robot)
-        if seen is not None:
-            return [seen]
-        return [self._begin, self._before[robot]] if robot in self._before else [self._begin]
+        found = [seen] if seen is not None else [self._begin]
+        if seen is None and robot in self._before:
+            found.append(self._before[robot])
+        return [*found, self._possible[robot]] if robot in self._possible else found

@@ -10,7 +10,7 @@ from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.mirror import Mirror
 from coview_stream.basemap.site.part import Around, keep_places, kept_places, part_file, tiles_around
-from coview_stream.basemap.site.route import Place, Route
+from coview_stream.basemap.site.route import Route, Whereabouts
 from coview_stream.errors import TransportError
 
 
@@ -39,12 +39,15 @@ class ServedSite:
         self.route: Route | None = None
         self.map_path = directory
         self._keys: set[Key] = set()
+        self._changed = False  # and nobody has been told yet
+        self._behind = False  # whether the tiles are not those of the route yet
         if around is not None:
             self._name = str(around)
             self.route = Route(around, kept_places(directory, self._name))
             if len(self.route.circles()) > 1:
                 self._fetch(self.route)
-            self.map_path = self._choose(self.route)
+            self._choose()
+            self._changed = False
 
     @property
     def name(self) -> str:
@@ -57,33 +60,33 @@ class ServedSite:
         return "" if self.mirror is None else self.mirror.offline
 
     def refresh(self) -> bool:
-        """Ask the source, fetch what is missing, and return whether anything has changed.
+        """Ask the source, fetch what is missing, and return whether anything has changed since that was last told.
 
         Raises:
             TransportError: it cannot be asked. MapError: what it gave is not what it should be.
         """
-        if self.mirror is None or not self.mirror.refresh():
-            return False
-        if self.route is not None:
-            self._choose(self.route)  # its tiles may be others now
-        return True
+        if self.mirror is not None:
+            self._changed |= self.mirror.refresh()
+        if self._changed or self._behind:
+            self._choose()
+        return self._told()
 
-    def follow(self, places: Mapping[str, Place | None]) -> bool:
+    def follow(self, robots: Mapping[str, Whereabouts | None]) -> bool:
         """Move the route on to where the robots are or may be, and return whether other tiles are wanted now.
 
         What cannot be fetched now :meth:`refresh` fetches later; meanwhile there is what there is.
 
         Raises:
             TransportError: nothing of it is there, and it cannot be fetched. MapError: no tile is there at all, or
-                what came is not what it should be.
+                what came is not what it should be. :meth:`refresh` tries again.
         """
-        if self.route is None or not self.route.move(places):
+        if self.route is None or not self.route.move(robots):
             return False
+        self._behind = True
         keep_places(self.directory, self._name, self.route.last_places())
-        before = self._keys
         self._fetch(self.route)
-        self._choose(self.route)
-        return self._keys != before
+        self._choose()
+        return self._told()
 
     def close(self) -> None:
         """End connections, and leave no file of this process."""
@@ -97,17 +100,25 @@ class ServedSite:
             return
         self.mirror.circles = tuple(route.circles())
         try:
-            self.mirror.refresh()
+            self._changed |= self.mirror.refresh()
         except TransportError as error:
             self.mirror.offline = str(error)
 
-    def _choose(self, route: Route) -> Path:
-        """Return the file that names the tiles of the route that are there; other processes go other ways."""
+    def _choose(self) -> None:
+        """Write the file that names the tiles of the route that are there; other processes go other ways."""
+        if self.route is None:
+            return
         manifest = Manifest.load(self.directory)
-        keys = tiles_around(manifest, *route.circles())
+        keys = tiles_around(manifest, *self.route.circles())
         if self.mirror is not None:
             keys &= self.mirror.fetched(manifest)
             if not keys:
                 raise TransportError(self.mirror.offline or f"{self.name}: none of the tiles around the robots came")
-        self._keys = keys
-        return part_file(self.directory, keys, f"{self._name} {os.getpid()}")
+        if keys != self._keys:
+            self.map_path = part_file(self.directory, keys, f"{self._name} {os.getpid()}")
+            self._keys, self._changed = keys, True
+        self._behind = False
+
+    def _told(self) -> bool:
+        changed, self._changed = self._changed, False
+        return changed

@@ -52,7 +52,7 @@ class TileClouds:
         self._cells: dict[Key, Ints] = {}
         self._index: list[Ints] = []
         for entry in entries:
-            self._add(entry, store)
+            self._add(entry, *self._read(entry, store))
             stations = read_stations_layer(layer_of(entry, "stations", store), grid.config.block)
             if len(stations) != entry.stations:
                 raise MapError(f"tile {entry.column}, {entry.row}: its stations are not those that the manifest counts")
@@ -64,9 +64,11 @@ class TileClouds:
             cloud = entry.layers["cloud"]
             if (entry.column, entry.row) in beside and store.holds(cloud.sha256, cloud.bytes):
                 try:
-                    self._add(entry, store)
+                    cloud_there = self._read(entry, store)
                 except MapError as error:
                     log.warning("%s; the tiles beside it are made without it", error)
+                    continue
+                self._add(entry, *cloud_there)
 
     @property
     def points(self) -> int:
@@ -94,12 +96,16 @@ class TileClouds:
                 found.append((points[near], normals[near]))
         return np.concatenate([each for each, _ in found]), np.concatenate([each for _, each in found])
 
-    def _add(self, entry: TileEntry, store: TileStore) -> None:
+    def _read(self, entry: TileEntry, store: TileStore) -> tuple[Points, Int8s]:
         key = entry.column, entry.row
         layer = layer_of(entry, "cloud", store)
         points, packed = read_cloud_layer(layer, self.grid.corner(key), self.grid.tile, self.grid.config.voxel)
         if len(points) != entry.points:
             raise MapError(f"tile {key[0]}, {key[1]}: its cloud is not the one that the manifest counts")
+        return points, packed
+
+    def _add(self, entry: TileEntry, points: Points, packed: Int8s) -> None:
+        key = entry.column, entry.row
         index = np.zeros((0, 4), dtype=np.int64)
         if len(points):
             points, packed, index = sort_by_tile_packed(points, packed, self.grid.config.tile)

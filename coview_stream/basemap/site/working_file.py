@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from coview_stream.basemap import file_format, trust
+from coview_stream.basemap import file_format
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site import cache
 from coview_stream.basemap.site.array_files import ArrayFiles
@@ -36,16 +36,29 @@ def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = No
         MapError: as :func:`working_file`.
     """
     directory, keys = (place, None) if place.is_dir() else read_part(place)
-    path = working_file(directory, verify_key, keys=keys)
+    return open_made(lambda: working_file(directory, verify_key, keys=keys), check)
+
+
+def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, file_format.Loaded]:
+    """Return a file of the cache and what is in it; one that is damaged is made again.
+
+    Args:
+        make: makes it, if it is not there, and returns it.
+        check: compare its content with its checksum, unless that has been done since it was written.
+
+    Raises:
+        MapError: as ``make``.
+    """
+    path = make()
     checked = cache.checked(path)
     try:
-        loaded = file_format.open_file(path, check, checked=checked)
+        loaded = file_format.open_file(path, check, checked=checked, opened=cache.hold)
     except MapError as error:
         log.warning("%s; it is made again", error)
         path.unlink(missing_ok=True)
-        path = working_file(directory, verify_key, keys=keys)
+        path = make()
         checked = cache.checked(path)
-        loaded = file_format.open_file(path, check, checked=checked)
+        loaded = file_format.open_file(path, check, checked=checked, opened=cache.hold)
     if check and loaded.identity != checked:
         cache.remember_checked(path, loaded.identity)
     return path, loaded
@@ -76,15 +89,15 @@ def working_file(
     folder, path = cache.cache_folder(), _path(manifest, keys)
     with cache.lock(path):
         if path.is_file():
+            remember_file(directory, path)
             return path
         with _bar(f"{directory}: made ready for this machine", progress) as step, ArrayFiles(folder) as into:
             earlier = earlier_file(directory)
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
             file_format.save(path, arrays | layers(arrays, into), parameters)
-        with path.open("rb") as file:
-            cache.remember_checked(path, trust.identity(file))  # its checksum is of what was just written
+        cache.remember_written(path)
         remember_file(directory, path)
-        cache.evict(folder, keep=path)
+        cache.evict(folder, path, directory)
     return path
 
 

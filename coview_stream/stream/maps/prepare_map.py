@@ -1,4 +1,4 @@
-"""Preparation of a site for a node that is running: its working file is made by a process of its own, which gives way.
+"""Preparation of a map for a node that is running: what is made of it is made by a process of its own, which gives way.
 
 Made by the node itself, it would take the time in which poses are due.
 """
@@ -13,16 +13,19 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from coview_stream.basemap.joined.joined_names import SUFFIX as JOINED
+from coview_stream.basemap.site.part import SUFFIX as PART
 from coview_stream.clouds.python_child import python_command, python_environment
 
 log = logging.getLogger("coview_stream.maps")
 
+_NAMES = (PART, JOINED)
 _NICE = 10  # set by hand
 _LOOK = 0.1  # seconds
 
 
 def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
-    """Have the working file of a site made, if ``place`` is a site or a part of one, and wait for it.
+    """Have made what a map is opened from, if that is made of something else: a site, a part of one, several maps.
 
     What goes wrong is left to whoever opens the map.
 
@@ -30,9 +33,7 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
         place: of a map.
         cancelled: asked now and then; True ends it.
     """
-    from coview_stream.basemap.site.part import site_directory
-
-    if site_directory(place) is None:
+    if not (place.is_dir() or place.suffix in _NAMES):
         return
     with subprocess.Popen(
         python_command(__name__, str(place)), env=python_environment(),
@@ -50,15 +51,12 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
 
 
 def main() -> None:
-    """Make the working file of the map that the command line names."""
-    from coview_stream.basemap.site.part import SUFFIX, read_part
-    from coview_stream.basemap.site.working_file import working_file
+    """Open the map that the command line names."""
+    from coview_stream.basemap.basemap import BaseMap
 
     with contextlib.suppress(OSError, AttributeError):
         os.nice(_NICE)
-    place = Path(sys.argv[1])
-    directory, keys = read_part(place) if place.suffix == SUFFIX else (place, None)
-    working_file(directory, progress=False, keys=keys)
+    BaseMap.load(sys.argv[1])
 
 
 if __name__ == "__main__":

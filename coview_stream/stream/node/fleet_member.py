@@ -78,7 +78,7 @@ class FleetMember:
         for name in taken:
             session = self._endpoints[name].session
             known = self._known.pop(name, None)
-            if known is not None and known.map_sha256 == session.map_sha256:
+            if known is not None and known.map_sha256 == session.site_sha256:
                 self._arriving[name] = known
             self._endpoints[name].listen()
         if given_up or taken:

@@ -17,7 +17,7 @@ class Handover:
     """What one node knows of where a robot is.
 
     Attributes:
-        map_sha256: of the base map.
+        map_sha256: of the base map; of a site that of its state, which all parts of it share.
         T_map_odom: (4, 4) map <- odometry; the robot's odometry goes on when its node changes.
         calibration: what is corrected of its sensor and odometry; None if that is not known.
     """

@@ -39,7 +39,7 @@ class LastPose:
 
     Attributes:
         robot: its name.
-        map_sha256: of the base map, 64 hexadecimal digits.
+        map_sha256: of the base map, 64 hexadecimal digits; of a site that of its state, which all parts of it share.
         stamp_ns: sensor time, nanoseconds.
         T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
         calibration: what was corrected of its sensor and odometry there; None if that was not known.

@@ -60,15 +60,15 @@ class LastPoseKeeper:
 
     def _hint(self, session: Session) -> None:
         robot = session.keys.robot
-        remove_parts(self.folder, robot, session.map_sha256)
-        last = load(self.folder, robot, session.map_sha256)
+        remove_parts(self.folder, robot, session.site_sha256)
+        last = load(self.folder, robot, session.site_sha256)
         if last is not None:
             x, y = last.T_map_body[:2, 3]
             log.info("%s: was last at %.1f, %.1f on this map: tried first, as a hypothesis", robot, x, y)
             session.hint_pose(last.T_map_body, last.calibration)
 
     def _keep(self, session: Session) -> None:
-        robot, sha256 = session.keys.robot, session.map_sha256
+        robot, sha256 = session.keys.robot, session.site_sha256
         now = session.last_known_pose()
         try:
             if now.forgotten != self._forgotten.get(robot, 0):

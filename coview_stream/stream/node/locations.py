@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +25,17 @@ class MapReference:
     """Reference of the map in force, which may change while a node runs.
 
     Args:
-        path: of the map.
+        files: of the maps that the node has opened, by their hashes.
+        sha256: of the map to begin with.
 
     Raises:
         InputError, DependencyError: as of :class:`GeoReference`.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, files: Mapping[str, Path], sha256: str) -> None:
+        self._files = files
         self._lock = threading.Lock()
-        loaded = BaseMap.load(path, check=False)
+        loaded = BaseMap.load(files[sha256], check=False)
         self._sha256 = loaded.sha256
         self._geo = _references(loaded)
 
@@ -45,9 +47,9 @@ class MapReference:
         with self._lock:
             if sha256 != self._sha256:
                 try:
-                    loaded = BaseMap.load(self._path, check=False)
+                    loaded = BaseMap.load(self._files[sha256], check=False)
                     self._sha256, self._geo = loaded.sha256, _references(loaded)
-                except CoViewError as error:
+                except (CoViewError, KeyError) as error:
                     log.warning("no latitude and longitude on the new map: %s", error)
                     self._sha256, self._geo = sha256, {}
             known = self._geo if sha256 == self._sha256 else {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,12 @@ class MapViewAnswer:
     """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.map_view.MapView.to_json` of the map that is served.
 
     Args:
-        path: of the map's file.
+        files: of the maps that the node has opened, by their hashes.
         sha256: returns the hash of the map that is served.
     """
 
-    def __init__(self, path: Path, sha256: Callable[[], str]) -> None:
-        self._path = path
+    def __init__(self, files: Mapping[str, Path], sha256: Callable[[], str]) -> None:
+        self._files = files
         self._sha256 = sha256
         self._made: tuple[str, dict[str, Any]] | None = None
 
@@ -32,8 +32,9 @@ class MapViewAnswer:
         """
         served = self._sha256()
         if self._made is None or self._made[0] != served:
-            base_map = BaseMap.load(self._path, check=False)  # the node has compared it when it opened the map
+            path = self._files[served]
+            base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
             if base_map.sha256 != served:
-                raise MapError(f"{self._path}: the file is of another map than the one that is served")
+                raise MapError(f"{path}: the file is of another map than the one that is served")
             self._made = served, MapView.of(base_map, POINTS_ON_WIRE).to_json()
         return self._made[1]

@@ -68,9 +68,9 @@ class MapReloader:
         self.last: dict[str, Any] = {"result": "none", "map_sha256": node.map_sha256, "error": None}
 
     @property
-    def busy(self) -> bool:
-        """Whether a change is going on, or has been asked for."""
-        return self._busy or self._asked.is_set()
+    def outcome(self) -> str:
+        """What became of the newest change that was asked for: as of :attr:`last`, ``loading`` until it is over."""
+        return "loading" if self._busy or self._asked.is_set() else str(self.last["result"])
 
     def request(self) -> dict[str, Any]:
         """Ask for a change; return what is known of the newest one. Asked for during a change, another one follows."""

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.part import site_directory
 from coview_stream.basemap.trust import Trust
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
@@ -24,6 +23,8 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.joined.served_maps import ServedMaps
+    from coview_stream.basemap.site.route import Whereabouts
     from coview_stream.basemap.site.served_site import ServedSite
     from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.stream.node.node import Node
@@ -82,7 +83,7 @@ class ServeOptions:
     verify_key: VerifyKey | None = None
     geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
-    site: ServedSite | None = None
+    site: ServedSite | ServedMaps | None = None
     fleet: str | None = None
     base: str = "coview"
 
@@ -130,7 +131,8 @@ def open_node(
         from coview_stream.stream.node.systemd import Notifier
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
-        reference = None if options.geo is None else MapReference(options.map_path)
+        files = {base_map.sha256: base_map.path or options.map_path}  # what each map was opened from, by its hash
+        reference = None if options.geo is None else MapReference(files, base_map.sha256)
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload,
             check_silence=options.fleet is None,  # another session would hear the other nodes' robots
@@ -161,13 +163,13 @@ def open_node(
         notifier = notifier or Notifier()
         node.reloader = reloader = MapReloader(
             node,
-            lambda cancelled: open_map(options, node.map_sha256, cancelled),
+            lambda cancelled: open_map(options, node.map_sha256, cancelled, files),
             lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
         )
         node.run_beside("reload", reloader.run)
         if options.site is not None:
             node.map_follower = follower = MapFollower(
-                options.site, node.reload, lambda: whereabouts(node.sessions), lambda: reloader.busy
+                options.site, node.reload, lambda: whereabouts(node.sessions), lambda: reloader.outcome
             )
             node.run_beside("map source", follower.run)
         node.run_beside("memory", MemoryRelease().run)
@@ -176,7 +178,7 @@ def open_node(
             for endpoints in node.endpoints.values():
                 endpoints.waits = True
             node.run_beside("fleet", FleetMember(elections, node.endpoints, transport).run)
-        map_view = MapViewAnswer(options.map_path, lambda: node.map_sha256)
+        map_view = MapViewAnswer(files, lambda: node.map_sha256)
         for keys in options.keys:
             transport.answer(keys.map_view, map_view)
         if reference is not None and options.geo is not None:
@@ -231,8 +233,8 @@ def start_engines(
     # what has been verified here they need not read again, as long as the file is the same
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     path = options.map_path
-    if base_map.path is not None and site_directory(path) is not None:
-        # the site may change while they are started again: they open the very file, of which the hash is known
+    if base_map.path is not None and base_map.path != path.absolute():
+        # what it is made of may change while they are started again: they open the very file, whose hash is known
         path, trust = base_map.path, None
     missing = base_map.require_features(options.reloc)
     if missing is not None:
@@ -256,13 +258,16 @@ def start_engines(
     return base_map, engines
 
 
-def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) -> OpenedMap | None:
+def open_map(
+    options: ServeOptions, served: str, cancelled: Callable[[], bool], files: dict[str, Path] | None = None
+) -> OpenedMap | None:
     """Open the map's file again, in new engines, until they would not keep a job waiting; None if it is the one served.
 
     Args:
         options: of the node.
         served: hash of the map that is served.
         cancelled: asked now and then; True gives up.
+        files: what maps were opened from, by their hashes; of more than the one served and this one none is kept.
 
     Raises:
         MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.
@@ -284,7 +289,12 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
             engine.wait_prepared(cancelled)
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        return OpenedMap(base_map.sha256, engines, make_sessions(options, base_map))
+        opened = OpenedMap(base_map.sha256, engines, make_sessions(options, base_map))
+        if files is not None:
+            for old in files.keys() - {served}:
+                files.pop(old)
+            files[base_map.sha256] = base_map.path or options.map_path
+        return opened
     except BaseException:
         for engine in engines.values():
             engine.close()
@@ -300,11 +310,16 @@ def make_sessions(options: ServeOptions, base_map: BaseMap) -> list[Session]:
 
     codecs = (options.cloud_codec, options.odometry_codec)
     parts, map_sha256 = MapParts.of(base_map.parameters), base_map.sha256
+    made: list[Session]
     if options.lidar is None:
-        return [Session(keys, map_sha256, options.node, codecs, parts) for keys in options.keys]
-    return [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]
+        made = [Session(keys, map_sha256, options.node, codecs, parts) for keys in options.keys]
+    else:
+        made = [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]
+    for session in made:
+        session.site_sha256 = base_map.site_sha256
+    return made
 
 
-def whereabouts(sessions: Sequence[Session]) -> dict[str, tuple[float, float] | None]:
+def whereabouts(sessions: Sequence[Session]) -> dict[str, Whereabouts | None]:
     """Return where robots are, or may be, in the map's frame, by name; None where nothing is known of it."""
     return {session.keys.robot: session.whereabouts() for session in sessions}

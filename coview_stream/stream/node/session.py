@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from coview_stream.basemap.joined.map_parts import MapParts
+from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
 from coview_stream.geometry.protection import ProtectionLevel
@@ -73,7 +74,7 @@ class Session:
             parts: the maps of which the map is joined; None of one map.
         """
         self.keys = keys
-        self.map_sha256 = map_sha256
+        self.map_sha256 = self.site_sha256 = map_sha256
         self.parts = parts
         self.config = config or NodeConfig()
         self.codecs = codecs
@@ -81,6 +82,7 @@ class Session:
         self._epoch = 0  # number of the odometry frame, counted through all resets
         self._hint = PoseHint()
         self._guess: PlaceGuess | None = None  # that no frame has taken to the engine yet
+        self._said: PlaceGuess | None = None  # the newest one, until the place is known
         self._clear()
 
     def _clear(self) -> None:
@@ -204,12 +206,14 @@ class Session:
         """Search from nothing because a client asks: without the last known pose."""
         with self._lock:
             self._hint.forget()
+            self._said = None
             self.restart_search("asked to search again")
 
     def reset(self) -> None:
         """Forget everything, counters, odometry and the last known pose too."""
         with self._lock:
             self._hint.forget()
+            self._said = None
             self._clear()
 
     def hint_pose(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
@@ -225,7 +229,7 @@ class Session:
         """Forget everything, for another node goes on with the robot."""
         with self._lock:
             self._hint = PoseHint()
-            self._guess = None
+            self._guess = self._said = None
             self._clear()
 
     def handover(self) -> Handover | None:
@@ -234,7 +238,7 @@ class Session:
             correction = self.robot_state.correction
             if correction is None or not self.robot_state.state.has_place:
                 return None
-            return Handover(self.map_sha256, correction.T_map_odom, self.robot_state.calibration)
+            return Handover(self.site_sha256, correction.T_map_odom, self.robot_state.calibration)
 
     def take_over(self, known: Handover) -> bool:
         """Go on with a robot that another node has followed: its place becomes a hypothesis with the next frame.
@@ -260,7 +264,7 @@ class Session:
         with self._lock:
             if self.robot_state.correction is not None:
                 return False
-            self._guess = guess
+            self._guess = self._said = guess
             return True
 
     def begin_beside(self, old: Session) -> None:
@@ -272,7 +276,9 @@ class Session:
             known, before = old.robot_state.last_known_pose(old.odometry), old._hint.known
             T_map_body = before if known.T_map_body is None else known.T_map_body
             calibration, forgotten = old.calibration or old._hint.calibration, old._hint.forgotten
+            said = old._said if old.parts is None and self.parts is None else None
         with self._lock:
+            self._guess = self._said = said  # it may be on this map only
             self._hint.forgotten = forgotten
             if T_map_body is not None:
                 self._hint.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
@@ -335,6 +341,8 @@ class Session:
                     if frame.job.guess is self._guess:
                         self._guess = None
                     self.robot_state.add_fix(result.fix, frame, result.events)
+                    if self.robot_state.correction is not None:
+                        self._said = None
                     self._record_state()
             elif isinstance(job, SearchJob) and isinstance(result, SearchResult):
                 self.queue.search_done(job, result, now)
@@ -365,18 +373,18 @@ class Session:
         T_map_odom = None if pose.T_map_odom is None else part.own(pose.T_map_odom)
         return replace(pose, T_map_body=part.own(pose.T_map_body), T_map_odom=T_map_odom, frame_id=part.name)
 
-    def whereabouts(self) -> tuple[float, float] | None:
-        """Return x and y in the map's frame of where the robot is or, if that is not known, may be.
+    def whereabouts(self) -> Whereabouts | None:
+        """Return where the robot is or, if that is not known, may be, in the map's frame.
 
-        That is where somebody says that it is, else where it was, else the most probable place that the search
-        considers, if it is more probable than none; None where there is nothing of that.
+        It may be where somebody says that it is, else where it was, else at the most probable place that the search
+        considers, if that is more probable than none; None where there is nothing of that.
         """
         with self._lock:
             correction = self.robot_state.correction
             if correction is not None:
                 at = correction.T_map_body[:2, 3]
-            elif self._guess is not None:
-                at = np.array([self._guess.x, self._guess.y])
+            elif self._said is not None:
+                at = np.array([self._said.x, self._said.y])
             elif self._hint.known is not None:
                 at = self._hint.known[:2, 3]
             else:
@@ -384,7 +392,7 @@ class Session:
                 if seen is None or not len(seen.places) or seen.places[0, 4] <= seen.none:
                     return None
                 at = seen.places[0, :2]
-        return float(at[0]), float(at[1])
+            return Whereabouts((float(at[0]), float(at[1])), correction is not None)
 
     def map_name(self) -> str | None:
         """Return which of several maps the robot is on; None while that is not known, and where there is one map."""

@@ -105,8 +105,6 @@ def test_file_of_joined_maps_is_made_once(world_file, tmp_path, monkeypatch):
     path = joined_file([("a", world_file), ("b", world_file)])
     monkeypatch.setattr(joining, "join_maps", None)
     assert joined_file([("a", world_file), ("b", world_file)]) == path
-    with pytest.raises(MapError, match="two maps are called a"):
-        joined_file([("a", world_file), ("a", world_file)])
 
 
 def test_parts_are_read_strictly():

@@ -59,3 +59,31 @@ def test_full_disk_is_an_error_that_names_the_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     with ArrayFiles(tmp_path) as files, pytest.raises(MapError, match=r"No space left.*COVIEW_CACHE"):
         files.zeros("a", (10,), np.int8)
+
+
+def test_rows_that_found_no_room_are_not_among_the_others(tmp_path, monkeypatch):
+    with ArrayFiles(tmp_path) as files:
+        files.append("a", np.full((4, 2), 1, np.int32))
+        file = files._files["a"]
+        files._files["a"] = Full(file)
+        with pytest.raises(MapError, match="No space left"):
+            files.append("a", np.full((4, 2), 2, np.int32))
+        files._files["a"] = file
+        assert files.append("a", np.full((1, 2), 3, np.int32)) == 4
+        np.testing.assert_array_equal(files.arrays()["a"], [[1, 1]] * 4 + [[3, 3]])
+
+
+class Full:
+    """A file that takes a few bytes more."""
+
+    def __init__(self, file):
+        self.file, self.left = file, 6
+
+    def seek(self, at):
+        self.file.seek(at)
+
+    def write(self, content):
+        if not self.left:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written, self.left = self.file.write(content[: self.left]), 0
+        return written

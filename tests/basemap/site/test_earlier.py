@@ -53,6 +53,7 @@ def keys_of(site):
 
 
 def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, taken, monkeypatch, tmp_path):
+    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
     some = set(keys_of(site)[1:3])
     part = file_format.open_file(working_file(site, keys=some)).arrays
     whole = file_format.open_file(working_file(site)).arrays
@@ -71,7 +72,17 @@ def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, 
     np.testing.assert_array_equal(part["station_codes"], whole["station_codes"][own])
 
 
-def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken):
+def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, monkeypatch):
+    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 10**6)
+    some = set(keys_of(site)[:2])
+    part = file_format.open_file(working_file(site, keys=some)).arrays
+    whole = file_format.open_file(working_file(site)).arrays
+    assert taken == [0, 2]  # their field is taken
+    assert not np.array_equal(part["station_codes.basis"], whole["station_codes.basis"])
+
+
+def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken, monkeypatch):
+    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
     working_file(site, keys=set(keys_of(site)[:1]))
     base_map = BaseMap.load(site)
     assert taken == [0, 1]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.mirror import Mirror
 from coview_stream.basemap.site.part import Around, kept_places, read_part
+from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.site_source import DirectorySource
@@ -45,6 +49,10 @@ class Source(DirectorySource):
         return super().manifest()
 
 
+def at(place):
+    return Whereabouts(place, True)
+
+
 def around(place, radius=30.0):
     return Around(*place, radius)
 
@@ -58,14 +66,14 @@ def test_tiles_follow_the_robots(site):
     corner = min(tiles(served))
     assert len(tiles(served)) == 1
     assert not served.follow({"a": None, "b": None})
-    assert not served.follow({"a": (WEST[0] + 15.0, WEST[1]), "b": None})  # its circle moves on the same tile
-    assert served.follow({"a": EAST, "b": None})
+    assert not served.follow({"a": at((WEST[0] + 15.0, WEST[1])), "b": None})  # its circle moves on the same tile
+    assert served.follow({"a": at(EAST), "b": None})
     assert tiles(served) == {corner, (corner[0] + 1, corner[1])}  # the other robot may be at the start
-    assert served.follow({"a": EAST, "b": EAST})
+    assert served.follow({"a": at(EAST), "b": at(EAST)})
     assert tiles(served) == {(corner[0] + 1, corner[1])}
     assert not served.refresh()  # of a directory nothing is asked
     with pytest.raises(MapError, match="no tile of the site is there"):
-        served.follow({"a": (0.0, 0.0), "b": (0.0, 0.0)})
+        served.follow({"a": at((0.0, 0.0)), "b": at((0.0, 0.0))})
     assert len(tiles(served)) == 1
     served.close()
     assert not served.map_path.exists()
@@ -79,7 +87,7 @@ def test_only_tiles_of_the_route_are_fetched_and_they_are_there_without_the_net(
     assert len(mirror.fetched(Manifest.load(site))) == 1
     source.gone = True
     with pytest.raises(TransportError, match="nobody answers"):
-        served.follow({"a": EAST})
+        served.follow({"a": at(EAST)})
     assert len(tiles(served)) == 1
     with pytest.raises(TransportError):
         served.refresh()
@@ -87,14 +95,41 @@ def test_only_tiles_of_the_route_are_fetched_and_they_are_there_without_the_net(
     assert served.refresh()  # what could not be fetched then
     assert tiles(served) == mirror.fetched(Manifest.load(site)) - {min(mirror.fetched(Manifest.load(site)))}
     source.gone = True
-    assert served.follow({"a": WEST})  # back, where everything is there
+    assert served.follow({"a": at(WEST)})  # back, where everything is there
     assert "nobody answers" in served.offline
     assert len(tiles(served)) == 1
 
 
+def test_change_of_the_site_that_following_fetches_is_told(site, tmp_path):
+    copy = shutil.copytree(site, tmp_path / "copy")
+    mirror = Mirror(Source(copy), None, around(WEST))
+    mirror.open()
+    served = ServedSite(mirror.directory, mirror, around(WEST))
+    whole = Manifest.load(copy)
+    replace(whole, tiles=whole.tiles[:-1], crs="EPSG:25833").save(copy)
+    assert served.follow({"a": at((WEST[0] + 15.0, WEST[1]))})  # the same tile, of another state
+    assert not served.refresh()
+
+
+def test_what_failed_is_tried_again(site, monkeypatch):
+    served = ServedSite(site, None, around(WEST))
+    with monkeypatch.context() as patch:
+        patch.setattr("coview_stream.basemap.site.served_site.part_file", full)
+        with pytest.raises(MapError):
+            served.follow({"a": at(EAST)})
+    assert not served.follow({"a": at(EAST)})  # it has not moved since
+    assert served.refresh()
+    assert len(tiles(served)) == 1
+    assert not served.refresh()
+
+
+def full(*args):
+    raise MapError("no room")
+
+
 def test_next_start_is_where_the_robots_were_and_at_the_start(site):
     served = ServedSite(site, None, around(WEST))
-    served.follow({"a": EAST})
+    served.follow({"a": at(EAST)})
     served.close()
     assert kept_places(site, str(around(WEST))) == {"a": EAST}
     assert len(tiles(ServedSite(site, None, around(WEST)))) == 2
@@ -103,6 +138,6 @@ def test_next_start_is_where_the_robots_were_and_at_the_start(site):
 def test_whole_site_is_not_followed(site):
     served = ServedSite(site)
     assert served.map_path == site
-    assert not served.follow({"a": EAST})
+    assert not served.follow({"a": at(EAST)})
     served.close()
     assert site.is_dir()

@@ -18,6 +18,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.mirror import Mirror
 from coview_stream.basemap.site.part import Around, part_file, read_part
+from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.tile_store import TileStore
@@ -144,18 +145,22 @@ def test_tiles_are_fetched_as_robots_come_to_them(source, server, site):
     mirror = Mirror(source, None, start)
     mirror.open()
     served = ServedSite(mirror.directory, mirror, start)
-    place, busy, calls, stopping = {"r1": None}, [], [], threading.Event()
-    follower = MapFollower(served, lambda: calls.append(1), lambda: place, lambda: bool(busy), period=0.05)
+    place, outcomes, calls, stopping = {"r1": None}, ["loading"], [], threading.Event()
+    follower = MapFollower(served, lambda: calls.append(1), lambda: place, lambda: outcomes[-1], period=0.05)
     thread = threading.Thread(target=follower.run, args=(stopping,))
     thread.start()
     try:
-        busy.append(1)
-        place["r1"] = (512_050.0, 5_120_050.0)
+        place["r1"] = Whereabouts((512_050.0, 5_120_050.0), True)
         assert not stopping.wait(0.3)
         assert not calls  # a change is being taken over
-        busy.clear()
-        until(lambda: calls)
-        assert follower.last["around"] == [[*place["r1"], 30.0]]
+        outcomes.append("refused")
+        until(lambda: len(calls) > 2)  # asked for again
+        outcomes.append("changed")
+        assert not stopping.wait(0.3)
+        made = len(calls)
+        assert not stopping.wait(0.5)
+        assert len(calls) == made
+        assert follower.last["around"] == [[*place["r1"].place, 30.0]]
         directory, keys = read_part(served.map_path)
         assert (directory, len(keys)) == (mirror.directory.resolve(), 1)
         assert len(mirror.fetched(Manifest.load(mirror.directory))) == 2

@@ -16,6 +16,7 @@ from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages.hypotheses import decode_hypotheses
 from coview_stream.stream.node.map_view import MapViewAnswer
+from coview_stream.stream.node.session import Session
 
 PLACES = Considered(1.5, np.array([[1.0, 2.0, 3.0, 0.5, 0.7, 9.0], [4.0, 5.0, 6.0, -0.5, 0.1, 2.0]]), 0.2)
 
@@ -55,13 +56,17 @@ def test_of_a_robot_with_a_place_nothing_goes_out(site, searched):
 
 
 def test_robot_may_be_at_the_most_probable_place_until_more_is_known(site, searched):
-    assert searched.whereabouts() == (1.0, 2.0)
+    assert searched.whereabouts() == ((1.0, 2.0), False)
     assert searched.guess_place(PlaceGuess(7.0, 8.0))
-    assert searched.whereabouts() == (7.0, 8.0)
+    site.frame("r1", 0.05)  # which takes it to the engine
+    assert searched.whereabouts() == ((7.0, 8.0), False)
+    beside = Session(searched.keys, SHA)
+    beside.begin_beside(searched)
+    assert beside.whereabouts() == ((7.0, 8.0), False)
     site.engine.answer = tracking
     site.frame("r1", 0.1)
     correction = searched.robot_state.correction
-    assert searched.whereabouts() == tuple(correction.T_map_body[:2, 3])
+    assert searched.whereabouts() == (tuple(correction.T_map_body[:2, 3]), True)
     searched.relocalize()
     assert searched.whereabouts() is None
 
@@ -82,7 +87,7 @@ def test_a_new_odometry_frame_forgets_them(site, searched):
 def test_a_map_view_is_of_the_map_that_is_served(site, world_file):
     served = [BaseMap.load(world_file).sha256]
     key = site.keys["r1"].map_view
-    site.net.answer(key, MapViewAnswer(world_file, lambda: served[0]))
+    site.net.answer(key, MapViewAnswer({served[0]: world_file, "00": world_file}, lambda: served[0]))
     view = site.net.query(key)
     assert view["map_sha256"] == served[0]
     assert view["count"] > 1000

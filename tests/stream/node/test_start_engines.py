@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -55,13 +56,16 @@ def loads(monkeypatch):
 
     def load(path, verify_key=None):
         made.append(path)
-        return SimpleNamespace(parameters={}, sha256="b" * 64, identity=None, require_features=lambda _: None)
+        sha256 = "b" * 64
+        return SimpleNamespace(
+            parameters={}, sha256=sha256, site_sha256=sha256, path=None, identity=None, require_features=lambda _: None
+        )
 
     monkeypatch.setattr(serve, "BaseMap", SimpleNamespace(load=load))
     return made
 
 
-OPTIONS = serve.ServeOptions("site.coview", [])
+OPTIONS = serve.ServeOptions(Path("site.coview"), [])
 
 
 def test_engine_that_does_not_start_ends_those_before_it(engine, loads, monkeypatch):
@@ -76,7 +80,7 @@ def test_new_map_is_loaded_once(engine, loads, monkeypatch):
     monkeypatch.setattr(serve, "start_children", lambda _: {"track": RecordedChild(), "search": RecordedChild()})
     opened = serve.open_map(OPTIONS, "a" * 64, lambda: False)
     assert opened is not None
-    assert loads == ["site.coview"]
+    assert loads == [OPTIONS.map_path]
     assert serve.open_map(OPTIONS, "b" * 64, lambda: False) is None
 
 
@@ -84,6 +88,7 @@ def test_opening_that_is_cancelled_leaves_nothing_running(engine, loads, monkeyp
     children = {"track": RecordedChild(), "search": RecordedChild()}
     monkeypatch.setattr(serve, "start_children", lambda _: children)
     with pytest.raises(CancelledError):
-        serve.open_map(OPTIONS, "a" * 64, lambda: True)
+        serve.open_map(OPTIONS, "a" * 64, lambda: bool(loads))
+    assert engine.made
     assert all(each.calls == ["start", "close"] for each in engine.made.values())
     assert all(child.closed for child in children.values())

@@ -1,0 +1,53 @@
+"""The cache keeps to its bound, and what is in use."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap import file_format
+from coview_stream.basemap.site import cache
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path))
+    monkeypatch.setenv("COVIEW_CACHE_GB", "2.5e-5")  # three of the files below are more
+    return cache.cache_folder()
+
+
+def made(folder, name, age):
+    path = folder / name
+    file_format.save(path, {"a": np.arange(1250, dtype=np.int64)}, {})
+    os.utime(path, (age, age))
+    return path
+
+
+def test_what_was_not_used_for_longest_goes(folder):
+    paths = [made(folder, f"{k}.coview", 1000 * k) for k in range(3)]
+    cache.evict(folder)
+    assert [path.exists() for path in paths] == [False, True, True]
+
+
+def test_what_is_asked_for_and_what_is_open_stays(folder):
+    paths = [made(folder, f"{k}.coview", 1000 * k) for k in range(3)]
+    held = file_format.open_file(paths[0], opened=cache.hold)
+    cache.evict(folder, paths[1])
+    assert [path.exists() for path in paths] == [True, True, False]
+    assert held.arrays["a"].sum() > 0
+    del held
+    made(folder, "2.coview", 2000)
+    cache.evict(folder)
+    assert [path.exists() for path in paths] == [False, True, True]
+
+
+def test_mirror_that_was_used_stays(folder):
+    old, new = (folder / "sites" / name for name in ("old", "new"))
+    for path in (old, new):
+        path.mkdir(parents=True)
+        (path / "x").write_bytes(bytes(15_000))
+    os.utime(old, (1, 1))
+    cache.evict(folder)
+    assert (old.exists(), new.exists()) == (False, True)
