@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from coview_kernels import StationCodes
 from coview_stream.basemap.build import surveyed_around
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, LAYERS, field_arrays, layers_arrays
@@ -32,6 +33,7 @@ from coview_stream.geometry.arrays import Bools, Floats
 Progress = Callable[[int, int], None]
 
 _FIELD_MARGIN = 16.0  # metres around a tile that its field sees, one tile of the field
+_IN_PARTS = "too large to be searched as one; open a part of the site, --around X,Y,RADIUS"
 _LEARNED = ("local", "sigma", "tiles", "place", "place_at")
 
 
@@ -66,8 +68,11 @@ def assemble(
         if progress:
             progress(done, steps)
 
-    if not sum(entry.stations for entry in entries):
+    stations = sum(entry.stations for entry in entries)
+    if not stations:
         raise MapError("the site has no stations there; build it again, or ask for other tiles")
+    if stations > StationCodes.MAX_STATIONS:
+        raise MapError(f"{stations} stations, {StationCodes.MAX_STATIONS} at most: {_IN_PARTS}")
     clouds = TileClouds(manifest, grid, store, entries, into, step)
     states = states_of(manifest, clouds)
     taken = Earlier(states, earlier, grid.config.descriptor.channels)
@@ -94,8 +99,15 @@ def assemble(
 
 
 def layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
-    """Return the rasters in which the field of these arrays is looked up, made in files."""
-    made = layers_arrays(arrays, into.zeros, into.release)
+    """Return the rasters in which the field of these arrays is looked up, made in files.
+
+    Raises:
+        MapError: the map is too large for them, or there is no room.
+    """
+    try:
+        made = layers_arrays(arrays, into.zeros, into.release)
+    except ValueError as error:
+        raise MapError(f"{error}: {_IN_PARTS}") from error
     kept = into.arrays()
     return {name: kept.get(name.removeprefix(LAYERS), values) for name, values in made.items()}
 
