@@ -57,7 +57,7 @@ class MapSummary:
         return (
             f"{self.width:.0f} x {self.depth:.0f} m with points on {_area(self.area)}{density}, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "
-            f"{self.bytes / 1e6:.0f} MB ({self.bytes / self.area / 1e3:.2g} GB per km2)"
+            f"{self.bytes / 1e6:.0f} MB as one file ({self.bytes / self.area / 1e3:.2g} GB per km2)"
         )
 
 

@@ -101,7 +101,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     sha256 = base_map = None
     if args.map is not None:
         try:
-            path = local_map(args.map, args.around, base=args.base, connect=connect or ()).path
+            path = local_map(args.map, args.around, base=args.base, connect=args.connect or (), config=args.config).path
         except CoViewError as error:
             finding = from_error("map", error)
         else:

@@ -90,7 +90,10 @@ def local_map(
     if circle is None:
         return LocalMap(path)
     if not is_site(path):
-        raise ConfigError(f"--around: {name} is no directory of tiles; `coview-stream convert` makes one")
+        raise ConfigError(
+            f"--around: {name} is no directory of tiles; `coview-stream build CLOUDS -o DIRECTORY/` makes one, "
+            "`convert` one of a .coview file"
+        )
     if follows:
         served = ServedSite(path, None, circle)
         return LocalMap(served.map_path, None, served)

@@ -92,6 +92,14 @@ class OdometryBuffer:
         self._discontinuous: deque[int] = deque(maxlen=_MIN_RESTART_SAMPLES)  # stamps
         self._discontinuous_since = float("inf")
 
+    def continue_from(self, other: OdometryBuffer) -> None:
+        """Go on with another buffer's samples, so that what does not continue those is noticed."""
+        self.newest, self.arrived = other.newest, other.arrived
+        self.travelled, self.turned = other.travelled, other.turned
+        self._samples = other._samples.copy()
+        self._discontinuous = other._discontinuous.copy()
+        self._discontinuous_since = other._discontinuous_since
+
     def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> SampleKind:
         """Take in a sample and return its kind; duplicates and samples out of order are not kept.
 

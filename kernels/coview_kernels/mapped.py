@@ -12,7 +12,7 @@ import numpy.typing as npt
 WINDOW = 1 << 25
 """Bytes that are used before they are released, set by hand: 16 launches for half a gigabyte, and little to hold."""
 
-LARGE = 1 << 27
+LARGE = 1 << 26
 """Bytes from which an array is used by windows, set by hand: each pass through it costs time, about an eighth of a
 second for a gigabyte (``python -m bench scale``)."""
 

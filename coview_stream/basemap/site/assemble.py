@@ -93,6 +93,9 @@ def assemble(
     if features:
         arrays |= _features(entries, store)
     parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256}
+    if keys is not None and isinstance(read := parameters.get("source_points"), int):
+        share = clouds.points / sum(tile.points for tile in manifest.tiles)
+        parameters["source_points"] = round(share * read)  # about: how many lay on each tile is not kept
     counts = {key: len(each) for key, each in clouds.stations.items()}
     parameters[PARAMETER] = record(states, counts, rows)
     return arrays, parameters | {"learned": manifest.parameters["learned"] if features else None}

@@ -140,8 +140,22 @@ def _row(view: RobotView, now: float) -> list[str]:
         *_pose_cells(view.fresh_pose(now), view.pose_rate(now)),
         f"{_number(latency.get('p50'), 0)}/{_number(latency.get('p99'), 0)}",
         _number(counters.get("dropped"), 0),
-        printable("; ".join([str(view.status.get("reason") or ""), *filter(None, [view.node]), *_says(view.status)])),
+        printable(
+            "; ".join(
+                [
+                    *_map(view.status),
+                    str(view.status.get("reason") or ""),
+                    *filter(None, [view.node]),
+                    *_says(view.status),
+                ]
+            )
+        ),
     ]
+
+
+def _map(status: dict[str, Any]) -> list[str]:
+    """Say on which of several maps a robot is."""
+    return [f"on map {status['map']}"] if isinstance(status.get("map"), str) else []
 
 
 def _pose_cells(pose: PoseMessage | None, rate: float) -> list[str]:

@@ -73,6 +73,9 @@ class MapFollower:
                     tries = 0
                 elif not self._pending or now < again_at:
                     continue
+                log.info(
+                    "%s: %s", self._site.name, "other tiles are wanted, or it has changed" if changed else "once more"
+                )
                 self._pending, again_at = True, now + self._period * 2 ** min(tries, _MOST_DOUBLINGS)
                 tries += 1
                 self._take_over()

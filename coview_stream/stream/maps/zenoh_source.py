@@ -62,4 +62,17 @@ class ZenohSource:
                 if len(reply.ok.payload) > limit:
                     raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")
                 return bytes(reply.ok.payload)
-        raise TransportError(f"{self.name}: {told or 'no map server answers; is serve-map running there?'}")
+        raise TransportError(f"{self.name}: {told or self._silence()}")
+
+    def _silence(self) -> str:
+        """Say what there is where nobody answers for this site."""
+        import zenoh
+
+        begin, end = self._keys.prefix.rpartition("/")[0] + "/", "/manifest"
+        with zenoh_config.zenoh_errors(self.name):
+            replies = list(self._session.get(f"{begin}*{end}", timeout=_TIMEOUT, target=zenoh.QueryTarget.ALL))
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        others = sorted({key.removeprefix(begin).removesuffix(end) for key in keys})
+        if others and self._keys.manifest not in keys:
+            return f"no map server there has it; there are {', '.join(others)[:200]}"
+        return "no map server answers; is serve-map running there?"

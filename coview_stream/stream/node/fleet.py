@@ -20,7 +20,7 @@ from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
 
-LEASE_MS = 2000
+LEASE_MS = 1000
 """After so long without a sign of life the network takes a node for dead, set by hand: to be replaced within 3 s."""
 
 _MISSED = 2  # looks in a row that do not show a node, before it is gone; set by hand

@@ -19,7 +19,7 @@ from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
 
-_LOOK = 0.25  # seconds between two looks at who is alive; set by hand
+_LOOK = 0.1  # seconds between two looks at who is alive; set by hand
 _TELL = 1.0  # seconds between two messages of where the robots are; set by hand
 _MAX_BYTES = 4 << 20  # of such a message that are read
 

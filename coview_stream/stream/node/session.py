@@ -277,6 +277,9 @@ class Session:
             T_map_body = before if known.T_map_body is None else known.T_map_body
             calibration, forgotten = old.calibration or old._hint.calibration, old._hint.forgotten
             said = old._said if old.parts is None and self.parts is None else None
+            with self._lock:  # as other sessions of the robot, which know nothing of each other
+                self.odometry.continue_from(old.odometry)
+                self._cloud_at = old._cloud_at
         with self._lock:
             self._guess = self._said = said  # it may be on this map only
             self._hint.forgotten = forgotten

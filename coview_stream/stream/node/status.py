@@ -133,7 +133,8 @@ class Reporter:
         before, now_told = self._reported.get(robot, ("", None)), self._news(session)
         self._reported[robot] = now_told  # published or not: it is not tried again at once
         if state.reported != before[0] and not closing:
-            log.info("%s: %s (%s)", robot, state.reported, reason)
+            name = session.map_name()
+            log.info("%s: %s%s (%s)", robot, state.reported, "" if name is None else f" on {name}", reason)
         claim = None if self._elections is None else self._elections.claim(robot)
         if self._elections is not None and claim is None:
             return

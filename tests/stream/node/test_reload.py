@@ -117,6 +117,20 @@ def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
     assert hints[1] is None  # told once
 
 
+def test_robot_that_begins_anew_after_a_change_that_it_slept_through_has_poses_again(changes):
+    change = changes("r1", max_handover=0.1)
+    change.step = 5000
+    change.drive_until(lambda: change.states() == ["TRACKING"])
+    change.site.node.reload()
+    until(lambda: change.reloader.last["result"] == "changed")
+    session = change.site.node.sessions[0]
+    assert "could be read" not in session.state()[1]
+    change.step, before = 0, len(change.site.poses("r1"))
+    change.drive_until(lambda: len(change.site.poses("r1")) > before + 3)
+    assert session.counters.clock_restarts == 1
+    assert change.site.poses("r1")[-1].stamp_ns < change.site.poses("r1")[before - 1].stamp_ns
+
+
 def test_robot_that_the_new_map_does_not_know_is_searched_for_after_a_while(changes):
     change = changes("r1", max_handover=0.3)
     change.drive_until(lambda: change.states() == ["TRACKING"])

@@ -1,0 +1,166 @@
+"""A fleet on machines of their own, network namespaces: a cable is pulled, and plugged in again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from nightly import nightly
+from sockets import until
+from zenoh_routers import ROUTER_PROGRAM, router_config
+
+from coview_stream.clouds.python_child import python_command, python_environment
+from coview_stream.stream.client.client import RobotClient
+
+PORT = 7461
+MAX_GAP = 3.0  # seconds that docs/scale.md promises
+FALSE = 1.0  # metres
+TRANSPORT = {"link": {"tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 1_500_000}}}}}}
+"""As docs/scale.md has it: or a machine that is silent holds all others up for five seconds."""
+
+ROBOTS = ("r1", "r2", "r3", "r4")
+
+
+class Machine:
+    """A network namespace behind a cable to this one, and a node of the fleet in it."""
+
+    def __init__(self, number, world_file):
+        self.name, self.cable = f"cv{os.getpid()}x{number}", f"cv{os.getpid() % 10000}c{number}"
+        self.here, self.there = f"10.83.{number}.1", f"10.83.{number}.2"
+        ip("netns", "add", self.name)
+        ip("link", "add", self.cable, "type", "veth", "peer", "name", "eth0", "netns", self.name)
+        ip("addr", "add", f"{self.here}/24", "dev", self.cable)
+        ip("link", "set", self.cable, "up")
+        ip("-n", self.name, "addr", "add", f"{self.there}/24", "dev", "eth0")
+        for device in ("eth0", "lo"):
+            ip("-n", self.name, "link", "set", device, "up")
+        words = ("--robot", *ROBOTS, "--fleet", "yard", "--node", f"node{number}", "--no-state", "--log-json")
+        command = python_command(
+            "coview_stream", "serve", str(world_file), *words, "--connect", f"tcp/{self.here}:{PORT}"
+        )
+        self.node = subprocess.Popen(
+            ["ip", "netns", "exec", self.name, *command], env=python_environment(), stderr=subprocess.PIPE, text=True
+        )
+        self.said = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        with contextlib.suppress(ValueError):  # closed
+            for line in self.node.stderr:
+                self.said.put(json.loads(line)["message"])
+
+    def number_in_fleet(self):
+        """The name that the node drew for itself, which statuses have."""
+        while "this node is" not in (text := self.said.get(timeout=90.0)):
+            pass
+        return text.split("this node is ")[1].split()[0].rstrip(",.;")
+
+    def pull(self, out):
+        ip("link", "set", self.cable, "down" if out else "up")
+
+    def close(self):
+        self.node.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.node.wait(10.0)
+        self.node.kill()
+        ip("netns", "del", self.name)
+
+
+class Robot:
+    """A robot that goes to and fro, ten frames a second, and what it hears."""
+
+    def __init__(self, name, drive):
+        self.client, self.drive = RobotClient(name, f"tcp/127.0.0.1:{PORT}"), drive
+        self.poses, self.nodes, self.truth = [], [], {}
+        self._ending = threading.Event()
+        for run in (self._send, self._hear_poses, self._hear_statuses):
+            threading.Thread(target=run, daemon=True).start()
+
+    def _send(self):
+        count, due = len(self.drive.clouds), time.monotonic()
+        for k in range(1_000_000):
+            at = (count - 1) - abs((k % (2 * count - 2)) - (count - 1))
+            stamp = 1000.0 + 0.2 * k
+            self.truth[round(stamp * 1e9)] = self.drive.T_map_body[at]
+            self.client.send_odometry(self.drive.T_odom_body[at], stamp)
+            self.client.send_cloud(self.drive.clouds[at], stamp)
+            due += 0.2
+            if self._ending.wait(max(0.0, due - time.monotonic())):
+                return
+
+    def _hear_poses(self):
+        for pose in self.client.poses(timeout=None):
+            self.poses.append((time.monotonic(), pose))
+
+    def _hear_statuses(self):
+        for status in self.client.statuses(timeout=None):
+            self.nodes.append((time.monotonic(), status["node"]["id"]))
+
+    def served_by(self, other_than, since):
+        return next((at for at, node in list(self.nodes) if at > since and node not in other_than), None)
+
+    def close(self):
+        self._ending.set()
+        self.client.close()
+
+
+def ip(*words):
+    return subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+
+@pytest.fixture
+def fleet(world_file):
+    if os.name != "posix" or os.geteuid() or not shutil.which("ip"):
+        pytest.skip("network namespaces need root, and ip (iproute2)")
+    with contextlib.ExitStack() as stack:
+        words = (sys.executable, "-c", ROUTER_PROGRAM, router_config(f"tcp/0.0.0.0:{PORT}", transport=TRANSPORT))
+        router = stack.enter_context(subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        stack.callback(router.kill)
+        assert router.stdout.readline() == b"up\n"
+        machines = []
+        for number in (1, 2):
+            machines.append(Machine(number, world_file))
+            stack.callback(machines[-1].close)
+        yield machines
+
+
+@nightly
+def test_cable_that_is_pulled_moves_robots_and_plugged_in_again_gives_no_false_pose(fleet, slow_drive):
+    machines = {machine.number_in_fleet(): machine for machine in fleet}
+    robots = [Robot(name, slow_drive) for name in ROBOTS]
+    try:
+        until(lambda: all(len(robot.poses) > 5 for robot in robots), 90.0)
+        victim = robots[0].nodes[-1][1]
+        moved = [robot for robot in robots if robot.nodes[-1][1] == victim]
+        machines[victim].pull(out=True)
+        pulled = time.monotonic()
+        until(lambda: all(robot.served_by({victim}, pulled) for robot in moved), 20.0)
+        taken = [robot.served_by({victim}, pulled) - pulled for robot in moved]
+        until(lambda: all(robot.poses[-1][0] > pulled + 5.0 for robot in moved), 60.0)
+        assert max(taken) < MAX_GAP, taken
+        machines[victim].pull(out=False)
+        plugged = time.monotonic()
+        until(lambda: all(robot.served_by(set(machines) - {victim}, plugged) for robot in moved), 60.0)
+        time.sleep(5.0)
+        now = time.monotonic()
+        until(lambda: all(robot.poses[-1][0] > now for robot in robots), 60.0)
+        for robot in robots:  # one node each
+            nodes = {node for at, node in list(robot.nodes) if at > now}
+            assert len(nodes) <= 1
+            poses = list(robot.poses)
+            off = [np.linalg.norm(p.T_map_body[:3, 3] - robot.truth[p.stamp_ns][:3, 3]) for _, p in poses]
+            assert max(off) < FALSE
+            stamps = [p.stamp_ns for at, p in poses if at > now]
+            assert stamps == sorted(stamps)
+    finally:
+        for robot in robots:
+            robot.close()
