@@ -196,8 +196,8 @@ def open_node(
         if isinstance(error, DiedError):
             raise MapError(f"{options.map_path}: {error} while it opened the map") from error
         raise
-    name = options.map_path if options.site is None else options.site.name
-    log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, name, ", ".join(names))
+    where = options.map_path if options.site is None else options.site.name
+    log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, where, ", ".join(names))
     notifier.ready(f"serves {', '.join(names)}")
     return node
 
