@@ -121,8 +121,8 @@ class BaseMap:
         """Memory-map a ``.coview`` file, or a site's.
 
         Args:
-            path: the file; or the directory of a site, a part of one, or the names of several maps, of which a file
-                is made first where it is not there.
+            path: the file; or the directory of a site, or a part of one, whose working file is made first where it is
+                not there.
             check: compare its content with its checksum, for which the whole file is read, a site's working file only
                 the first time; without, :attr:`sha256` is what the file says: for one that another process has just
                 checked.
@@ -143,13 +143,6 @@ class BaseMap:
             from coview_stream.basemap.site.working_file import open_site
 
             place, file = open_site(place, check, None if trust is None else trust.key)
-        elif place.suffix == ".joined":
-            from coview_stream.basemap.joined.join_maps import joined_file
-            from coview_stream.basemap.joined.joined_names import read_names
-            from coview_stream.basemap.site.working_file import open_made
-
-            maps, key = read_names(place), None if trust is None else trust.key
-            place, file = open_made(lambda: joined_file(maps, key), check)
         else:
             file = file_format.open_file(place, check, trust)
         loaded = cls(file.arrays, file.parameters, file.sha256)

@@ -241,7 +241,7 @@ def _serve(
     def work() -> None:
         try:
             opened.append(node := open_node(options, lambda: stop.requested, children, notifier))
-            feeds.append(feed_of_node(node, options.keys, options.map_path, options.node.mount, sinks))
+            feeds.append(feed_of_node(node, options.keys, options.node.mount, sinks))
         except CancelledError:
             pass
         except BaseException as error:

@@ -101,20 +101,18 @@ def feed_of_watch(
     return _running(SessionFeed(transport, topics, view, source, clouds=not args.no_clouds), sinks)
 
 
-def feed_of_node(
-    node: Node, keys: Sequence[RobotKeys], path: Path, mount: Mount, sinks: Sequence[Sink]
-) -> SessionFeed | None:
+def feed_of_node(node: Node, keys: Sequence[RobotKeys], mount: Mount, sinks: Sequence[Sink]) -> SessionFeed | None:
     """Return a running feed of a node in this process; None where nothing takes it in.
 
     It reads what the node reads and publishes on the node's own session, of which nothing waits for it.
     """
     if not sinks:
         return None
-    from coview_stream.viewers.map_source import read_from_file
+    from coview_stream.viewers.map_source import read_from_files
     from coview_stream.viewers.session_feed import SessionFeed
     from coview_stream.viewers.topics import topics_of_robots
 
-    source = read_from_file(path, lambda: node.map_sha256)
+    source = read_from_files(node.map_files, lambda: node.map_sha256)
     feed = SessionFeed(node.transport, topics_of_robots(keys), None, source, mount=mount, policy="newest")
     return _running(feed, sinks)
 

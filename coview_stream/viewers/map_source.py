@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from coview_stream.basemap.map_view import MAX_WIRE_BYTES, MapView
@@ -24,15 +24,16 @@ def asked_of_node(transport: Transport, base: str) -> MapSource:
     return ask
 
 
-def read_from_file(path: Path, sha256: Callable[[], str]) -> MapSource:
-    """Return a map source that reads a node's file, as long as it is of the map that the node serves: ``sha256()``."""
+def read_from_files(files: Mapping[str, Path], sha256: Callable[[], str]) -> MapSource:
+    """Return a map source that reads a node's files, by the hash of the map that the node serves: ``sha256()``."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.errors import MapError
 
     def load(robot: str) -> MapView:
-        base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
-        if base_map.sha256 != sha256():
-            raise MapError(f"{path}: the file is of another map than the one that is served")
+        served = sha256()
+        base_map = BaseMap.load(files[served], check=False)  # the node has compared it when it opened the map
+        if base_map.sha256 != served:
+            raise MapError(f"{files[served]}: the file is of another map than the one that is served")
         return MapView.of(base_map)
 
     return load

@@ -52,11 +52,11 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
 
 def main() -> None:
     """Open the map that the command line names."""
-    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.joined.load_map import load_map
 
     with contextlib.suppress(OSError, AttributeError):
         os.nice(_NICE)
-    BaseMap.load(sys.argv[1])
+    load_map(Path(sys.argv[1]))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 from coview_stream.config.node import NodeConfig
@@ -77,6 +78,7 @@ class Node:
         beat: local time at which the pose clock has ticked last.
         reloader: changes the map; None if there is no way to open one.
         map_follower: has it changed when its source elsewhere changes; None of a map that is here.
+        map_files: what the map was opened from, by its hash; also of one that is to take its place.
         feeds: of the engines of the map that is served, and of another that is to take its place.
     """
 
@@ -112,6 +114,7 @@ class Node:
         self.started = self.beat = time.monotonic()
         self.reloader: Reloader | None = None
         self.map_follower: Follower | None = None
+        self.map_files: Mapping[str, Path] = {}
 
     # ---- life
 

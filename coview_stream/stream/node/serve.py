@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.joined.load_map import load_map
 from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.trust import Trust
@@ -160,6 +161,7 @@ def open_node(
             sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
             engines.get("odometry"), background, elections,
         )  # fmt: skip
+        node.map_files = files
         notifier = notifier or Notifier()
         node.reloader = reloader = MapReloader(
             node,
@@ -230,7 +232,7 @@ def start_engines(
     Raises:
         MapError: the map is unusable. CoViewError: it has not what the options ask for.
     """
-    base_map = base_map or BaseMap.load(options.map_path, verify_key=options.verify_key)
+    base_map = base_map or load_map(options.map_path, options.verify_key)
     # what has been verified here they need not read again, as long as the file is the same
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     path = options.map_path
@@ -279,7 +281,7 @@ def open_map(
     prepare_map(options.map_path, cancelled)
     if cancelled():
         raise CancelledError("the node is no longer wanted")
-    base_map = BaseMap.load(options.map_path, verify_key=options.verify_key)
+    base_map = load_map(options.map_path, options.verify_key)
     if base_map.sha256 == served:
         return None
     children = start_children(options.lidar is not None)

@@ -6,9 +6,10 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.joined.joined_names import read_names, write_names
+from coview_stream.basemap.joined.load_map import load_map
 from coview_stream.basemap.joined.map_parts import MapParts
 from coview_stream.basemap.joined.served_maps import ServedMaps
-from coview_stream.basemap.signature import SigningKey, make_keys
+from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
 from coview_stream.errors import MapError, TransportError
 
 pytestmark = pytest.mark.slow
@@ -45,11 +46,11 @@ class Mirror:
 def test_names_are_loaded_as_one_map(world_file):
     names = write_names([("ground", world_file), ("upper", world_file)])
     assert read_names(names) == [("ground", world_file), ("upper", world_file)]
-    base_map = BaseMap.load(names)
+    base_map = load_map(names)
     parts = MapParts.of(base_map.parameters)
     assert [part.name for part in parts] == ["ground", "upper"]
     assert BaseMap.load(base_map.path, check=False).sha256 == base_map.sha256
-    assert BaseMap.load(names).path == base_map.path
+    assert load_map(names).path == base_map.path
 
 
 def test_each_of_them_has_to_be_signed_where_a_key_is_asked_for(world_map, world_file, tmp_path):
@@ -57,9 +58,10 @@ def test_each_of_them_has_to_be_signed_where_a_key_is_asked_for(world_map, world
     world_map_signed = BaseMap.load(world_file)
     world_map_signed.save(tmp_path / "signed.coview", SigningKey(keys[0]))
     signed = tmp_path / "signed.coview"
-    BaseMap.load(write_names([("a", signed), ("b", signed)]), verify_key=keys[1])
+    key = read_verify_key(keys[1])
+    load_map(write_names([("a", signed), ("b", signed)]), key)
     with pytest.raises(MapError, match="not signed"):
-        BaseMap.load(write_names([("a", signed), ("b", world_file)]), verify_key=keys[1])
+        load_map(write_names([("a", signed), ("b", world_file)]), key)
 
 
 def test_two_maps_of_one_name_and_other_files_are_refused(world_file, tmp_path):
@@ -69,7 +71,7 @@ def test_two_maps_of_one_name_and_other_files_are_refused(world_file, tmp_path):
     for content in ("", "[]", '{"format": "x"}', '{"format": "coview-joined", "maps": [1]}'):
         other.write_text(content)
         with pytest.raises(MapError, match="names no maps"):
-            BaseMap.load(other)
+            load_map(other)
 
 
 def test_change_of_any_is_a_change_and_an_outage_of_one_hides_no_change_of_another(world_file):

@@ -54,14 +54,14 @@ def loads(monkeypatch):
     """Loads of the map, each of which may hash all of its file."""
     made = []
 
-    def load(path, verify_key=None):
+    def load(path, key=None):
         made.append(path)
         sha256 = "b" * 64
         return SimpleNamespace(
             parameters={}, sha256=sha256, site_sha256=sha256, path=None, identity=None, require_features=lambda _: None
         )
 
-    monkeypatch.setattr(serve, "BaseMap", SimpleNamespace(load=load))
+    monkeypatch.setattr(serve, "load_map", load)
     return made
 
 
