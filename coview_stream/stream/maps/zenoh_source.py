@@ -11,7 +11,7 @@ from coview_stream.errors import TransportError
 from coview_stream.stream.maps.map_keys import MapKeys
 from coview_stream.stream.transport import zenoh_config
 
-_NO_ANSWER = "Timeout"  # zenoh's word
+_NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
 _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s; set by hand
 
 
@@ -51,9 +51,8 @@ class ZenohSource:
     def _get(self, key: str, limit: int) -> bytes:
         import zenoh
 
+        self._open()
         with zenoh_config.zenoh_errors(self.name):
-            if self._session is None:
-                self._session = zenoh.open(zenoh_config.compose(*self._given))
             told = ""
             for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
                 if reply.ok is None:
@@ -63,6 +62,20 @@ class ZenohSource:
                     raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")
                 return bytes(reply.ok.payload)
         raise TransportError(f"{self.name}: {told or self._silence()}")
+
+    def _open(self) -> None:
+        import zenoh
+
+        if self._session is not None:
+            return
+        config = zenoh_config.compose(*self._given)
+        try:
+            with zenoh_config.zenoh_errors(self.name):
+                self._session = zenoh.open(config)
+        except TransportError as error:
+            if _UNREACHABLE not in str(error):
+                raise
+            raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
 
     def _silence(self) -> str:
         """Say what there is where nobody answers for this site."""

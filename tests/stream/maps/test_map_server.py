@@ -178,6 +178,18 @@ def test_working_file_of_a_part_is_made_by_another_process(site):
     prepare_map(site / "manifest.json", lambda: False)  # one file: there is nothing to do
 
 
+def test_another_name_and_no_server_are_said(server, site, endpoint):
+    address = endpoint.removeprefix("tcp/")
+    for name, words in (
+        (f"{address}/yrd", "there has it; there are yard"),
+        ("127.0.0.1:9/yard", "is serve-map running"),
+    ):
+        asked = source_of(f"zenoh://{name}")
+        with pytest.raises(TransportError, match=words):
+            asked.manifest()
+        asked.close()
+
+
 def test_addresses(endpoint):
     source = source_of("zenoh://yard", connect=[endpoint])
     assert isinstance(source, ZenohSource)
