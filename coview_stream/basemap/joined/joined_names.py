@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from coview_stream.basemap.site.cache import cache_folder
-from coview_stream.clouds.atomic_file import atomic_file
+from coview_stream.basemap.site.cache import read_record, write_record
 from coview_stream.errors import MapError
 
 SUFFIX = ".joined"
 _FORMAT = "coview-joined"
-_MAX_BYTES = 1 << 20
 
 
 def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
@@ -27,15 +24,8 @@ def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
         if names.count(name) > 1:
             raise MapError(f"two maps are called {name}: name them, as in first={path}")
     rows = [[name, str(path.absolute())] for name, path in maps]
-    content = json.dumps({"format": _FORMAT, "maps": rows}).encode()
-    file = cache_folder() / "parts" / (hashlib.sha256(content).hexdigest()[:16] + SUFFIX)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(file) as out:
-            out.write(content)
-    except OSError as error:
-        raise MapError(f"{file}: cannot be written ({error.strerror})") from error
-    return file
+    name = hashlib.sha256(repr(rows).encode()).hexdigest()[:16] + SUFFIX
+    return write_record(name, {"format": _FORMAT, "maps": rows})
 
 
 def read_names(file: Path) -> list[tuple[str, Path]]:
@@ -45,8 +35,7 @@ def read_names(file: Path) -> list[tuple[str, Path]]:
         MapError: it is something else.
     """
     try:
-        with file.open("rb") as opened:
-            data = json.loads(opened.read(_MAX_BYTES))
+        data = read_record(file)
         if data["format"] != _FORMAT:
             raise ValueError("another format")
         return [(str(name), Path(str(path))) for name, path in data["maps"]]

@@ -113,7 +113,7 @@ class ArrayFiles:
         """Let the memory go that what was written or read takes; it is in the files."""
         if hasattr(mmap, "MADV_DONTNEED"):
             for each in self._mapped:
-                each._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+                each._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]  # NumPy's types lack it
 
     def close(self) -> None:
         """Delete the files; arrays that are still mapped can be used on."""
@@ -126,7 +126,7 @@ class ArrayFiles:
         if name in self._files:
             raise ValueError(f"{name} is there already")
         with self._room():
-            self._files[name] = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+            self._files[name] = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115 - until close()
         self._shapes[name] = kind, shape
         return self._files[name]
 

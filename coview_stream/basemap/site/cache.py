@@ -13,14 +13,15 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from coview_stream.basemap.trust import FileIdentity, identity
-from coview_stream.clouds.atomic_file import atomic_path
+from coview_stream.clouds.atomic_file import atomic_file, atomic_path
 from coview_stream.errors import ConfigError, MapError
 
 _GB = 1e9
 _MAX_GB = 20.0  # set by hand
+_MAX_RECORD = 1 << 24  # bytes
 _MARK = ".checked"  # suffix of the small file beside one that has been compared with its checksum
 
 
@@ -36,6 +37,24 @@ def cache_folder() -> Path:
     except OSError as error:
         raise MapError(f"{folder}: cannot be used ({error.strerror}); name a folder in COVIEW_CACHE") from error
     return folder
+
+
+def write_record(name: str, data: object) -> Path:
+    """Write plain data into a small file of the cache, ``parts/NAME``, and return it; MapError where that fails."""
+    path = cache_folder() / "parts" / name
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(json.dumps(data).encode())
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written ({error.strerror})") from error
+    return path
+
+
+def read_record(path: Path) -> Any:
+    """Return what :func:`write_record` has written; OSError or ValueError for anything else."""
+    with path.open("rb") as file:
+        return json.loads(file.read(_MAX_RECORD))
 
 
 def evict(folder: Path, *keep: Path) -> None:

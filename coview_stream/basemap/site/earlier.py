@@ -27,8 +27,7 @@ from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.tile_clouds import TileClouds
 from coview_stream.basemap.station_index import CODES, StationIndex
-from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.config import config_of_map
+from coview_stream.config import Channel, config_of_map
 from coview_stream.errors import MapError
 
 log = logging.getLogger("coview_stream.maps")
@@ -39,13 +38,11 @@ VERSION = 3
 PARAMETER = "made_tiles"
 """Parameter of a working file: state, first station, stations, first row of the field, its rows; for each tile."""
 
-_MAX_POINTER = 1 << 14  # bytes
-
 
 class Earlier:
     """What of an earlier working file can be taken; of none, nothing."""
 
-    def __init__(self, states: Mapping[Key, str], path: Path | None = None, channels: Sequence[str] = ()) -> None:
+    def __init__(self, states: Mapping[Key, str], path: Path | None = None, channels: Sequence[Channel] = ()) -> None:
         """Open a file; one that cannot be read, or has another form, is as good as none.
 
         Args:
@@ -68,7 +65,7 @@ class Earlier:
             log.info("%s: nothing is taken from it (%s)", path, error)
             return
         self._arrays = loaded.arrays
-        self._index = StationIndex.from_arrays(loaded.arrays, channels)  # type: ignore[arg-type]
+        self._index = StationIndex.from_arrays(loaded.arrays, channels)
         if self._index is not None and all(name in loaded.arrays for name in FIELD_ARRAYS):
             self._spans = {key: known[state] for key, state in states.items() if state in known}
 
@@ -127,8 +124,7 @@ def states_of(manifest: Manifest, clouds: TileClouds) -> dict[Key, str]:
 def earlier_file(directory: Path) -> Path | None:
     """Return the working file that was made last of a site's directory, if it is still there."""
     try:
-        with _pointer(directory).open("rb") as file:
-            path = cache.cache_folder() / str(json.loads(file.read(_MAX_POINTER)))
+        path = cache.cache_folder() / str(cache.read_record(cache.cache_folder() / "parts" / _record_name(directory)))
     except (OSError, ValueError):
         return None
     return path if path.parent == cache.cache_folder() and path.is_file() else None
@@ -136,18 +132,11 @@ def earlier_file(directory: Path) -> Path | None:
 
 def remember_file(directory: Path, path: Path) -> None:
     """Keep which working file was made last of a site's directory."""
-    pointer = _pointer(directory)
-    try:
-        pointer.parent.mkdir(exist_ok=True)
-        with atomic_file(pointer) as file:
-            file.write(json.dumps(path.name).encode())
-    except OSError as error:
-        raise MapError(f"{pointer}: cannot be written ({error.strerror})") from error
+    cache.write_record(_record_name(directory), path.name)
 
 
-def _pointer(directory: Path) -> Path:
-    name = hashlib.sha256(str(directory.resolve()).encode()).hexdigest()[:16]
-    return cache.cache_folder() / "parts" / f"{name}.last"
+def _record_name(directory: Path) -> str:
+    return hashlib.sha256(str(directory.resolve()).encode()).hexdigest()[:16] + ".last"
 
 
 def record(states: Mapping[Key, str], stations: Mapping[Key, int], rows: Mapping[Key, int]) -> list[list[Any]]:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from coview_stream.basemap.site.cache import cache_folder
+from coview_stream.basemap.site.cache import cache_folder, read_record, write_record
 from coview_stream.basemap.site.grid import Key
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError, MapError
 
 log = logging.getLogger("coview_stream.maps")
 
 SUFFIX = ".tiles"
 _FORMAT = "coview-part"
-_MAX_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -92,15 +89,8 @@ def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
         MapError: the cache cannot be written.
     """
     place = str(directory.resolve())
-    path = cache_folder() / "parts" / (hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + SUFFIX)
-    data = {"format": _FORMAT, "directory": place, "tiles": sorted(keys)}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as file:
-            file.write(json.dumps(data).encode())
-    except OSError as error:
-        raise MapError(f"{path}: cannot be written ({error.strerror})") from error
-    return path
+    record = hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + SUFFIX
+    return write_record(record, {"format": _FORMAT, "directory": place, "tiles": sorted(keys)})
 
 
 def read_part(path: Path) -> tuple[Path, set[Key]]:
@@ -110,8 +100,7 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
         MapError: it is something else.
     """
     try:
-        with path.open("rb") as file:
-            data = json.loads(file.read(_MAX_BYTES))
+        data = read_record(path)
         if data["format"] != _FORMAT:
             raise ValueError("another format")
         return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
@@ -121,29 +110,24 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
 
 def keep_places(directory: Path, name: str, places: Mapping[str, tuple[float, float]]) -> None:
     """Write where robots were on a part of a site, for the next start; what goes wrong is left to the log."""
-    path = _places_file(directory, name)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as file:
-            file.write(json.dumps({robot: list(place) for robot, place in places.items()}).encode())
-    except OSError as error:
-        log.warning("%s: cannot be written (%s)", path, error.strerror)
+        write_record(_places_record(directory, name), places)
+    except MapError as error:
+        log.warning("%s", error)
 
 
 def kept_places(directory: Path, name: str) -> dict[str, tuple[float, float]]:
     """Return what :func:`keep_places` has written, nothing where there is no such file, or another one."""
     try:
-        with _places_file(directory, name).open("rb") as file:
-            data = json.loads(file.read(_MAX_BYTES))
+        data = read_record(cache_folder() / "parts" / _places_record(directory, name))
         found = {str(robot): (float(x), float(y)) for robot, (x, y) in data.items()}
         return {robot: place for robot, place in found.items() if all(map(math.isfinite, place))}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
-def _places_file(directory: Path, name: str) -> Path:
-    place = hashlib.sha256(f"{directory.resolve()}\n{name}".encode()).hexdigest()[:16]
-    return cache_folder() / "parts" / f"{place}.places"
+def _places_record(directory: Path, name: str) -> str:
+    return hashlib.sha256(f"{directory.resolve()}\n{name}".encode()).hexdigest()[:16] + ".places"
 
 
 def site_directory(path: Path) -> Path | None:

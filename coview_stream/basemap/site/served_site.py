@@ -39,7 +39,7 @@ class ServedSite:
         self.route: Route | None = None
         self.map_path = directory
         self._keys: set[Key] = set()
-        self._changed = False  # and nobody has been told yet
+        self._changed = False  # since the last answer of refresh or follow
         self._behind = False  # whether the tiles are not those of the route yet
         if around is not None:
             self._name = str(around)

@@ -27,7 +27,7 @@ _LOOK = 0.1  # seconds
 def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
     """Have made what a map is opened from, if that is made of something else: a site, a part of one, several maps.
 
-    What goes wrong is left to whoever opens the map.
+    An error here is not raised: opening the map afterwards meets the same one and says it.
 
     Args:
         place: of a map.

@@ -78,7 +78,7 @@ class ZenohSource:
             raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
 
     def _silence(self) -> str:
-        """Say what there is where nobody answers for this site."""
+        """Return why there was no answer: the sites that are served there, or that none is."""
         import zenoh
 
         begin, end = self._keys.prefix.rpartition("/")[0] + "/", "/manifest"

@@ -120,7 +120,7 @@ def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
     working_file(site)
     assert taken == [0, 0]
     assert earlier_file(site) != first
-    earlier._pointer(site).write_text('"../../elsewhere.coview"')
+    (cache / "parts" / earlier._record_name(site)).write_text('"../../elsewhere.coview"')
     assert earlier_file(site) is None
 
 
