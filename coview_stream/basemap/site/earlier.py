@@ -2,7 +2,7 @@
 
 A tile's field and codes are made of its stations and of the clouds on it and around it. A working file names, for each
 of its tiles, the hash of these layers and the settings, and the rows that were made of them. Codes of other tiles are
-then made in the earlier file's terms: what they were learned from matters little (docs/large_maps.md).
+then made in the terms of the earlier file; they find the same stations (tests/basemap/site/test_earlier.py).
 """
 
 from __future__ import annotations
