@@ -11,22 +11,8 @@ from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
 from coview_stream.basemap.site import earlier
 from coview_stream.basemap.site.earlier import PARAMETER, earlier_file
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.tile_store import TileStore
 from coview_stream.basemap.site.working_file import working_file
-from coview_stream.clouds.files import write_cloud
-from coview_stream.config import map_preset
-
-FAR = np.array([512_003.0, 5_120_005.0, 100.0])
-"""Puts the corner of four tiles into the small world."""
-
-
-@pytest.fixture(scope="module")
-def site(map_points, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("site")
-    write_cloud(folder / "a.las", map_points + FAR)
-    build_site(folder / "a.las", folder / "site", map_preset("slam", learned=False))
-    return folder / "site"
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
-import numpy as np
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
@@ -18,24 +17,12 @@ from coview_stream.basemap.signature import SigningKey, read_verify_key
 from coview_stream.basemap.site.manifest import FILE, Manifest
 from coview_stream.basemap.site.mirror import Mirror
 from coview_stream.basemap.site.part import Around, part_file, read_part, tiles_around
-from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.site_source import DirectorySource, ObjectStoreSource, WebSource, is_site_address
 from coview_stream.basemap.site.tile_store import TileStore
 from coview_stream.cli import main
-from coview_stream.clouds.files import write_cloud
-from coview_stream.config import map_preset
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def site(map_points, tmp_path_factory):
-    """The small world about the corner of four tiles."""
-    folder = tmp_path_factory.mktemp("mirrored")
-    write_cloud(folder / "yard.las", map_points + np.array([512_003.0, 5_120_005.0, 100.0]))
-    assert len(build_site(folder / "yard.las", folder / "yard", map_preset("slam", learned=False)).manifest.tiles) == 4
-    return folder / "yard"
 
 
 @pytest.fixture(autouse=True)

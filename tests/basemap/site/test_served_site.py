@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from coview_stream.basemap.site.manifest import Manifest
@@ -13,10 +12,7 @@ from coview_stream.basemap.site.mirror import Mirror
 from coview_stream.basemap.site.part import Around, kept_places, read_part
 from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
-from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.site_source import DirectorySource
-from coview_stream.clouds.files import write_cloud
-from coview_stream.config import map_preset
 from coview_stream.errors import MapError, TransportError
 
 pytestmark = pytest.mark.slow
@@ -24,14 +20,6 @@ pytestmark = pytest.mark.slow
 CORNER = (512_000.0, 5_120_000.0)
 """Where the four tiles of the site meet."""
 WEST, EAST = (CORNER[0] - 50.0, CORNER[1] + 50.0), (CORNER[0] + 50.0, CORNER[1] + 50.0)
-
-
-@pytest.fixture(scope="module")
-def site(map_points, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("followed")
-    write_cloud(folder / "yard.las", map_points + np.array([CORNER[0] + 3.0, CORNER[1] + 5.0, 100.0]))
-    assert len(build_site(folder / "yard.las", folder / "yard", map_preset("slam", learned=False)).manifest.tiles) == 4
-    return folder / "yard"
 
 
 @pytest.fixture(autouse=True)
