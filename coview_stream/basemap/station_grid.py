@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.geometry.arrays import Floats32, Indices, Reals
+from coview_stream.geometry.arrays import Floats32, Indices, Ints, Reals
 
 _LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys; set by hand
 
@@ -20,7 +20,7 @@ class StationGrid:
     def __init__(self, stations: Floats32, block: float) -> None:
         self.stations = stations
         self.block = block
-        cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
+        cells = self.cells_of(slice(None))
         self._low = cells.min(axis=0)
         cells -= self._low
         self._shape = cells.max(axis=0) + 1
@@ -55,6 +55,16 @@ class StationGrid:
     def levels_at(self, positions: Reals) -> Indices:
         """Return the stations (L, N), lowest first, in whose cells (N, 2 or 3) positions are; -1 for none."""
         return np.asarray(self._levels[:, self.cell(positions)], dtype=np.intp)
+
+    def cells_of(self, chosen: Indices | slice) -> Ints:
+        """Return column and row (N, 2) of the cells that stations stand in, counted from the map's zero."""
+        return np.asarray(np.floor(self.stations[chosen, :2].astype(np.float64) / self.block), dtype=np.int64)
+
+    def levels_of(self, chosen: Indices) -> Ints:
+        """Return how many stations stand below each of some (N,) in its cell."""
+        column, row = (self.cells_of(chosen) - self._low).T
+        standing = self._levels[:, column * self._shape[1] + row]
+        return np.asarray((standing == chosen).argmax(axis=0), dtype=np.int64)
 
     def storeys(self, station: int) -> list[int]:
         """Return the stations of a station's cell, lowest first, itself among them."""

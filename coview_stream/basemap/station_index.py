@@ -37,15 +37,29 @@ class ScoredQuery:
 
     Attributes:
         coded: the query, its channels weighted by how far they spread.
-        rest: the same, for the second tier.
+        rest: the same, for the second tier; None without one.
         screen_zero: z-score of no correlation at all by the first tier alone.
         zero: that by both.
     """
 
     coded: CodedQuery
-    rest: CodedQuery
+    rest: CodedQuery | None
     screen_zero: float
     zero: float
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Some stations by which queries are standardised.
+
+    Attributes:
+        codes, rest: of them, by tier.
+        spectra: of their descriptors, by channel.
+    """
+
+    codes: StationCodes
+    rest: StationCodes
+    spectra: dict[Channel, Complexes]
 
 
 class StationIndex:
@@ -55,7 +69,8 @@ class StationIndex:
     (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
     """
 
-    def __init__(self, codes: StationCodes, rest: StationCodes, sample: Descriptors) -> None:
+    def __init__(self, codes: StationCodes, rest: StationCodes | None, sample: Descriptors) -> None:
+        """Keep the tiers of codes, of which the second may be missing, and the descriptors of a sample."""
         self.codes = codes
         self.rest = rest
         self._descriptors = sample
@@ -99,10 +114,27 @@ class StationIndex:
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
         found = {_SAMPLED: np.stack(list(self._descriptors.values()))}
-        for tier, codes in zip(CODES, (self.codes, self.rest), strict=True):
+        for tier, codes in zip(CODES, self.tiers, strict=True):
             basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
             found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
         return found
+
+    def subset(self, stations: Ints, second: bool = True) -> StationIndex:
+        """Return the index of some stations (K,), copied into memory, with the second tier or without.
+
+        Its z-scores are those by the stations of the whole index, but for what a second tier would add.
+        """
+        rest = self.tiers[1].subset(stations) if second else None
+        found = StationIndex(self.codes.subset(stations), rest, self._descriptors)
+        found._sample = self._sample
+        return found
+
+    @property
+    def tiers(self) -> tuple[StationCodes, StationCodes]:
+        """Both tiers; ValueError without the second."""
+        if self.rest is None:
+            raise ValueError("an index without its second tier")
+        return self.codes, self.rest
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -114,12 +146,11 @@ class StationIndex:
         return self.codes.sectors
 
     @cached_property
-    def _sample(self) -> tuple[Ints, dict[Channel, Complexes]]:
-        """Every so many stations (K,), and the spectra of their descriptors by channel."""
+    def _sample(self) -> _Sample:
+        """Every so many stations."""
+        codes, rest = (tier.subset(sampled_stations(len(self))) for tier in self.tiers)
         known = self._descriptors.items()
-        return sampled_stations(len(self)), {
-            name: kernels.column_spectra(each.astype(np.float32)) for name, each in known
-        }
+        return _Sample(codes, rest, {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known})
 
     def prepare(self) -> None:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
@@ -129,21 +160,25 @@ class StationIndex:
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
-        chosen, spectra = self._sample
-        mean = np.zeros((len(chosen), self.sectors), dtype=np.float32)
+        sample = self._sample
+        every = np.arange(len(sample.codes))
+        mean = np.zeros((len(every), self.sectors), dtype=np.float32)
         columns = []
-        for name, sample in spectra.items():
-            distance = kernels.all_shift_distance(descriptors[name], sample, self.sectors)
+        for name, spectra in sample.spectra.items():
+            distance = kernels.all_shift_distance(descriptors[name], spectra, self.sectors)
             median = np.median(distance)
-            weight = np.float32(1.0 / (len(spectra) * (1.4826 * np.median(np.abs(distance - median)) + 1e-6)))
+            weight = np.float32(1.0 / (len(sample.spectra) * (1.4826 * np.median(np.abs(distance - median)) + 1e-6)))
             mean += (distance - median) * weight
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
-        coded, rest = self.codes.query(stacked), self.rest.query(stacked)
+        coded = self.codes.query(stacked)
         # the codes leave parts out that no query lacks: what that adds on the mean is made up for here
-        mean += self.codes.all_shifts(coded, chosen)
+        mean += sample.codes.all_shifts(coded, every)
         screen_zero = float(np.median(mean))
-        mean += self.rest.all_shifts(rest, chosen)
+        if self.rest is None:
+            return ScoredQuery(coded, None, screen_zero, screen_zero)
+        rest = self.rest.query(stacked)
+        mean += sample.rest.all_shifts(rest, every)
         return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
@@ -160,14 +195,14 @@ class StationIndex:
 
     def at_all(self, requests: Sequence[tuple[ScoredQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[Floats32]:
         """Return what :meth:`at` does of each request; the index of a large map is gone through once for all."""
-        first = self.codes.at_all([(query.coded, stations, shifts) for query, stations, shifts in requests])
-        second = self.rest.at_all([(query.rest, stations, shifts) for query, stations, shifts in requests])
-        out = []
-        for (query, stations, _), one, other in zip(requests, first, second, strict=True):
-            found = np.float32(query.zero) - one
-            found -= other
+        out = self.codes.at_all([(query.coded, stations, shifts) for query, stations, shifts in requests])
+        out = [np.float32(query.zero) - one for (query, *_), one in zip(requests, out, strict=True)]
+        if self.rest is not None:
+            asked = [(query.rest, stations, shifts) for query, stations, shifts in requests if query.rest is not None]
+            for found, other in zip(out, self.rest.at_all(asked), strict=True):
+                found -= other
+        for found, (_, stations, _) in zip(out, requests, strict=True):
             found[np.asarray(stations) < 0] = 0.0
-            out.append(found)
         return out
 
 

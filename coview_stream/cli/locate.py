@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     acceptance = acceptance_config(args.risk)
     formats = () if args.export is None else chosen_formats(args.export)
     mount = mount_of(args)
-    guess = None if args.initial is None else initial_guess(args.initial)
+    guess = initial_guess(args.initial, args.within)
     lidar = _lidar_odometry(args.odometry, args.gravity)
     if args.registration == "gicp":
         library()  # before anything is read: it may be missing

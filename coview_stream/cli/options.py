@@ -59,17 +59,27 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
         help="where the robot may be at first (map coordinates, degrees): tried, never trusted; write "
         + ("--initial=..." if not of_robots else "one for each robot"),
     )
+    parser.add_argument(
+        "--within",
+        type=float,
+        metavar="METRES",
+        help="around --initial, where the robot surely is: nothing else is searched until it is found (all of the map)",
+    )
 
 
-def initial_guess(text: str) -> PlaceGuess:
-    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees; of several maps, ``MAP:X,Y[,YAW]``.
+def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess | None:
+    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees; of several maps, ``MAP:X,Y[,YAW]``; None for none.
 
     Raises:
-        ConfigError: it is no such text.
+        ConfigError: it is no such text, or ``within`` is given without it, or is no distance.
     """
     from coview_stream.errors import ConfigError
     from coview_stream.localization.search.place_guess import PlaceGuess
 
+    if text is None:
+        if within is not None:
+            raise ConfigError("--within: it is metres around --initial; give that, too")
+        return None
     of, _, place = text.rpartition(":")
     try:
         numbers = [float(part) for part in place.split(",")]
@@ -77,10 +87,14 @@ def initial_guess(text: str) -> PlaceGuess:
             raise ValueError
     except ValueError:
         raise ConfigError(f"--initial {text!r}: give X,Y or X,Y,YAW (metres in the map, degrees)") from None
-    return PlaceGuess(numbers[0], numbers[1], math.radians(numbers[2]) if len(numbers) == 3 else None, map=of or None)
+    yaw = math.radians(numbers[2]) if len(numbers) == 3 else None
+    try:
+        return PlaceGuess(numbers[0], numbers[1], yaw, map=of or None, within=within)
+    except ConfigError as error:
+        raise ConfigError(f"--initial {text!r}: {error}") from error
 
 
-def initial_guesses(texts: Iterable[str], robots: Iterable[str]) -> dict[str, PlaceGuess]:
+def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float | None = None) -> dict[str, PlaceGuess]:
     """Return the guesses of ``NAME=X,Y[,YAW]`` by robot.
 
     Raises:
@@ -88,14 +102,19 @@ def initial_guesses(texts: Iterable[str], robots: Iterable[str]) -> dict[str, Pl
     """
     from coview_stream.errors import ConfigError
 
-    out, known = {}, list(robots)
+    out: dict[str, PlaceGuess] = {}
+    known = list(robots)
+    if not (texts := list(texts)):
+        initial_guess(None, within)
     for text in texts:
         name, sign, place = text.rpartition("=")
         if not sign and len(known) == 1:
             name = known[0]
         if name not in known:
             raise ConfigError(f"--initial {text!r}: write NAME=X,Y[,YAW], with one of {', '.join(known)}")
-        out[name] = initial_guess(place)
+        guess = initial_guess(place, within)
+        assert guess is not None  # there is a text
+        out[name] = guess
     return out
 
 

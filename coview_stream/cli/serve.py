@@ -202,7 +202,8 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or default_node(args)), args.metrics, verify_key,
-        args.geo, initial_guesses(args.initial, args.robot), source.site, fleet_name(args.fleet), args.base,
+        args.geo, initial_guesses(args.initial, args.robot, args.within), source.site, fleet_name(args.fleet),
+        args.base,
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []

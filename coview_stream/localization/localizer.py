@@ -277,14 +277,17 @@ class Localizer:
     def guess_place(self, guess: PlaceGuess) -> None:
         """Have the search try, from the next frame on, where somebody says that the robot is.
 
-        Never trusted: what is tried there is judged like what the descriptors name. Ignored while a place is known.
+        Never trusted: what is tried there is judged like what the descriptors name; but with ``guess.within`` nothing
+        outside of that circle is searched, until a place is accepted or another guess comes. Ignored while a place is
+        known.
 
         Raises:
             InputError: the map has no ground there.
         """
         if not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
+            around = guess.within or guess.distance
             raise InputError(
-                f"guess {guess.x:.1f}, {guess.y:.1f}: the map has no ground within {guess.distance:g} m of it; "
+                f"guess {guess.x:.1f}, {guess.y:.1f}: the map has no ground within {around:g} m of it; "
                 "give coordinates of the frame of the map's sources (coview-stream info)"
             )
         if not self.state.has_place:
@@ -381,6 +384,7 @@ class Localizer:
         assert self._frames.anchor is not None  # there is a frame
         hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
         guesses = self._hints.guessed(self.base_map.origin, self._frames.anchor, frame.T_odom_body)
+        area = self._hints.area
         if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
             self._restart_search(frame.stamp)
             return None
@@ -388,7 +392,7 @@ class Localizer:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
         rays = RangeImage.rays(frame.cloud)
-        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints, guesses)
+        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints, guesses, area)
         # what the search would begin with: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
 

@@ -65,6 +65,17 @@ class Windows:
         self._map.madvise(mmap.MADV_DONTNEED, begin, min(end, len(self._map)) - begin)
 
 
+def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+    """Return a copy (K, ...) of rows (K,) of an array; of a large mapped file, little is in memory at a time."""
+    out = np.empty((len(rows), *array.shape[1:]), dtype=array.dtype)
+    order = np.argsort(rows, kind="stable")
+    for part in Windows(array):
+        begin, end = np.searchsorted(rows[order], (part.start, part.stop))
+        own = order[begin:end]
+        out[own] = array[part][rows[own] - part.start]
+    return out
+
+
 def release(array: npt.NDArray[Any]) -> None:
     """Let the memory of an array that is mapped from a file go; it is read again when it is touched."""
     whole = _map_of(array)

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
 from coview_kernels.launch import Launch
-from coview_kernels.mapped import Windows
+from coview_kernels.mapped import Windows, take_rows
 from coview_kernels.similarity import unit_columns
 
 ANGLES = 60
@@ -229,6 +229,11 @@ class StationCodes:
         """Return the number of stations M."""
         return len(self.codes)
 
+    def subset(self, stations: npt.ArrayLike) -> StationCodes:
+        """Return a copy of the codes of stations (K,), in memory; a query of these codes is one of those."""
+        rows = take_rows(self.codes, np.asarray(stations, dtype=np.int64))
+        return StationCodes(rows, self.basis, self.step, self.norm, self.sectors)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what may be copied or sent to another process: all but the prepared launches."""
         return self.__dict__ | {"_kernels": None}
@@ -314,6 +319,8 @@ class _Kernels:
         self._factors = np.zeros((_ROWS, 4, _LANES), dtype=np.float32)
         self._products = np.zeros((_CHUNK, 2, 2, _LANES), dtype=np.float32)
         self._values = np.zeros(_CHUNK, dtype=np.float32)
+        # of a large file single rows are copied: to go through it by windows would map all of it, again and again
+        self._copied = np.zeros((_CHUNK, *codes.shape[1:]), dtype=np.int16) if self._windows.several else None
         serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
         name = "best_serial" if serial else "best_parallel"
         common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
@@ -346,49 +353,41 @@ class _Kernels:
     def products(self, factors: F32, stations: I32) -> F32:
         self._factors[:] = factors
         found = np.empty((len(stations), 2, 2, _LANES), dtype=np.float32)
-        launch, chosen = self._launches[_PRODUCTS], _ByWindow(stations, self._windows)
-        for part in self._windows:
-            launch.put(0, self._codes[part].reshape(-1))
-            for own in chosen.chunks(part):
-                self._stations[: len(own)] = stations[own] - part.start
-                launch.put(4, len(own))
-                launch()
-                found[own] = self._products[: len(own)]
+        launch = self._launches[_PRODUCTS]
+        for own in self._chunks(launch, stations):
+            launch.put(4, own.stop - own.start)
+            launch()
+            found[own] = self._products[: own.stop - own.start]
+        self._windows.release()
         return found
 
     def at(self, requests: Sequence[_Request]) -> list[F32]:
-        launch = self._launches[_AT]
-        found = [np.zeros(len(stations), dtype=np.float32) for _, stations, _ in requests]
-        chosen = [_ByWindow(stations, self._windows) for _, stations, _ in requests]
-        for part in self._windows:
-            launch.put(0, self._codes[part].reshape(-1))
-            for (query, stations, shifts), into, each in zip(requests, found, chosen, strict=True):
-                launch.put(1, query.table.reshape(-1))
-                for own in each.chunks(part):
-                    count = len(own)
-                    self._stations[:count], self._shifts[:count] = stations[own] - part.start, shifts[own]
-                    self._values[:count] = 0.0
-                    launch.put(5, count)
-                    launch()
-                    into[own] = self._values[:count]
-        return found
+        launch, out = self._launches[_AT], []
+        for query, stations, shifts in requests:
+            launch.put(1, query.table.reshape(-1))
+            found = np.zeros(len(stations), dtype=np.float32)
+            for own in self._chunks(launch, stations):
+                count = own.stop - own.start
+                self._shifts[:count] = shifts[own]
+                self._values[:count] = 0.0
+                launch.put(5, count)
+                launch()
+                found[own] = self._values[:count]
+            out.append(found)
+        self._windows.release()
+        return out
 
-
-class _ByWindow:
-    """Some stations (K,) by the window that they are in; stations of -1 are in none, or in the only one."""
-
-    def __init__(self, stations: I32, windows: Windows) -> None:
-        self._several = windows.several
-        self._order = np.argsort(stations, kind="stable") if windows.several else np.arange(len(stations))
-        self._sorted = stations[self._order]
-
-    def chunks(self, part: slice) -> Iterator[I64]:
-        """Yield which of the stations are in a window, not too many at a time."""
-        begin, end = 0, len(self._order)
-        if self._several:
-            begin, end = np.searchsorted(self._sorted, [part.start, part.stop]).tolist()
-        for start in range(begin, end, _CHUNK):
-            yield self._order[start : min(start + _CHUNK, end)]
+    def _chunks(self, launch: Launch, stations: I32) -> Iterator[slice]:
+        """Yield the numbers of stations (K,) that a launch is ready for, not too many at a time."""
+        launch.put(0, (self._codes if self._copied is None else self._copied).reshape(-1))
+        for start in range(0, len(stations), _CHUNK):
+            own = slice(start, min(start + _CHUNK, len(stations)))
+            chosen = stations[own]
+            if self._copied is not None:
+                self._codes.take(chosen, axis=0, out=self._copied[: len(chosen)], mode="clip")
+                chosen = np.where(chosen < 0, -1, np.arange(len(chosen)))
+            self._stations[: len(chosen)] = chosen
+            yield own
 
 
 def _frequencies() -> I64:

@@ -143,6 +143,17 @@ def test_initial_place_that_is_none_is_refused(world_file, world_run, tmp_path, 
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize("words", [["--within=200"], ["--initial=1,2", "--within=3"], ["--initial=1,2", "--within=x"]])
+def test_circle_that_is_none_is_refused(world_file, world_run, tmp_path, capsys, words):
+    try:
+        code = main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), *words])
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2
+    assert "--within" in capsys.readouterr().err or "within" in words[-1]
+    assert not (tmp_path / "out").exists()
+
+
 def test_initial_place_beside_the_map_is_refused(world_file, world_run, tmp_path, capsys):
     assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), "--initial=9000,9000"]) == 2
     assert "no ground within 5 m" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coview_kernels import StationCodes, mapped
-from coview_kernels.mapped import Windows
+from coview_kernels.mapped import Windows, take_rows
 
 
 @pytest.fixture
@@ -58,6 +58,15 @@ def test_what_a_window_brought_into_memory_is_released(tmp_path, monkeypatch):
     assert resident_bytes() - before < 12 << 20
 
 
+def test_rows_are_copied_in_the_order_asked_for(windowed, tmp_path):
+    array = stored(np.arange(50_000, dtype=np.int32).reshape(-1, 5), tmp_path / "a.npy")
+    rows = np.random.default_rng(3).integers(0, len(array), 700)
+    for given in (array, np.array(array)):
+        np.testing.assert_array_equal(take_rows(given, rows), array[rows])
+    assert take_rows(array, rows[:0]).shape == (0, 5)
+    assert take_rows(array[:0], rows[:0]).shape == (0, 5)
+
+
 def test_codes_of_a_file_answer_by_windows_as_those_in_memory_do(windowed, tmp_path):
     rng = np.random.default_rng(8)
     descriptors = [rng.random((300, 20, 60), dtype=np.float32) for _ in range(2)]
@@ -78,3 +87,6 @@ def test_codes_of_a_file_answer_by_windows_as_those_in_memory_do(windowed, tmp_p
     for found, expected in zip(file.at_all(requests), codes.at_all(requests), strict=True):
         np.testing.assert_array_equal(found, expected)
     assert file.at_all(requests)[1][0] == 0.0
+    some = file.subset(chosen[:40])
+    np.testing.assert_array_equal(some.best(query), codes.best(query)[chosen[:40]])
+    assert not isinstance(some.codes, np.memmap)

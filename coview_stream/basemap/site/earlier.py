@@ -96,7 +96,7 @@ class Earlier:
             return None
         if len(self._index) < min(len(into[0]), StationCodes.LEARNED):
             return None
-        tiers = self._index.codes, self._index.rest
+        tiers = self._index.tiers
         return [
             StationCodes(codes, each.basis, each.step, each.norm.copy(), each.sectors)
             for codes, each in zip(into, tiers, strict=True)

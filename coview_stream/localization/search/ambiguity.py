@@ -19,9 +19,10 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import yaw_of
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.scoring import PlaceScorer, Scored, ScoredPlace
+from coview_stream.localization.search.station_consensus import StationConsensus
 from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
 
 # set by hand
@@ -168,7 +169,7 @@ class _Rehearsal:
         self._clear()
 
     def _clear(self) -> None:
-        self._consensus = Consensus(self.base_map.station_grid, self.config.consensus)
+        self._consensus = StationConsensus(self._retrieval, self.config.consensus)
         self._scorer.clear()
 
     def begin(self, station: int) -> _Seen:
@@ -192,7 +193,7 @@ class _Rehearsal:
         if scan is None:
             return _Seen(False, False, 0.0, 0.0, 1.0)
         query = {name: own.astype(np.float32) for name, own in self.base_map.descriptors_of(station).items()}
-        self._consensus.vote(self._retrieval.vote(self.base_map.stations[station].astype(np.float64), query))
+        self._consensus.vote(self.base_map.stations[station].astype(np.float64), query)
         named = self._consensus.hypotheses()
         beside = np.tile(np.eye(4), (len(_AROUND), 1, 1))
         beside[:, :2, 3] = _AROUND

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from coview_kernels import StationCodes
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
@@ -50,6 +51,10 @@ class CoViewVote:
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1."""
         return self._index.at(self._query, stations, shifts)
+
+    def screened(self, codes: StationCodes, stations: Ints, shifts: Ints) -> Floats32:
+        """Return z-scores (K,) of stations at shifts by the first tier of the codes that the index is taken from."""
+        return np.float32(self._query.screen_zero) - codes.at(self._query.coded, stations, shifts)
 
     def at_all(self, requests: Sequence[Request[CoViewVote]]) -> list[Floats32]:
         """Return what :meth:`at` of each does, in one go through the index."""

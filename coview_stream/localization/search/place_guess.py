@@ -9,6 +9,7 @@ import numpy as np
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config.checks import require
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, transform, yaw_of
 from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.localization.search.consensus import Hypothesis
@@ -21,6 +22,9 @@ _MAX_POSES = 400
 MAX_DISTANCE = 20.0
 """Metres around a guess that are tried at most."""
 
+MIN_WITHIN = 50.0
+"""Metres of a circle that is searched alone, at least: evidence is judged by what the other places in it look like."""
+
 
 @dataclass(frozen=True)
 class PlaceGuess:
@@ -32,6 +36,8 @@ class PlaceGuess:
         distance: metres around it that are tried as well, up to :data:`MAX_DISTANCE`.
         angle: radians to either side of ``yaw`` that are tried as well.
         map: name of the one of several maps in whose frame it is; None of one map.
+        within: metres around it outside of which nothing is searched; None: all of the map is. Unlike the rest this
+            is trusted: of a robot that is elsewhere no place is found.
     """
 
     x: float
@@ -40,6 +46,7 @@ class PlaceGuess:
     distance: float = 5.0
     angle: float = float(np.radians(30.0))
     map: str | None = None
+    within: float | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.x, self.y, 0.0 if self.yaw is None else self.yaw)
@@ -48,6 +55,9 @@ class PlaceGuess:
         require(max(abs(self.x), abs(self.y)) < MAX_COORDINATE, self, "x", "map coordinates in metres")
         require(0.0 < self.distance <= MAX_DISTANCE, self, "distance", f"above 0, at most {MAX_DISTANCE:g} m")
         require(0.0 <= self.angle <= np.pi, self, "angle", "0 to pi radians")
+        if self.within is not None:
+            plain = isinstance(self.within, float | int) and not isinstance(self.within, bool)
+            require(plain and MIN_WITHIN <= self.within < MAX_COORDINATE, self, "within", f"{MIN_WITHIN:g} m or more")
 
     def poses(self) -> Floats:
         """Return (K, 3) x, y and yaw to be tried, the nearest to the guess first."""
@@ -64,6 +74,12 @@ class PlaceGuess:
         unlikely = np.repeat(far / self.distance, len(turns)) + np.tile(np.abs(turns) / max(reach, 1e-9), len(xy))
         poses = poses[np.argsort(unlikely, kind="stable")][:_MAX_POSES]
         return np.asarray(np.add(poses, (self.x, self.y, self.yaw or 0.0)))
+
+    def area(self, origin: Floats) -> Circle | None:
+        """Return the circle, about the map's ``origin`` (3,), outside of which nothing is searched; None for none."""
+        if self.within is None:
+            return None
+        return Circle(self.x - float(origin[0]), self.y - float(origin[1]), self.within)
 
     def transforms(self, origin: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` (4, 4), level, about the map's ``origin`` (3,), heights left open (0).
@@ -100,6 +116,9 @@ def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) 
 
 
 def has_ground(guess: PlaceGuess, origin: Floats, grid: StationGrid) -> bool:
-    """Tell whether the map has ground anywhere near a guess."""
+    """Tell whether the map has ground anywhere near a guess, or within its circle if it has one."""
+    area = guess.area(origin)
+    if area is not None:
+        return bool(area.holds(grid.stations).any())
     poses = guess.poses()
     return bool((grid.levels_at(poses[:, :2] - origin[:2]) >= 0).any())

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.place_guess import PlaceGuess
@@ -23,6 +24,9 @@ class PoseHints:
 
     The localizer's own odometry frame has its origin moved to an anchor; here it is undone, for after a loss there is
     another anchor. Map coordinates are the map's own.
+
+    Attributes:
+        area: of the map, metres from its zero, outside of which nothing is to be searched; None for none.
     """
 
     def __init__(self) -> None:
@@ -31,11 +35,12 @@ class PoseHints:
         self._led: tuple[Pose, ...] = ()
         self._guess: PlaceGuess | None = None  # of the place at the next frame
         self._guessed: tuple[Pose, ...] = ()
+        self.area: Circle | None = None
 
     def clear(self) -> None:
         """Forget them all: a place has been accepted."""
         self._awaited, self._known, self._led = None, (), ()
-        self._guess, self._guessed = None, ()
+        self._guess, self._guessed, self.area = None, (), None
 
     def guess(self, guess: PlaceGuess) -> None:
         """Have a guess of the place at the next frame tried, in place of an earlier one."""
@@ -53,6 +58,7 @@ class PoseHints:
             guess, self._guess = self._guess, None
             away = pose_from(np.eye(3), -anchor)
             self._guessed = tuple(T @ away for T in guess.transforms(origin, T_odom_body))
+            self.area = guess.area(origin)
         return tuple(T @ pose_from(np.eye(3), anchor) for T in self._guessed)
 
     def robot_at(self, T_map_body: Pose) -> None:

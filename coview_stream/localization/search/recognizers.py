@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Protocol
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
-from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.smallest_distance import SmallestDistance
+from coview_stream.localization.search.station_consensus import StationConsensus
 
 if TYPE_CHECKING:  # imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
@@ -90,10 +91,10 @@ class CoViewRecognizer:
         self.config = config
         self.retrieval = retrieval
         consensus = replace(config.consensus, peaks=peaks)
-        self.consensus: Consensus | SmallestDistance = (
+        self.consensus: StationConsensus | SmallestDistance = (
             SmallestDistance(base_map.stations, consensus)
             if consensus.mode == "single"
-            else Consensus(base_map.station_grid, consensus)
+            else StationConsensus(retrieval, consensus)
         )
         self.last_query: dict[Channel, Descriptor] = {}
 
@@ -107,7 +108,7 @@ class CoViewRecognizer:
         if isinstance(self.consensus, SmallestDistance):
             self.consensus.vote(centre, self.retrieval.distances(self.last_query).values())
         else:
-            self.consensus.vote(self.retrieval.vote(centre, self.last_query))
+            self.consensus.vote(centre, self.last_query, request.area)
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
@@ -66,6 +67,7 @@ class SearchRequest:
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
         R_body_cloud: (3, 3) rotation that ``cloud`` has been levelled by.
+        area: of the map, metres from its zero, that is searched alone; None for all of it.
     """
 
     stamp: float
@@ -79,6 +81,7 @@ class SearchRequest:
     guesses: tuple[Pose, ...] = ()
     surroundings: Points = field(default_factory=_no_points)
     R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
+    area: Circle | None = None
 
     @property
     def position(self) -> Floats:
@@ -96,6 +99,7 @@ class SearchRequest:
         epoch: Epoch = FIRST_EPOCH,
         hints: tuple[Pose, ...] = (),
         guesses: tuple[Pose, ...] = (),
+        area: Circle | None = None,
     ) -> SearchRequest:
         """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is its newest frame, body frame."""
         scan = surroundings = _no_points()
@@ -108,6 +112,7 @@ class SearchRequest:
             keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, guesses,
             surroundings,
             keyframe.R_body_cloud,
+            area,
         )  # fmt: skip
 
 

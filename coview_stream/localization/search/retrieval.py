@@ -10,18 +10,21 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
 from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.circle import Circle
 from coview_stream.localization.search.coview_vote import CoViewVote
+from coview_stream.localization.search.search_stations import SearchStations
 from coview_stream.localization.search.votes import ScoreVolume, TableVote, Vote
 
 _BLOCK = 8192  # stations whose spectra are made at a time; set by hand
 
 
 class Stations(Protocol):
-    """The part of a base map that retrieval uses: its stations' descriptors and their index."""
+    """The part of a base map that retrieval uses: its stations' places, descriptors and index."""
 
     @property
     def descriptor_config(self) -> DescriptorConfig:
@@ -31,6 +34,11 @@ class Stations(Protocol):
     @property
     def station_index(self) -> StationIndex:
         """Return the index of the descriptors."""
+        ...
+
+    @property
+    def station_grid(self) -> StationGrid:
+        """Return the look-up of the stations by position."""
         ...
 
     def __len__(self) -> int:
@@ -55,12 +63,34 @@ class Retrieval:
     def prepare(self) -> None:
         """Make what the first vote would."""
         if self.config.mode == "exhaustive":
-            self.stations.station_index.prepare()
+            self._whole.index.prepare()
 
-    def vote(self, centre: Floats, query: Mapping[Channel, Descriptor]) -> Vote:
-        """Return a keyframe's vote; ``centre`` (3,) is the zero of its descriptors, odometry frame."""
+    def compared(self, area: Circle | None = None) -> SearchStations:
+        """Return the stations that votes compare: of the map, or within a circle, metres from the map's zero.
+
+        ``ring_key`` mode compares all of them, whatever the circle.
+        """
+        if area is None or self.config.mode != "exhaustive":
+            return self._whole
+        grid = self.stations.station_grid
+        chosen = np.flatnonzero(area.holds(grid.stations))
+        return SearchStations.of(self.stations.station_index, grid, chosen)
+
+    @cached_property
+    def _whole(self) -> SearchStations:
+        index, grid = self.stations.station_index, self.stations.station_grid
+        return SearchStations.of(index, grid) if self.config.mode == "exhaustive" else SearchStations(index, grid)
+
+    def vote(self, centre: Floats, query: Mapping[Channel, Descriptor], compared: SearchStations | None = None) -> Vote:
+        """Return a keyframe's vote.
+
+        Args:
+            centre: (3,) zero of its descriptors, odometry frame.
+            query: descriptors (R, S) by channel.
+            compared: as :meth:`compared` returns them; None for those of the map.
+        """
         if self.config.mode == "exhaustive":
-            return CoViewVote(centre, self.stations.station_index, query)
+            return CoViewVote(centre, (compared or self._whole).index, query)
         return TableVote.of_distances(centre, self.distances(query).values())
 
     def distances(self, query: Mapping[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:

@@ -192,6 +192,7 @@ class RobotClient:
         distance: float = 5.0,
         timeout: float = 5.0,
         map: str | None = None,
+        within: float | None = None,
     ) -> dict[str, Any]:
         """Tell the node where the robot may be: one more place for its search to try, which is never trusted.
 
@@ -202,6 +203,8 @@ class RobotClient:
             distance: metres around it that are tried as well, 20 at most.
             timeout: seconds.
             map: name of the one of several maps in whose frame x and y are.
+            within: metres around x and y outside of which nothing is searched until the place is known; this is
+                trusted.
 
         Returns:
             The reply; ``taken`` is False while the place is known.
@@ -211,6 +214,7 @@ class RobotClient:
         """
         self._check_open()
         given = {"x": x, "y": y, "distance": distance} | ({} if yaw is None else {"yaw": yaw})
+        given |= {} if within is None else {"within": within}
         parameters = {k: repr(float(v)) for k, v in given.items()} | ({} if map is None else {"map": map})
         return self._transport.query(self.keys.suggest, parameters, timeout)
 

@@ -17,13 +17,13 @@ from coview_stream.messages.types import Sample
 
 _MAX_BYTES = 4096  # of a message; set by hand
 _SIGMAS = 2.0  # of a covariance that are tried around its pose; set by hand
-_FIELDS = ("x", "y", "yaw", "distance", "angle", "map")
+_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
 
 
 def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess of named numbers or their texts: x and y, and perhaps yaw, distance and angle (radians, metres).
 
-    With ``map``, a name, they are in the frame of that one of several maps.
+    With ``map``, a name, they are in the frame of that one of several maps; ``within``: as of a :class:`PlaceGuess`.
 
     Raises:
         InputError: x or y is missing, a name is unknown, or a value is no number or out of its range.
@@ -31,7 +31,7 @@ def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
     unknown = sorted(set(fields) - set(_FIELDS))
     if unknown or "x" not in fields or "y" not in fields:
         what = f"{unknown[0]!r} is unknown" if unknown else "x or y is missing"
-        raise InputError(f"initial pose: {what}; give x, y and perhaps yaw, distance, angle (metres, radians)")
+        raise InputError(f"initial pose: {what}; give x, y and perhaps yaw, distance, angle, within (metres, radians)")
     numbers: dict[str, float] = {}
     of = fields.get("map")
     if not isinstance(of, str | None):
@@ -39,7 +39,7 @@ def guess_of_fields(fields: Mapping[str, Any]) -> PlaceGuess:
     for name, value in fields.items():
         if name == "map":
             continue
-        if value is None and name == "yaw":
+        if value is None and name in ("yaw", "within"):
             continue
         try:
             if isinstance(value, bool):

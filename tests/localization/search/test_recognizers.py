@@ -32,7 +32,7 @@ def knowing(monkeypatch, world_drive):
     local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
     T_map_local = world_drive.T_map_body[0] @ inverse(local)
 
-    def vote(self, view, near):
+    def vote(self, view, near, area):
         rng = np.random.default_rng(0)
         found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
         there = transform(T_map_local, view.centre[None])[0, :2]
@@ -113,7 +113,7 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
     """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
     named = []
 
-    def vote(self, view, near):
+    def vote(self, view, near, area):
         found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
         away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import pytest
 
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ring_key
@@ -39,6 +40,11 @@ class Stations:
     @cached_property
     def station_index(self):
         return StationIndex.of(self.full)
+
+    @cached_property
+    def station_grid(self):
+        places = np.column_stack([2.0 * np.arange(len(self)) + 1.0, np.ones(len(self)), np.zeros(len(self))])
+        return StationGrid(places.astype(np.float32), 2.0)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,8 @@ def sample(payload):
 def test_json_and_parameters_name_a_place():
     assert decode_guess(sample(b'{"x": 1.5, "y": -2, "yaw": null}')) == PlaceGuess(1.5, -2.0)
     assert guess_of_fields({"x": "1.5", "y": "-2", "yaw": "0.5", "distance": "3"}) == PlaceGuess(1.5, -2.0, 0.5, 3.0)
+    assert decode_guess(sample(b'{"x": 1, "y": 2, "within": 800}')) == PlaceGuess(1.0, 2.0, within=800.0)
+    assert guess_of_fields({"x": 1, "y": 2, "within": None}) == PlaceGuess(1.0, 2.0)
 
 
 def test_pose_of_rviz_names_a_place_and_how_far_it_may_be_off():
@@ -40,7 +42,8 @@ def test_pose_of_rviz_names_a_place_and_how_far_it_may_be_off():
     [
         b"", b"{", b"[]", b"{}", b'{"x": 1}',
         b'{"x": 1, "y": "no"}', b'{"x": 1, "y": 2, "z": 3}', b'{"x": true, "y": 2}',
-        b'{"x": NaN, "y": 2}', b'{"x": 1e12, "y": 2}', b'{"x": 1, "y": 2, "distance": 500}', b"{" * 3000, b"{" * 5000,
+        b'{"x": NaN, "y": 2}', b'{"x": 1e12, "y": 2}', b'{"x": 1, "y": 2, "distance": 500}',
+        b'{"x": 1, "y": 2, "within": 3}', b"{" * 3000, b"{" * 5000,
         b"\0\1\0\0" + b"\xff" * 300,
     ],
 )  # fmt: skip

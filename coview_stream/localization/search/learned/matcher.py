@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.selection import argsmallest
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.search.consensus import yaw_of_shift
@@ -145,18 +146,28 @@ class FeatureMatcher:
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
         return QueryFeatures(features, weight, centre)
 
-    def vote(self, query: QueryFeatures, near: npt.ArrayLike = ()) -> FeatureVote:
+    def vote(self, query: QueryFeatures, near: npt.ArrayLike = (), area: Circle | None = None) -> FeatureVote:
         """Return a query's vote, which is asked for scores; shift n means yaw -2 pi n / S.
 
         Its candidates are found by correlating coarse cells with the query at some headings. On a map too large to be
         searched all over that is done around the tiles most similar to the query, and around ``near`` (N, 2), metres.
+        With an ``area`` they are all within it.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
         turned = turn_query(query.features.local, query.weight, self.rasters, ratio, yaws)
-        blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near)
+        if not self.dense:
+            blocks = self._similar_blocks(query, near, area)
+        elif area is None:
+            blocks = self._feature_blocks
+        else:
+            inside = self.index.blocks_near((area.x, area.y), area.radius)
+            blocks = np.intersect1d(self._feature_blocks, inside)
         coarse = correlate_turned(turned.coarse, self.index, True, blocks)
         named, groups = self._named(coarse, turned)
+        if area is not None:
+            within = area.holds(self.stations[named[0]])
+            named, groups = (named[0][within], named[1][within]), groups[within]
         return FeatureVote(query.centre, self.rasters.fine, self.cells, turned.images, named, groups)
 
     def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
@@ -183,13 +194,20 @@ class FeatureMatcher:
         shifts = (shift[group, None] + off) % self.config.yaws
         return (np.repeat(station, len(off)), shifts.ravel()), np.repeat(group, len(off))
 
-    def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike) -> Ints:
-        """Find the blocks of the index around ``near`` (N, 2) and around the tiles most similar to the query."""
+    def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike, area: Circle | None) -> Ints:
+        """Find the blocks of the index around ``near`` (N, 2) and around the tiles most similar to the query.
+
+        Of an ``area``, if there is one, only tiles that it may meet are compared.
+        """
         similarity = self.features.place.astype(np.float32) @ query.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
         found, number = np.unique(tile, axis=0, return_inverse=True)
         best = np.full(len(found), -np.inf, dtype=np.float32)
         np.maximum.at(best, number.reshape(-1), similarity)
+        if area is not None:
+            reached = replace(area, radius=area.radius + _TILE_RADIUS)
+            met = reached.holds((found + 0.5) * (TILE * LOCAL_CELL))
+            found, best = found[met], best[met]
         chosen = found[np.argsort(-best, kind="stable")[: self.config.shortlist]]
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
         middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])

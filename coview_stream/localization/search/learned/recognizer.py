@@ -31,7 +31,7 @@ class LearnedRecognizer:
         centre = on_ground(request.surroundings, request.position)
         query = self.learned.encode(request.surroundings, centre)
         hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
-        self.consensus.vote(self.learned.vote(query, hinted))
+        self.consensus.vote(self.learned.vote(query, hinted, request.area))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on every storey that they may be on: from above these look alike."""

@@ -28,7 +28,7 @@ def named(heights, peaks=5):
     flat[(xy == THERE).all(axis=1), SHIFT] = 0.2
     learned = SimpleNamespace(
         encode=lambda points, centre: SimpleNamespace(centre=centre),
-        vote=lambda view, near: TableVote.of_distances(view.centre, [np.tile(flat, (len(heights), 1))]),
+        vote=lambda view, near, area: TableVote.of_distances(view.centre, [np.tile(flat, (len(heights), 1))]),
     )
     source = LearnedRecognizer(SimpleNamespace(station_grid=StationGrid(stations, 2.0)), config, learned)
     ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)

@@ -12,6 +12,7 @@ from coview_stream.config import ConsensusConfig, LearnedConfig
 from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import Features
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
@@ -106,6 +107,18 @@ def test_large_maps_are_searched_around_place_matches_and_hints(planted, station
         assert (named > (32.0, 64.0)).all(axis=1).any() == beyond  # the block that the hint lies in
     there = int(np.hypot(*(stations[:, :2] - hint).T).argmin())
     assert vote.at(np.array([there]), np.array([3]))[0] != 0.0  # what other keyframes name is looked at anywhere
+
+
+@pytest.mark.parametrize("dense_area", [1000.0, 2e6])
+def test_candidates_lie_within_the_area_that_is_searched(planted, stations, dense_area):
+    known = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=dense_area))
+    view = planted.seen((-77.0, -43.0), 0.0, np.zeros(3))
+    for area in (Circle(-60.0, -40.0, 40.0), Circle(60.0, 60.0, 50.0)):
+        vote = known.vote(view, (), area)
+        named = vote.candidates()[0]
+        assert len(named)
+        assert area.holds(stations[named]).all()
+        assert (np.hypot(*(stations[named[0], :2] - (-77.0, -43.0))) < 2.0) == (area.x < 0.0)
 
 
 def test_only_small_maps_are_prepared_for_full_search(planted, stations):

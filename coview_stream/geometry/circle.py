@@ -1,0 +1,28 @@
+"""Circle on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Bools, Reals
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Circle in a horizontal plane.
+
+    Attributes:
+        x, y: its centre, metres.
+        radius: metres.
+    """
+
+    x: float
+    y: float
+    radius: float
+
+    def holds(self, positions: Reals) -> Bools:
+        """Tell which of positions (N, 2 or 3) lie within it, heights left out of account."""
+        away = np.asarray(positions[:, :2], dtype=np.float64) - (self.x, self.y)
+        return np.asarray((away * away).sum(axis=1) <= self.radius**2)
