@@ -25,6 +25,7 @@ from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, r
 from bench.harness.pinned import today
 from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.worlds import MAPPER, prepared_run, world_name
+from bench.speed import city_votes
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
@@ -113,6 +114,9 @@ def _figures(side: int, found: dict[str, float]) -> Iterator[Row]:
     yield informs(f"{title}: of it, without pages of files", seen["RssAnon"], "MB")
     yield informs(f"{title}: memory, peak", seen["VmHWM"], "MB")
     yield informs(f"{title}: robots found in their first {_FRAMES} frames", seen["found"], f"of {seen['drives']}")
+    if side > 1:
+        yield from city_votes.rows(title, isolated(city_votes.voted, site, worlds))
+        yield city_votes.wrong_circle_row(title, isolated(city_votes.elsewhere, site, worlds))
     yield judged(f"{title}: false poses", f"{seen['false']} of {seen['poses']}", "none", seen["false"] == 0)
 
 

@@ -16,7 +16,9 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,13 +33,16 @@ from bench.speed.search import last_core
 from coview_stream import BaseMap
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
-from coview_stream.config import ConsensusConfig
+from coview_stream.config import ConsensusConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.selection import argsmallest
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z
-from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
-from coview_stream.localization.search.coview_vote import CoViewVote
+from coview_stream.localization.search.consensus import yaw_of_shift
+from coview_stream.localization.search.global_search import coview_peaks
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.station_consensus import StationConsensus
 from coview_stream.localization.search.votes import robust_zscore
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
@@ -46,6 +51,9 @@ CHECKED = {10_000: 1, 100_000: 3, 1_000_000: 9}
 
 MOST_SLOPE, LEAST_KEPT, MOST_MS = 1.0, 99.9, 30.0
 """The targets: growth from a hundred thousand to a million stations, per cent of right places, a vote near a prior."""
+
+RADIUS = 1000.0
+"""Metres of the prior's circle; around the drive it holds 785,000 of the million stations."""
 
 BOTH = (10_000, 100_000)
 """Sizes at which the campus is searched too."""
@@ -60,7 +68,7 @@ def make(size: int, scene: str, out: Path) -> None:
     """Write stations, descriptors and index of a map of ``size`` stations."""
     site, _, _ = opened(WORLDS[scene])
     seen = drive(scene)
-    middle = np.mean([(each.T_map_odom @ np.append(each.position, 1.0))[:3] for each in seen], axis=0)
+    middle = np.mean([_place(each) for each in seen], axis=0)
     own = np.argsort(np.linalg.norm(site.stations - middle, axis=1), kind="stable")[:size]
     known = [site.descriptors(name)[own] for name in site.descriptor_config.channels]
     _save_queries(site, seen, out)
@@ -89,15 +97,18 @@ def make(size: int, scene: str, out: Path) -> None:
 
 
 def widened(stations: Floats32, count: int, block: float) -> Floats32:
-    """Return ``count`` stations (count, 3): these, and the others on a square grid east of them."""
+    """Return ``count`` stations (count, 3): these, and the others on the same grid around them, the nearest first."""
     missing = count - len(stations)
-    side = int(np.ceil(np.sqrt(max(missing, 1))))
-    column, row = np.divmod(np.arange(missing), side)
-    # on the same grid: its stations stand in the middle of blocks
-    east = (np.floor(stations[:, 0].max() / block) + 2 + column + 0.5) * block
-    north = (np.floor(stations[:, 1].min() / block) + row + 0.5) * block
+    cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
+    low, high = cells.min(axis=0) - 1, cells.max(axis=0) + 1
+    reach = int(np.ceil(np.sqrt(count / np.pi) + np.ptp(cells, axis=0).max()))
+    middle = (low + high) // 2
+    others = np.stack(np.meshgrid(*(np.arange(m - reach, m + reach) for m in middle)), axis=-1).reshape(-1, 2)
+    others = others[((others < low) | (others > high)).any(axis=1)]
+    nearest = np.argsort(np.linalg.norm(others - middle, axis=1), kind="stable")[:missing]
+    xy = (others[np.sort(nearest)] + 0.5) * block  # its stations stand in the middle of blocks
     height = np.full(missing, np.median(stations[:, 2]))
-    return np.concatenate([stations, np.column_stack([east, north, height])]).astype(np.float32)
+    return np.concatenate([stations, np.column_stack([xy, height])]).astype(np.float32)
 
 
 def drive(scene: str) -> list[Seen]:
@@ -141,8 +152,11 @@ def _opened(out: Path) -> tuple[float, Floats32, dict[Any, npt.NDArray[Any]], li
     return float(kept["block"]), np.load(out / "stations.npy"), mapped, queries
 
 
-def voted(out: Path) -> dict[str, Any]:
-    """Milliseconds of every keyframe's vote, the ranks of the right places, and the memory that all took."""
+def voted(out: Path, radius: float | None = None) -> dict[str, Any]:
+    """Milliseconds of every keyframe's vote, the ranks of the right places, and the memory that all took.
+
+    With a ``radius``, within a circle of so many metres around the first keyframe's place.
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {last_core()})
     block, stations, descriptors, queries = _opened(out)
@@ -150,13 +164,18 @@ def voted(out: Path) -> dict[str, Any]:
     index = StationIndex.from_arrays(kept, descriptors)
     if index is None:
         raise RuntimeError("the index is not one of these descriptors")
-    consensus = Consensus(StationGrid(stations, block), ConsensusConfig())
+    site: Any = SimpleNamespace(station_index=index, station_grid=StationGrid(stations, block))
+    retrieval = Retrieval(site, RetrievalConfig())
+    area = None if radius is None else Circle(*_place(queries[0].seen)[:2].tolist(), radius)
     kernels.warm_up()
-    index.prepare()
+    retrieval.compared(area).index.prepare()
+    consensus = StationConsensus(retrieval, _consensus(len(stations)))
+    consensus.vote(queries[0].centre, queries[0].described, area)  # copies the codes that it compares
+    consensus.clear()
     times, ranks = [], []
     for seen, centre, described in queries:
         begin = time.perf_counter()
-        consensus.vote(CoViewVote(centre, index, described))
+        consensus.vote(centre, described, area)
         found = consensus.hypotheses()
         times.append(1e3 * (time.perf_counter() - begin))
         ranks.append(_rank([each.T_map_odom for each in found], seen))
@@ -165,6 +184,17 @@ def voted(out: Path) -> dict[str, Any]:
         "ms": times, "ranks": ranks, "megabytes": peak_megabytes(), "index_bytes": size,
         "build_s": float((out / "seconds").read_text()),
     }  # fmt: skip
+
+
+def _consensus(stations: int) -> ConsensusConfig:
+    """Return the settings of a search of so many stations."""
+    config = ConsensusConfig()
+    return replace(config, peaks=coview_peaks(config.peaks, stations))
+
+
+def _place(seen: Seen) -> Floats:
+    """Return where a keyframe was taken (3,), in the map."""
+    return np.asarray((seen.T_map_odom @ np.append(seen.position, 1.0))[:3])
 
 
 def _rank(poses: Sequence[Pose], seen: Seen) -> int | None:
@@ -176,7 +206,7 @@ def exhaustive(out: Path, every: int, last: int | None) -> dict[str, Any]:
     """Ranks of the right places by adding up all z-scores; milliseconds of one keyframe's."""
     block, stations, descriptors, queries = _opened(out)
     cells, at = _cells(stations, block)
-    config, ranks, times = ConsensusConfig(), {}, []
+    config, ranks, times = _consensus(len(stations)), {}, []
     window: list[tuple[Floats, Floats32]] = []
     for number, (seen, centre, described) in enumerate(queries):
         if last is not None and number >= last:
@@ -254,6 +284,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 if scene == "town":
                     found[size] = votes
                     yield from _figures(size, votes)
+                    if size == SIZES[-1]:
+                        yield from _prior(size, isolated(voted, Path(scratch), RADIUS))
                 if size in CHECKED:
                     whole = isolated(exhaustive, Path(scratch), CHECKED[size], _LAST.get(size))
                     yield from _beside(f"scale/{size} stations, {scene}", votes, whole)
@@ -282,6 +314,14 @@ def _figures(size: int, votes: dict[str, Any]) -> Iterator[Row]:
     yield informs(f"{name}: memory of the process, peak", votes["megabytes"], "MB")
     yield informs(f"{name}: index per station", votes["index_bytes"] / size, "B")
     yield informs(f"{name}: making the index", votes["build_s"], "s")
+
+
+def _prior(size: int, votes: dict[str, Any]) -> Iterator[Row]:
+    """Rows of the votes within a circle."""
+    name = f"scale/{size} stations, in a circle of {RADIUS:g} m"
+    yield bounded(f"{name}: vote and places, p50", float(np.median(votes["ms"])), "ms", MOST_MS)
+    named = [rank is not None for rank in votes["ranks"]]
+    yield informs(f"{name}: right place named, of {len(named)}", 100 * float(np.mean(named)), "%")
 
 
 def _beside(name: str, votes: dict[str, Any], whole: dict[str, Any]) -> Iterator[Row]:

@@ -181,6 +181,14 @@ class GlobalSearch:
         self._hints.tried(refuted=surveyed and best < 0.0)
 
 
+def coview_peaks(configured: int, stations: int) -> int:
+    """Return how many hypotheses the co-view votes on so many stations come to.
+
+    On an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums, too.
+    """
+    return round(configured * max(1.0, float(stations / _ORDINARY) ** 0.25))
+
+
 def _recognizers(
     base_map: BaseMap, config: LocalizerConfig, index: SearchIndex
 ) -> tuple[CoViewRecognizer | None, PlaceRecognizer | None]:
@@ -190,7 +198,6 @@ def _recognizers(
         from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
 
         learned = LearnedRecognizer(base_map, config, index.learned)
-    # on an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums, too
-    peaks = round(config.consensus.peaks * max(1.0, (len(base_map) / _ORDINARY) ** 0.25))
+    peaks = coview_peaks(config.consensus.peaks, len(base_map))
     coview = None if index.retrieval is None else CoViewRecognizer(base_map, config, index.retrieval, peaks)
     return coview, learned
