@@ -1,4 +1,4 @@
-"""Votes of keyframes on a site: all stations compared, squares of them, in the circle of a prior, and in a wrong one."""
+"""Votes of keyframes on a site: all stations compared, squares, squares in a circle of a prior, and in a wrong one."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ def coview_peaks(configured: int, stations: int) -> int:
 
     On an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums, too.
     """
-    return round(configured * max(1.0, float(stations / _ORDINARY) ** 0.25))
+    return round(configured * math.sqrt(math.sqrt(max(1.0, stations / _ORDINARY))))
 
 
 def _recognizers(
