@@ -90,7 +90,8 @@ def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) ->
 
 def square_metres(points: Points) -> int:
     """Return how many squares of a metre hold points (N, 3)."""
-    return len(np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0))
+    column, row = np.floor(points[:, :2]).astype(np.int64).T
+    return len(np.unique(column * (1 << 32) + row))
 
 
 def columns_of(tile: float, voxel: float) -> int:

@@ -1,16 +1,19 @@
-"""Bytes of a tile's layer: named arrays, each compressed by itself (LZMA), under a JSON header.
+"""Bytes of a tile's layer: named arrays, each compressed by itself, under a JSON header.
 
-Layout: ``COVIEWL1``, the header's length (4 bytes, little endian), the header, the compressed arrays in its order. The
-same arrays give the same bytes. Nothing is believed on reading: sizes are bounded before memory is taken.
+Layout: ``COVIEWL1``, the header's length (4 bytes, little endian), the header, the compressed arrays in its order. An
+array's entry says how it is compressed: ``bz2``, or LZMA of its bytes by planes where it says nothing. bzip2 makes
+clouds as small as LZMA does in a seventh of the time, which was a third of a tile's; features it makes a tenth larger.
+The same arrays give the same bytes. Nothing is believed on reading: sizes are bounded before memory is taken.
 """
 
 from __future__ import annotations
 
+import bz2
 import json
 import lzma
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +21,7 @@ import numpy.typing as npt
 from coview_stream.errors import MapError
 
 Arrays = Mapping[str, npt.NDArray[Any]]
+Packing = Literal["bz2", "lzma"]
 
 _MAGIC = b"COVIEWL1"
 _TYPES = {"u1": "|u1", "i1": "|i1", "u2": "<u2", "i2": "<i2", "i4": "<i4", "f4": "<f4"}
@@ -28,15 +32,24 @@ MAX_BYTES = 1 << 29
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 22}]
 """Bytes are predicted by nothing: rows of small numbers, whose neighbours in memory tell little of each other."""
 
+PACKING: Mapping[str, Packing] = {"cloud": "bz2", "stations": "bz2", "features": "lzma"}
+"""How the arrays of a tile's layers are compressed."""
 
-def encode(arrays: Arrays) -> bytes:
+
+def encode(arrays: Arrays, packing: Packing = "bz2") -> bytes:
     """Return the bytes of arrays of small integers or float32, whose names are sorted."""
-    entries, parts = [], []
+    entries: list[dict[str, Any]] = []
+    parts = []
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         kind = next(kind for kind, dtype in _TYPES.items() if np.dtype(dtype) == array.dtype)
-        part = lzma.compress(_planes(array), format=lzma.FORMAT_RAW, filters=_FILTERS)
-        entries.append({"name": name, "type": kind, "shape": list(array.shape), "bytes": len(part)})
+        entry = {"name": name, "type": kind, "shape": list(array.shape)}
+        if packing == "bz2":
+            part = bz2.compress(array.tobytes())
+            entry["packing"] = packing
+        else:
+            part = lzma.compress(_planes(array), format=lzma.FORMAT_RAW, filters=_FILTERS)
+        entries.append(entry | {"bytes": len(part)})
         parts.append(part)
     header = json.dumps(entries, separators=(",", ":")).encode()
     return b"".join([_MAGIC, len(header).to_bytes(4, "little"), header, *parts])
@@ -54,7 +67,7 @@ def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
     """
     try:
         return _decode(raw)
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, lzma.LZMAError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError, EOFError, lzma.LZMAError) as error:
         raise MapError(f"{name}: is no layer of a tile ({error}); fetch or build it again") from error
 
 
@@ -74,20 +87,31 @@ def _decode(raw: bytes) -> dict[str, npt.NDArray[Any]]:
         total += wanted
         if total > MAX_BYTES or at + length > len(raw):
             raise ValueError("it is too large or cut off")
-        arrays[str(entry["name"])] = _unpacked(raw[at : at + length], wanted, dtype, shape)
+        if entry.get("packing", "lzma") not in ("bz2", "lzma"):
+            raise ValueError("an array is compressed in a way that is not known")
+        unpack = _from_bz2 if "packing" in entry and entry["packing"] == "bz2" else _from_lzma
+        arrays[str(entry["name"])] = unpack(raw[at : at + length], wanted, dtype).reshape(shape)
         at += length
     if at != len(raw):
         raise ValueError("something follows its end")
     return arrays
 
 
-def _unpacked(part: bytes, wanted: int, dtype: np.dtype[Any], shape: list[int]) -> npt.NDArray[Any]:
+def _from_lzma(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
-    found = decoder.decompress(part, max_length=wanted + 1)
+    planes = _whole(decoder.decompress(part, max_length=wanted + 1), wanted).reshape(dtype.itemsize, -1)
+    return np.ascontiguousarray(planes.T).view(dtype)
+
+
+def _from_bz2(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    found = bz2.BZ2Decompressor().decompress(part, max_length=wanted + 1)
+    return _whole(found, wanted).view(dtype)
+
+
+def _whole(found: bytes, wanted: int) -> npt.NDArray[np.uint8]:
     if len(found) != wanted:
         raise ValueError(f"an array has {len(found)} bytes or more, not {wanted}")
-    planes = np.frombuffer(found, dtype=np.uint8).reshape(dtype.itemsize, -1)
-    return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)
+    return np.frombuffer(bytearray(found), dtype=np.uint8)
 
 
 def _planes(array: npt.NDArray[Any]) -> bytes:

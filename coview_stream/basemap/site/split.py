@@ -15,7 +15,7 @@ from coview_stream.basemap.site.assemble import Progress, assemble
 from coview_stream.basemap.site.cloud_layer import cloud_layer, square_metres
 from coview_stream.basemap.site.earlier import PARAMETER
 from coview_stream.basemap.site.grid import TILE, Key, SiteGrid
-from coview_stream.basemap.site.layer_bytes import encode
+from coview_stream.basemap.site.layer_bytes import PACKING, encode
 from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry, in_order
 from coview_stream.basemap.site.site_build import check_directory
 from coview_stream.basemap.site.stations_layer import stations_layer
@@ -60,7 +60,7 @@ def split(
         if learned:
             layers["features"] = _features(arrays, (column, row), tile)
         named = {}
-        for name, content in ((name, encode(each)) for name, each in layers.items()):
+        for name, content in ((name, encode(each, PACKING[name])) for name, each in layers.items()):
             named[name] = LayerEntry(store.put(content), len(content))
         low, high = (round(float(each), 2) for each in (local[:, 2].min(), local[:, 2].max()))
         entries.append(TileEntry(column, row, len(local), len(standing), square_metres(local), low, high, named))

@@ -11,7 +11,7 @@ import numpy as np
 
 from coview_stream.basemap.site.cloud_layer import cloud_layer, square_metres
 from coview_stream.basemap.site.grid import FEATURE_HALO, HALO, Key, SiteGrid
-from coview_stream.basemap.site.layer_bytes import encode
+from coview_stream.basemap.site.layer_bytes import PACKING, encode
 from coview_stream.basemap.site.manifest import LayerEntry, TileEntry
 from coview_stream.basemap.site.partition import Parts
 from coview_stream.basemap.site.stations_layer import stations_layer
@@ -21,7 +21,7 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.geometry.transforms import Points
 
-_CODE = 1
+_CODE = 2
 """Counts changes of what a tile is made of: tiles of other code are not taken for done."""
 
 _SLAB = 8_000_000  # points that are thinned at a time: 0.6 GB; set by hand
@@ -174,7 +174,7 @@ def _build(job: TileJob, store: TileStore) -> TileEntry | None:
         )
     entries = {}
     for name, arrays in layers.items():
-        content = encode(arrays)
+        content = encode(arrays, PACKING[name])
         entries[name] = LayerEntry(store.put(content), len(content))
     heights = near[inside][:, 2]
     low, high = round(float(heights.min()), 2), round(float(heights.max()), 2)

@@ -21,9 +21,14 @@ ARRAYS = {
 }
 
 
-def test_arrays_come_back_and_the_same_arrays_are_the_same_bytes():
-    raw = encode(ARRAYS)
-    assert raw == encode(dict(reversed(ARRAYS.items())))
+@pytest.fixture(params=["bz2", "lzma"])
+def packing(request):
+    return request.param
+
+
+def test_arrays_come_back_and_the_same_arrays_are_the_same_bytes(packing):
+    raw = encode(ARRAYS, packing)
+    assert raw == encode(dict(reversed(ARRAYS.items())), packing)
     found = decode(raw, "a")
     assert set(found) == set(ARRAYS)
     for name, array in ARRAYS.items():
@@ -32,8 +37,8 @@ def test_arrays_come_back_and_the_same_arrays_are_the_same_bytes():
 
 
 @pytest.mark.parametrize("at", [0, 9, 20, 300, -1])
-def test_changed_bytes_are_refused_or_change_only_numbers(at):
-    raw = bytearray(encode(ARRAYS))
+def test_changed_bytes_are_refused_or_change_only_numbers(at, packing):
+    raw = bytearray(encode(ARRAYS, packing))
     raw[at] ^= 0x5A
     with contextlib.suppress(MapError):  # the error of a layer, and no other
         found = decode(bytes(raw), "tile")
@@ -41,9 +46,20 @@ def test_changed_bytes_are_refused_or_change_only_numbers(at):
 
 
 @pytest.mark.parametrize("cut", [0, 7, 30, 200, -1])
-def test_cut_bytes_are_refused(cut):
+def test_cut_bytes_are_refused(cut, packing):
     with pytest.raises(MapError, match="is no layer of a tile"):
-        decode(encode(ARRAYS)[:cut], "tile")
+        decode(encode(ARRAYS, packing)[:cut], "tile")
+
+
+@pytest.mark.parametrize("other", ["zip2", 7, None])
+def test_unknown_packings_are_refused(other):
+    raw = encode({"a": np.arange(9, dtype=np.uint8)})
+    size = int.from_bytes(raw[8:12], "little")
+    entries = json.loads(raw[12 : 12 + size])
+    entries[0]["packing"] = other
+    header = json.dumps(entries).encode()
+    with pytest.raises(MapError, match="not known"):
+        decode(raw[:8] + len(header).to_bytes(4, "little") + header + raw[12 + size :], "tile")
 
 
 @pytest.mark.parametrize("shape", [[1 << 30], [1 << 15, 1 << 15], [-1], [2.0], ["a"], [1, 1, 1, 1, 1]])
@@ -53,8 +69,8 @@ def test_impossible_shapes_take_no_memory(shape):
         decode(b"COVIEWL1" + len(header).to_bytes(4, "little") + header, "tile")
 
 
-def test_array_that_unpacks_to_more_than_it_says_is_refused():
-    raw = encode({"a": np.zeros(1 << 20, dtype=np.uint8)})
+def test_array_that_unpacks_to_more_than_it_says_is_refused(packing):
+    raw = encode({"a": np.zeros(1 << 20, dtype=np.uint8)}, packing)
     small = raw.replace(b"[1048576]", b"[1048575]")
     assert small != raw
     with pytest.raises(MapError, match="not 1048575"):
