@@ -60,6 +60,7 @@ BENCHMARKS = {
     "search": Benchmark("speed.search", "the whole search step beside an earlier commit", _ANY, (), 1200.0),
     "scale": Benchmark("speed.scale", "the vote of a keyframe on a thousand to a million stations", (1,), (), 1200.0),
     "city": Benchmark("speed.city", "a city of 4 km2 as a directory: build, open, find robots, memory"),
+    "large_build": Benchmark("speed.large_build", "building of hundreds of millions of points: time, memory, slopes"),
     "airborne": Benchmark(
         "speed.airborne", "search on a real airborne map of 1.5 km2: times, memory, sizes", limit_s=1800.0, page=True
     ),
