@@ -1,4 +1,4 @@
-"""Building of a very large survey: as many points as are asked for, from towns that are simulated and laid side by side.
+"""Building of a very large survey: as many points as are asked for, of simulated towns that are laid side by side.
 
 Some towns of 500 x 500 m are surveyed from the air, at a density like that of drones or of several flights; copies of
 their files, moved, fill a square. To a build every copy is new ground: tiles are cut elsewhere. (A robot could not be
@@ -78,16 +78,17 @@ def _surveyed(below: Path, number: int, density: float) -> dict[str, object]:
     """Return the file of a town's survey and its points; simulate it unless it is there."""
     config = SimulationConfig(scene="town", seed=FIRST_SEED + number, size=EDGE, density=density, origin=_CORNER)
     path = below / f"town{number}.laz"
-
-    def make() -> dict[str, int]:
-        below.mkdir(parents=True, exist_ok=True)
-        points = base_map(scene_of(config), config)
-        write_cloud(path, points, origin=config.origin)
-        return {"points": len(points)}
-
+    below.mkdir(parents=True, exist_ok=True)
     spec = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
-    made = remembered(below / f"town{number}.json", spec, lambda: isolated(make))
+    made = remembered(below / f"town{number}.json", spec, lambda: isolated(_survey, path, config))
     return {"path": path, "points": made["points"]}
+
+
+def _survey(path: Path, config: SimulationConfig) -> dict[str, int]:
+    """Write the survey of a town, and return its number of points."""
+    points = base_map(scene_of(config), config)
+    write_cloud(path, points, origin=config.origin)
+    return {"points": len(points)}
 
 
 def _built(below: Path, towns: list[dict[str, object]], points: float, workers: int) -> dict[str, float]:
