@@ -29,6 +29,8 @@ PLANES = ti.types.ndarray(ti.u16, 1)
 BITS = ti.types.ndarray(ti.i64, 1)
 
 WINDOW = 2 * REACH + 1  # coarse shifts a side
+# bits are counted from the array's beginning, or on large maps from its middle: by ``first``, 0 or -2^31, to which
+# indices are added in 32 bits, going round
 DIGITS = 7  # of a number of hits: 127 points at most
 CENTIMETRE = 0.01
 
@@ -102,7 +104,7 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
 
 @ti.func
 def fine_hits(
-    table: ti.template(), down, across, bits: ti.template(), structure: ti.template(), x, y, z, yaw, step,
+    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
@@ -117,18 +119,20 @@ def fine_hits(
             columns[k] = clamped(x + c * u - s * v + step * (k - 1), across)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
-                at = 2 * place(table, across, rows[i], columns[j])
+                at = 2 * place(table, across, rows[i], columns[j]) + first
                 hits[3 * i + j] += ti.cast(((bits[at] >> level) & 1) + ((bits[at + 1] >> level) & 1), ti.i32)
 
 
 @ti.func
-def hits_at(table: ti.template(), down, across, bits: ti.template(), structure: ti.template(), x, y, z, yaw) -> ti.i32:
+def hits_at(
+    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw
+) -> ti.i32:  # fmt: skip
     """Count at a pose points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     hits = 0
     for p in range(structure.shape[0] // 3):
         u, v = structure[3 * p], structure[3 * p + 1]
-        at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
+        at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v) + first
         level = z + structure[3 * p + 2]
         hits += bit(bits[at], level) + bit(bits[at + 1], level)
     return hits
@@ -155,7 +159,7 @@ def rise(
 @ti.kernel
 def score(
     planes: PLANES, blocks: ti.i32, high: ti.i32,
-    table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, surface: WHOLES,
+    table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, first: ti.i32, surface: WHOLES,
     few: FLOATS, some: FLOATS, lows: FLOATS, structure: FLOATS, low: FLOATS, free: FLOATS,
     levels: ti.i32, coarse: ti.i32,
     poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
@@ -185,7 +189,7 @@ def score(
                     for _ in range(levels):
                         # the shift first, then the heading there: a third of what all pairs of them would cost
                         hits = ti.Vector.zero(ti.i32, 9)
-                        fine_hits(table, down, across, bits, some, x, y, z, yaw, step, hits)
+                        fine_hits(table, down, across, bits, first, some, x, y, z, yaw, step, hits)
                         best, bi, bj, bk = -1, 0, 0, 0
                         for i in ti.static(range(3)):
                             for j in ti.static(range(3)):
@@ -195,7 +199,8 @@ def score(
                         x += step * bj
                         y += step * bi
                         for k in range(2):
-                            value = 4 * hits_at(table, down, across, bits, some, x, y, z, yaw + angle * (2 * k - 1)) - 1
+                            turned = yaw + angle * (2 * k - 1)
+                            value = 4 * hits_at(table, down, across, bits, first, some, x, y, z, turned) - 1
                             if value > best:
                                 best, bk = value, 2 * k - 1
                         yaw += angle * bk
@@ -212,11 +217,11 @@ def score(
                         known = ti.cast(ground_of(word) != NOT_SURVEYED, ti.i32)
                         level = z + structure[3 * p + 2]
                         edge = word >> 16
-                        hit = bit(bits[2 * at], level)
+                        hit = bit(bits[2 * at + first], level)
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
                         inside += known
                         close += hit & known
-                        on += bit(bits[2 * at + 1], level) & known
+                        on += bit(bits[2 * at + 1 + first], level) & known
                         covered += (hit | ti.cast(top > level - UNDER_EDGE, ti.i32)) & known
                     for p in range(low.shape[0] // 3):
                         u, v = low[3 * p], low[3 * p + 1]
@@ -226,13 +231,13 @@ def score(
                         level = z + low[3 * p + 2]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
-                        upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1], level)
+                        upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1 + first], level)
                         inside_low += known
                         grounded += (flat | upper) & known
                     for p in range(free.shape[0] // 3):
                         u, v = free[3 * p], free[3 * p + 1]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-                        passed += bit(bits[2 * at + 1], z + free[3 * p + 2])
+                        passed += bit(bits[2 * at + 1 + first], z + free[3 * p + 2])
                     poses[4 * h] = x
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z

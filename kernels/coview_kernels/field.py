@@ -33,8 +33,9 @@ COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 """Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
 often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
 
-_MAX_TILES, _MAX_TABLE = 1 << 20, 1 << 21  # tiles with layers, and all of them: 268 and 537 km2; kernels count in int32
-
+_MAX_TABLE = 1 << 21  # tiles of the rectangle that holds a map, 537 km2: kernels count in int32
+_MIDDLE = 1 << 31
+"""Words of bits that an index of 32 bits, with its sign, counts from their first; of more it counts from the middle."""
 
 _BATCH = 512  # tiles at a time, so that intermediate arrays stay small
 _BAND = 16  # rows of tiles at a time, likewise
@@ -119,7 +120,7 @@ class FieldMap:
         low, high = (
             np.asarray(each, dtype=np.int64) for each in (self.corner, self.tiles[:, :2].max(axis=0, initial=0))
         )
-        if len(self.tiles) >= _MAX_TILES or (len(self.tiles) and float(np.prod(high - low + 2.0)) >= _MAX_TABLE):
+        if len(self.tiles) and float(np.prod(high - low + 2.0)) >= _MAX_TABLE:
             raise ValueError(f"{len(self.tiles)} tiles from {low} to {high} are too many for one map")
         if self.stored is not None:
             self._check(self.stored)
@@ -255,10 +256,13 @@ def _structure_at(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple
 
 def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
     poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 7), dtype=np.int32)
+    bits, first = layers.bits.reshape(-1), 0
+    if len(bits) > _MIDDLE:
+        bits, first = bits[_MIDDLE:], -_MIDDLE
     Launch(
         "field", "score",
         layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2],
-        layers.table.reshape(-1), layers.table.shape[1], layers.base, layers.bits.reshape(-1),
+        layers.table.reshape(-1), layers.table.shape[1], layers.base, bits, first,
         layers.surface.reshape(-1), plan.few.reshape(-1), plan.some.reshape(-1), plan.lows.reshape(-1),
         plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels, int(plan.coarse),
         poses.reshape(-1), counts.reshape(-1), runtime.workers(),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import coview_kernels as kernels
+from coview_kernels import field as field_module
 from coview_kernels import mapped, reference
 from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
 from coview_kernels.mapped import Windows
@@ -187,3 +188,30 @@ def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
     for poses in (starts, pose[None]):
         for one, other in zip(*(kernels.field_scores(each, scan, poses) for each in (field, stored)), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_tiles_beyond_what_32_bits_count_are_looked_up(
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path
+):
+    """More than 268 km2: the same tiles under the highest numbers, in files that are holes but for these."""
+    field, scan, pose, others = scene
+    layers, last = field.layers, (1 << 20) + 50
+    number = np.where(layers.table > 4, layers.table + last, layers.table)
+    far = np.concatenate([[0], np.unique(number[number > 0])])
+    sparse = {}
+    for name in ("base", "bits", "surface"):
+        own = getattr(layers, name)
+        made = np.memmap(tmp_path / name, own.dtype, "w+", shape=(last + len(own), *own.shape[1:]))
+        made[far] = own
+        sparse[name] = made
+    large = layers._replace(table=number.astype(np.int32), **sparse)
+    assert large.bits.size > 2**31
+    structure, low, free = scan.structure, scan.low, scan.free
+    few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
+    plan = Plan(structure, low, free, *few, 2, True)
+    corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
+    starts = np.vstack([others, pose]) - corner
+    found = field_module._native if kernels.backend() != "numpy" else reference.field_scores
+    both = (kernels.submit(found, each, plan, starts.copy()) for each in (layers, large))
+    for one, other in zip(*both, strict=True):
+        np.testing.assert_array_equal(one, other)

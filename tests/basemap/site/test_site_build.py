@@ -219,7 +219,7 @@ def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not
         np.testing.assert_array_equal(stored, made)
 
 
-@pytest.mark.parametrize(("name", "most"), [("station_codes.StationCodes.MAX_STATIONS", 100), ("field._MAX_TILES", 2)])
+@pytest.mark.parametrize(("name", "most"), [("station_codes.StationCodes.MAX_STATIONS", 100), ("field._MAX_TABLE", 2)])
 def test_site_that_is_too_large_for_one_map_is_to_be_opened_in_parts(site, cache, monkeypatch, name, most):
     monkeypatch.setattr(f"coview_kernels.{name}", most)
     with pytest.raises(MapError, match="--around X,Y,RADIUS"):
