@@ -46,7 +46,7 @@ _MARGIN = 1.1  # beyond the greatest number of the sample
 _MAX_SUM = 32_500.0  # of int16, with room for what rounding adds
 _MIN_PARALLEL = 4096  # stations from which other threads are worth waking
 _BEST, _PRODUCTS, _AT = range(3)  # launches
-_CHUNK = 16_384  # pairs of station and shift at a time
+_CHUNK = 4096  # pairs of station and shift at a time
 
 
 class Screen(NamedTuple):

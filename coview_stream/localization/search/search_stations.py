@@ -113,13 +113,16 @@ class _Squares:
 
 def _members(grid: StationGrid, stations: Ints, stride: int) -> Int32s:
     """Return the stations (K, n) of each square of ``stride`` blocks and level, a middle one first; -1 for none."""
-    cells, levels = grid.cells_of(stations), grid.levels_of(stations)
+    cells = grid.cells_of(stations)
     squares = cells // stride
-    beside = np.abs(cells - squares * stride - stride // 2).max(axis=1)
-    order = np.lexsort((beside, levels, squares[:, 1], squares[:, 0]))
-    keys = np.column_stack([squares, levels])[order]
-    begins = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
-    square = np.repeat(np.arange(len(begins)), np.diff(np.append(begins, len(order))))
+    beside = np.abs(cells - squares * stride - stride // 2).max(axis=1).astype(np.int8)
+    squares -= squares.min(axis=0)
+    levels = grid.levels_of(stations)
+    key = (squares[:, 0] * (int(squares[:, 1].max()) + 1) + squares[:, 1]) * (int(levels.max()) + 1) + levels
+    del cells, squares, levels  # of a million stations they are 16 MB each
+    order = np.lexsort((beside, key))
+    begins = np.flatnonzero(np.append(True, np.diff(key[order]) != 0))
+    square = np.repeat(np.arange(len(begins), dtype=np.int32), np.diff(np.append(begins, len(order))))
     place = np.arange(len(order)) - begins[square]
     members = np.full((len(begins), int(place.max()) + 1), -1, dtype=np.int32)
     members[square, place] = stations[order]
