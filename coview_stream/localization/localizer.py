@@ -27,7 +27,7 @@ from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer, OdometryCheck
 from coview_stream.localization.search.place_guess import PlaceGuess, has_ground
-from coview_stream.localization.search.pose_hints import PoseHints
+from coview_stream.localization.search.pose_hints import PoseHints, robot_position
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import Event, State, next_state
@@ -385,6 +385,8 @@ class Localizer:
         hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
         guesses = self._hints.guessed(self.base_map.origin, self._frames.anchor, frame.T_odom_body)
         area = self._hints.area
+        if area is not None:
+            hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
         if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
             self._restart_search(frame.stamp)
             return None

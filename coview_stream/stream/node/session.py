@@ -193,9 +193,13 @@ class Session:
             self._disconnected_at = now
 
     def restart_search(self, reason: str) -> None:
-        """Search from nothing in a new epoch: what came before no longer fits. Odometry that has come stays."""
+        """Search from nothing in a new epoch: what came before no longer fits. Odometry that has come stays.
+
+        So does what somebody has said of the place: the engine, which forgets it, is told again.
+        """
         with self._lock:
             self._epoch += 1
+            self._guess = self._said
             self.robot_state.restart_search(reason)
             self.counters.dropped += len(self._frame_sync)
             self._frame_sync = FrameSync(self.config, self.odometry, self.counters)

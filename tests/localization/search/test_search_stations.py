@@ -7,6 +7,7 @@ import pytest
 
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search import search_stations
 from coview_stream.localization.search.place_guess import PlaceGuess
@@ -104,3 +105,21 @@ def test_robot_is_found_within_a_circle_and_not_beside_it(world_map, world_drive
     localizer.guess_place(PlaceGuess(x_away, y_away, distance=5.0, within=50.0))
     last = world_drive.clouds[6], world_drive.T_odom_body[6]
     assert localizer.step(*last, 3.0).state is not State.TRACKING
+
+
+def test_localizer_that_does_not_search_chooses_no_stations(world_map, world_drive, monkeypatch):
+    """As the tracking engine's: the search is in another process."""
+    monkeypatch.setattr(SearchStations, "of", None)
+    localizer = Localizer(world_map)
+    assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0) is not None
+
+
+def test_hints_outside_the_circle_are_not_tried(world_map, world_drive):
+    x, y = (world_map.stations[0] + world_map.origin)[:2].tolist()
+    for away, tried in ((20.0, True), (70.0, False)):
+        localizer = Localizer(world_map)
+        localizer.hint_pose(pose_from(np.eye(3), [x + away, y, 1.0]))
+        localizer.guess_place(PlaceGuess(x, y, within=50.0))
+        request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+        assert len(request.hints) == tried
+        assert request.area == Circle(*(np.array([x, y]) - world_map.origin[:2]).tolist(), 50.0)

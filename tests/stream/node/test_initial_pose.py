@@ -66,7 +66,7 @@ def test_guess_goes_to_the_engine_with_one_frame():
     robot, guess = Robot(), PlaceGuess(1.0, 2.0)
     assert robot.session.guess_place(guess)
     assert robot.frame(0.0, unknown).guess is guess
-    assert robot.frame(1.0, unknown).guess is None
+    assert robot.frame(0.1, unknown).guess is None
 
 
 def test_guess_that_comes_while_the_place_is_known_is_not_taken():
@@ -82,3 +82,14 @@ def test_questions_and_messages_reach_the_session(pair):
     session = pair.sessions["r1"]
     pair.net.publish(sample(b'{"x": 5.0}'))
     assert any("initial poses of no use" in text for text in session.errors.texts)
+
+
+def test_guess_is_told_again_to_an_engine_that_begins_anew():
+    robot, guess = Robot(), PlaceGuess(1.0, 2.0, within=300.0)
+    assert robot.session.guess_place(guess)
+    assert robot.frame(0.0, unknown).guess is guess
+    robot.session.restart_search("odometry jumped")
+    assert robot.frame(0.1, unknown).guess is guess
+    assert robot.frame(0.2, unknown).guess is None
+    robot.session.relocalize()
+    assert robot.frame(0.3, unknown).guess is None
