@@ -6,7 +6,8 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Floats32, Indices, Ints, Reals
 
-_LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys; set by hand
+LEVEL_GAP = 2.5
+"""Metres: stations farther apart in height are on different storeys; set by hand."""
 
 
 class StationGrid:
@@ -50,7 +51,7 @@ class StationGrid:
         gap[levels < 0] = np.inf
         best = gap.argmin(axis=0)
         each = np.arange(levels.shape[1])
-        return np.where(gap[best, each] < _LEVEL_GAP, levels[best, each], -1).astype(np.intp)
+        return np.where(gap[best, each] < LEVEL_GAP, levels[best, each], -1).astype(np.intp)
 
     def levels_at(self, positions: Reals) -> Indices:
         """Return the stations (L, N), lowest first, in whose cells (N, 2 or 3) positions are; -1 for none."""
@@ -59,12 +60,6 @@ class StationGrid:
     def cells_of(self, chosen: Indices | slice) -> Ints:
         """Return column and row (N, 2) of the cells that stations stand in, counted from the map's zero."""
         return np.asarray(np.floor(self.stations[chosen, :2].astype(np.float64) / self.block), dtype=np.int64)
-
-    def levels_of(self, chosen: Indices) -> Ints:
-        """Return how many stations stand below each of some (N,) in its cell."""
-        column, row = (self.cells_of(chosen) - self._low).T
-        standing = self._levels[:, column * self._shape[1] + row]
-        return np.asarray((standing == chosen).argmax(axis=0), dtype=np.int64)
 
     def storeys(self, station: int) -> list[int]:
         """Return the stations of a station's cell, lowest first, itself among them."""

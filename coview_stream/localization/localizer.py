@@ -36,6 +36,7 @@ from coview_stream.localization.tracking.monitor import LossMonitor, RejectionRe
 from coview_stream.localization.tracking.tracker import Tracker
 
 _FOUND = np.diag(np.square([*np.radians([0.5, 0.5, 0.5]), 0.1, 0.1, 0.1]))  # of an accepted place; set by hand
+_BY_INDEX = ("exhaustive", "consensus")  # modes of retrieval and consensus
 _SMEARED = np.radians(1.0)  # keyframes that lean by less are not levelled again while searching; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
@@ -274,23 +275,31 @@ class Localizer:
         if not self.state.has_place:
             self._hints.robot_at(local)
 
-    def guess_place(self, guess: PlaceGuess) -> None:
+    def guess_place(self, guess: PlaceGuess, check: bool = True) -> None:
         """Have the search try, from the next frame on, where somebody says that the robot is.
 
         Never trusted: what is tried there is judged like what the descriptors name; but with ``guess.within`` nothing
-        outside of that circle is searched, until a place is accepted or another guess comes. Ignored while a place is
-        known.
+        outside of that circle, and of what is driven meanwhile, is searched, until a place is accepted, another guess
+        comes or the search begins anew (:meth:`restart`, :meth:`relocalize`). Ignored while a place is known.
+
+        Args:
+            guess: of the place.
+            check: refuse one of no use; without, nothing is found where the map has no ground in the circle.
 
         Raises:
-            InputError: the map has no ground there.
+            InputError: the map has no ground there, or stations are not compared by their index, which circles need.
         """
-        if not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
+        if guess.within is not None and (self.config.retrieval.mode, self.config.consensus.mode) != _BY_INDEX:
+            raise InputError("within: is for exhaustive retrieval and consensus, not for the paper's own modes")
+        if check and not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
             around = guess.within or guess.distance
             raise InputError(
                 f"guess {guess.x:.1f}, {guess.y:.1f}: the map has no ground within {around:g} m of it; "
                 "give coordinates of the frame of the map's sources (coview-stream info)"
             )
         if not self.state.has_place:
+            if guess.within is not None or self._hints.circle is not None:
+                self._next_epoch()  # what is being searched is not what is asked for now
             self._hints.guess(guess)
 
     def hint_calibration(self, known: Calibration) -> None:
@@ -384,13 +393,17 @@ class Localizer:
         assert self._frames.anchor is not None  # there is a frame
         hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
         guesses = self._hints.guessed(self.base_map.origin, self._frames.anchor, frame.T_odom_body)
-        area = self._hints.area
+        area = self._hints.area(self._frames.anchor, frame.T_odom_body)
         if area is not None:
             hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
         if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
             self._restart_search(frame.stamp)
             return None
         if keyframe is None:
+            return None
+        if area is not None and not area.holds(self.base_map.stations).any():
+            reason = "nothing is searched: the map has no ground in the circle that the robot is said to be in"
+            self._evidence = KeyframeEvidence(frame.stamp, self.state, reason)
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
         rays = RangeImage.rays(frame.cloud)

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
 from coview_kernels.launch import Launch
-from coview_kernels.mapped import Windows, take_rows
+from coview_kernels.mapped import Windows, copy_rows, take_rows
 from coview_kernels.similarity import unit_columns
 
 ANGLES = 60
@@ -124,7 +124,7 @@ class StationCodes:
     """M stations in 512 bytes each, and what it takes to compare a query with them.
 
     Attributes:
-        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only a window is held in memory.
+        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only some of it is held in memory.
         basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
         step: (16, 2, 16) float32 what one unit of int8 stands for, real and imaginary.
         norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
@@ -358,7 +358,6 @@ class _Kernels:
             launch.put(4, own.stop - own.start)
             launch()
             found[own] = self._products[: own.stop - own.start]
-        self._windows.release()
         return found
 
     def at(self, requests: Sequence[_Request]) -> list[F32]:
@@ -374,7 +373,6 @@ class _Kernels:
                 launch()
                 found[own] = self._values[:count]
             out.append(found)
-        self._windows.release()
         return out
 
     def _chunks(self, launch: Launch, stations: I32) -> Iterator[slice]:
@@ -384,7 +382,7 @@ class _Kernels:
             own = slice(start, min(start + _CHUNK, len(stations)))
             chosen = stations[own]
             if self._copied is not None:
-                self._codes.take(chosen, axis=0, out=self._copied[: len(chosen)], mode="clip")
+                copy_rows(self._codes, self._windows, np.maximum(chosen, 0), self._copied)
                 chosen = np.where(chosen < 0, -1, np.arange(len(chosen)))
             self._stations[: len(chosen)] = chosen
             yield own

@@ -67,6 +67,43 @@ def test_rows_are_copied_in_the_order_asked_for(windowed, tmp_path):
     assert take_rows(array[:0], rows[:0]).shape == (0, 5)
 
 
+def test_rows_that_are_not_there_are_refused(windowed, tmp_path):
+    array = stored(np.arange(50_000, dtype=np.int32).reshape(-1, 5), tmp_path / "a.npy")
+    for given in (array, np.array(array)):
+        with pytest.raises(IndexError):
+            take_rows(given, np.array([3, len(array)]))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_single_codes_of_a_large_file_take_little_memory(tmp_path, monkeypatch):
+    rng = np.random.default_rng(8)
+    codes = StationCodes.of([rng.random((300, 20, 60), dtype=np.float32)])
+    rows = np.lib.format.open_memmap(tmp_path / "codes.npy", "w+", np.int16, (400_000, 16, 16))  # 205 MB
+    rows[:] = codes.codes[0]
+    rows.flush()
+    del rows
+    file = StationCodes(
+        np.load(tmp_path / "codes.npy", mmap_mode="r"), codes.basis, codes.step, codes.norm, codes.sectors
+    )
+    assert Windows(file.codes).several
+    query = codes.query(rng.random((20, 60), dtype=np.float32))
+    monkeypatch.setattr(mapped, "_COPIED", 64)
+    before = most = resident_bytes()
+    release = Windows.release
+
+    def measured(self, part=None):
+        nonlocal most
+        most = max(most, resident_bytes())
+        release(self, part)
+
+    monkeypatch.setattr(Windows, "release", measured)
+    chosen = rng.integers(0, 400_000, 3000)
+    found = file.at(query, chosen, np.zeros(3000, dtype=np.int64))
+    np.testing.assert_allclose(found, codes.at(query, [0], [0])[0], atol=1e-6)
+    assert most - before < 40 << 20
+    assert resident_bytes() - before < 20 << 20
+
+
 def test_codes_of_a_file_answer_by_windows_as_those_in_memory_do(windowed, tmp_path):
     rng = np.random.default_rng(8)
     descriptors = [rng.random((300, 20, 60), dtype=np.float32) for _ in range(2)]

@@ -89,7 +89,7 @@ def _decode(raw: bytes) -> dict[str, npt.NDArray[Any]]:
             raise ValueError("it is too large or cut off")
         if entry.get("packing", "lzma") not in ("bz2", "lzma"):
             raise ValueError("an array is compressed in a way that is not known")
-        unpack = _from_bz2 if "packing" in entry and entry["packing"] == "bz2" else _from_lzma
+        unpack = _from_bz2 if entry.get("packing") == "bz2" else _from_lzma
         arrays[str(entry["name"])] = unpack(raw[at : at + length], wanted, dtype).reshape(shape)
         at += length
     if at != len(raw):

@@ -20,7 +20,8 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import MapError
 
 FORMAT = "coview-site"
-VERSION = 1
+VERSION = 2
+"""Of what is written; layers of sites of version 1, compressed otherwise, are read as well."""
 FILE = "manifest.json"
 LAYERS = ("cloud", "stations", "features")
 """Layers of a tile: its points with normals, its stations, and learned features, which need not be there."""
@@ -87,6 +88,7 @@ class Manifest:
         tiles: by row and column.
         signer: fingerprint of the key that it is signed with; empty for none.
         signature: hexadecimal; empty for none.
+        version: of the format.
     """
 
     origin: tuple[float, float, float]
@@ -96,6 +98,7 @@ class Manifest:
     tiles: tuple[TileEntry, ...] = field(repr=False)
     signer: str = ""
     signature: str = ""
+    version: int = VERSION
 
     @property
     def sha256(self) -> str:
@@ -114,7 +117,7 @@ class Manifest:
     def _content(self) -> bytes:
         plain = asdict(replace(self, signer="", signature=""))
         del plain["signer"], plain["signature"]
-        return json.dumps({"format": FORMAT, "version": VERSION} | plain, sort_keys=True, allow_nan=False).encode()
+        return json.dumps({"format": FORMAT} | plain, sort_keys=True, allow_nan=False).encode()
 
     def signed(self, key: SigningKey) -> Manifest:
         """Return it with a signature."""
@@ -159,8 +162,10 @@ class Manifest:
             data = json.loads(raw)
             if not isinstance(data, dict) or data.get("format") != FORMAT:
                 raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
-            if data.get("version") != VERSION:
-                raise MapError(f"{name}: is of version {str(data.get('version'))[:20]}, this program reads {VERSION}")
+            if data.get("version") not in (1, VERSION):
+                raise MapError(
+                    f"{name}: is of version {str(data.get('version'))[:20]}, this program reads {VERSION} and 1"
+                )
             return _manifest(data)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             reason = " ".join(str(error).split())[:120]
@@ -219,7 +224,8 @@ def _manifest(data: dict[str, Any]) -> Manifest:
     tiles = tuple(_tile(each) for each in data["tiles"])
     if len({(each.column, each.row) for each in tiles}) != len(tiles):
         raise ValueError("a tile is named twice")
-    return Manifest(origin, tile, crs, parameters, tiles, str(data.get("signer", "")), str(data.get("signature", "")))
+    signed = str(data.get("signer", "")), str(data.get("signature", ""))
+    return Manifest(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
 
 
 def _tile(data: dict[str, Any]) -> TileEntry:

@@ -10,7 +10,6 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
-from coview_stream.geometry.circle import Circle
 from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.evidence.observed_scan import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -61,7 +60,6 @@ class GlobalSearch:
         self._index = index
         self._scorer = PlaceScorer(base_map)
         self._epoch = Epoch()
-        self._area: Circle | None = None
         self.clear()
 
     @property
@@ -106,10 +104,10 @@ class GlobalSearch:
             self.coview.last_query = {}
 
     def update(self, request: SearchRequest) -> SearchResult:
-        """Search the map for one keyframe; one of another epoch or area, or after an acceptance, starts anew."""
-        if (request.epoch, request.area) != (self._epoch, self._area):
+        """Search the map for one keyframe; a request of another epoch, or one after an acceptance, starts anew."""
+        if request.epoch != self._epoch:
             self.clear()
-            self._epoch, self._area = request.epoch, request.area
+            self._epoch = request.epoch
         scan = ScanInput(
             prepare_scan(request.submap, request.position, self.config.registration), request.cloud, request.T_odom_body
         )

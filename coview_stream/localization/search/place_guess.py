@@ -1,7 +1,11 @@
-"""Guess of where a robot is, by somebody who may be wrong: more places for the search to try, none of them trusted."""
+"""Guess of where a robot is, by somebody who may be wrong: more places for the search to try, none of them trusted.
+
+Only a circle that goes with it is: nothing outside of that is searched.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +42,7 @@ class PlaceGuess:
         map: name of the one of several maps in whose frame it is; None of one map.
         within: metres around it outside of which nothing is searched; None: all of the map is. Unlike the rest this
             is trusted: of a robot that is elsewhere no place is found.
+        begin, end: of x, beyond which ``within`` does not reach: where one of several maps ends.
     """
 
     x: float
@@ -47,6 +52,8 @@ class PlaceGuess:
     angle: float = float(np.radians(30.0))
     map: str | None = None
     within: float | None = None
+    begin: float = -math.inf
+    end: float = math.inf
 
     def __post_init__(self) -> None:
         numbers = (self.x, self.y, 0.0 if self.yaw is None else self.yaw)
@@ -79,7 +86,8 @@ class PlaceGuess:
         """Return the circle, about the map's ``origin`` (3,), outside of which nothing is searched; None for none."""
         if self.within is None:
             return None
-        return Circle(self.x - float(origin[0]), self.y - float(origin[1]), self.within)
+        x, y = float(origin[0]), float(origin[1])
+        return Circle(self.x - x, self.y - y, self.within, self.begin - x, self.end - x)
 
     def transforms(self, origin: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` (4, 4), level, about the map's ``origin`` (3,), heights left open (0).

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from coview_stream.localization.search.place_guess import PlaceGuess
 
 _TRIES = 5  # keyframes in a row that must refute all hints before they are tried less often; set by hand
 _PAUSE = 4  # keyframes between two tries then; set by hand
+_GROWTH = 1.25  # of the radius of a circle, from step to step and at first: no step within a quarter of it; set by hand
 
 FROM_THERE = " (from the last known place)"
 """What an evidence's reason ends with where the best hypothesis began as a hint."""
@@ -26,7 +29,7 @@ class PoseHints:
     another anchor. Map coordinates are the map's own.
 
     Attributes:
-        area: of the map, metres from its zero, outside of which nothing is to be searched; None for none.
+        circle: of the map, metres from its zero, that the robot was said to be in; None for none.
     """
 
     def __init__(self) -> None:
@@ -35,12 +38,13 @@ class PoseHints:
         self._led: tuple[Pose, ...] = ()
         self._guess: PlaceGuess | None = None  # of the place at the next frame
         self._guessed: tuple[Pose, ...] = ()
-        self.area: Circle | None = None
+        self.circle: Circle | None = None
+        self._said_at = np.zeros(3)  # where odometry had the robot then
 
     def clear(self) -> None:
         """Forget them all: a place has been accepted."""
         self._awaited, self._known, self._led = None, (), ()
-        self._guess, self._guessed, self.area = None, (), None
+        self._guess, self._guessed, self.circle = None, (), None
 
     def guess(self, guess: PlaceGuess) -> None:
         """Have a guess of the place at the next frame tried, in place of an earlier one."""
@@ -58,8 +62,19 @@ class PoseHints:
             guess, self._guess = self._guess, None
             away = pose_from(np.eye(3), -anchor)
             self._guessed = tuple(T @ away for T in guess.transforms(origin, T_odom_body))
-            self.area = guess.area(origin)
+            self.circle, self._said_at = guess.area(origin), anchor + T_odom_body[:3, 3]
         return tuple(T @ pose_from(np.eye(3), anchor) for T in self._guessed)
+
+    def area(self, anchor: Floats, T_odom_body: Pose) -> Circle | None:
+        """Return the circle that the robot is in now, if it was in the one that was said: wider by what it has driven.
+
+        It grows in steps, for the votes so far go with each. The arguments are as for :meth:`about`.
+        """
+        if self.circle is None:
+            return None
+        moved = float(np.linalg.norm(anchor + T_odom_body[:3, 3] - self._said_at))
+        steps = math.ceil(math.log(1.0 + moved / self.circle.radius, _GROWTH))
+        return replace(self.circle, radius=self.circle.radius * _GROWTH ** max(1, steps))
 
     def robot_at(self, T_map_body: Pose) -> None:
         """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""

@@ -68,12 +68,17 @@ class Retrieval:
     def compared(self, area: Circle | None = None) -> SearchStations:
         """Return the stations that votes compare: of the map, or within a circle, metres from the map's zero.
 
-        ``ring_key`` mode compares all of them, whatever the circle.
+        Raises:
+            ValueError: a circle without any, or in ``ring_key`` mode.
         """
-        if area is None or self.config.mode != "exhaustive":
+        if area is None:
             return self._whole
+        if self.config.mode != "exhaustive":
+            raise ValueError("circles are compared in exhaustive mode only")
         grid = self.stations.station_grid
         chosen = np.flatnonzero(area.holds(grid.stations))
+        if not len(chosen):
+            raise ValueError("no station in the circle")
         return SearchStations.of(self.stations.station_index, grid, chosen)
 
     @cached_property
@@ -90,7 +95,7 @@ class Retrieval:
             compared: as :meth:`compared` returns them; None for those of the map.
         """
         if self.config.mode == "exhaustive":
-            return CoViewVote(centre, (compared or self._whole).index, query)
+            return CoViewVote(centre, (self._whole if compared is None else compared).index, query)
         return TableVote.of_distances(centre, self.distances(query).values())
 
     def distances(self, query: Mapping[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:

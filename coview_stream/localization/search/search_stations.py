@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coview_kernels import StationCodes
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.station_grid import LEVEL_GAP, StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.geometry.arrays import Floats32, Int32s, Ints
 from coview_stream.localization.search.consensus import Hypothesis
@@ -112,14 +112,18 @@ class _Squares:
 
 
 def _members(grid: StationGrid, stations: Ints, stride: int) -> Int32s:
-    """Return the stations (K, n) of each square of ``stride`` blocks and level, a middle one first; -1 for none."""
+    """Return the stations (K, n) of each square of ``stride`` blocks and storey, a middle one first; -1 for none."""
     cells = grid.cells_of(stations)
     squares = cells // stride
     beside = np.abs(cells - squares * stride - stride // 2).max(axis=1).astype(np.int8)
     squares -= squares.min(axis=0)
-    levels = grid.levels_of(stations)
-    key = (squares[:, 0] * (int(squares[:, 1].max()) + 1) + squares[:, 1]) * (int(levels.max()) + 1) + levels
-    del cells, squares, levels  # of a million stations they are 16 MB each
+    key = squares[:, 0] * (int(squares[:, 1].max()) + 1) + squares[:, 1]
+    del cells, squares  # of a million stations they are 16 MB each
+    height = grid.stations[stations, 2]
+    order = np.lexsort((height, key))
+    # a storey ends where nothing stands for a while; by heights, as cells may lack the one below
+    change = (np.diff(key[order]) != 0) | (np.diff(height[order]) >= LEVEL_GAP)
+    key[order] = np.cumsum(np.append(0, change))
     order = np.lexsort((beside, key))
     begins = np.flatnonzero(np.append(True, np.diff(key[order]) != 0))
     square = np.repeat(np.arange(len(begins), dtype=np.int32), np.diff(np.append(begins, len(order))))

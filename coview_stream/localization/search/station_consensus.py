@@ -32,7 +32,9 @@ class StationConsensus:
         return 0 if self._consensus is None else len(self._consensus)
 
     def clear(self) -> None:
-        """Forget all votes."""
+        """Forget all votes, and what was copied of a circle."""
+        if self._area is not None:
+            self._area = self._compared = self._consensus = None
         if self._consensus is not None:
             self._consensus.clear()
 

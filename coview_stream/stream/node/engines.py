@@ -14,7 +14,7 @@ from typing import Protocol
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.trust import Trust
 from coview_stream.config import LocalizerConfig
-from coview_stream.errors import InputError, MapError, RunError
+from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -97,8 +97,7 @@ class TrackEngine:
             with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
                 localizer.hint_pose(job.hint)
         if job.guess is not None:
-            with contextlib.suppress(InputError):  # likewise: the node's answer has told already
-                localizer.guess_place(job.guess)
+            localizer.guess_place(job.guess, check=False)  # the node has said that it is taken
         points = job.points
         if job.times is not None and job.segment is not None:
             known = localizer.calibration

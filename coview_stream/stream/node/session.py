@@ -195,11 +195,12 @@ class Session:
     def restart_search(self, reason: str) -> None:
         """Search from nothing in a new epoch: what came before no longer fits. Odometry that has come stays.
 
-        So does what somebody has said of the place: the engine, which forgets it, is told again.
+        So does what somebody has guessed: the engine, which forgets it, is told again. A circle does not, for nobody
+        knows how far the robot has come.
         """
         with self._lock:
             self._epoch += 1
-            self._guess = self._said
+            self._guess = self._said = _without_circle(self._said)
             self.robot_state.restart_search(reason)
             self.counters.dropped += len(self._frame_sync)
             self._frame_sync = FrameSync(self.config, self.odometry, self.counters)
@@ -217,7 +218,7 @@ class Session:
         """Forget everything, counters, odometry and the last known pose too."""
         with self._lock:
             self._hint.forget()
-            self._said = None
+            self._guess = self._said = None
             self._clear()
 
     def hint_pose(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
@@ -263,8 +264,9 @@ class Session:
             InputError: one of several maps has to be named, and none of that name is there.
         """
         if self.parts is not None:
-            shift = self.parts.named(guess.map).shift
-            guess = replace(guess, x=guess.x + shift[0], y=guess.y + shift[1], map=None)
+            part = self.parts.named(guess.map)
+            x, y = guess.x + part.shift[0], guess.y + part.shift[1]
+            guess = replace(guess, x=x, y=y, map=None, begin=part.begin, end=part.end)
         with self._lock:
             if self.robot_state.correction is not None:
                 return False
@@ -285,7 +287,7 @@ class Session:
                 self.odometry.continue_from(old.odometry)
                 self._cloud_at = old._cloud_at
         with self._lock:
-            self._guess = self._said = said  # it may be on this map only
+            self._guess = self._said = _without_circle(said)  # it may be on this map only
             self._hint.forgotten = forgotten
             if T_map_body is not None:
                 self._hint.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
@@ -473,3 +475,7 @@ class Session:
     def _record_state(self) -> None:
         """Add the state to the history, wherever it may have changed."""
         self.history.add(*self.state(), self.robot_state.last_frame_ns, self.robot_state.evidence)
+
+
+def _without_circle(said: PlaceGuess | None) -> PlaceGuess | None:
+    return None if said is None else replace(said, within=None)

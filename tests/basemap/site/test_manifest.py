@@ -24,10 +24,19 @@ def test_manifest_comes_back_with_the_same_hash(tmp_path):
     assert (found.nbytes, found.hashes()) == (198, {SHA})
 
 
+def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
+    before = replace(SITE, version=1)
+    before.save(tmp_path)
+    found = Manifest.load(tmp_path)
+    assert found == before
+    assert found.sha256 == before.sha256 != SITE.sha256
+    assert json.loads((tmp_path / "manifest.json").read_bytes())["version"] == 1
+
+
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (("format",), "x"), (("version",), 2), (("origin",), [1, 2]), (("tile",), "a"), (("tile",), 0.1),
+        (("format",), "x"), (("version",), 3), (("origin",), [1, 2]), (("tile",), "a"), (("tile",), 0.1),
         (("tiles", 0, "column"), 1.5), (("tiles", 0, "row"), True), (("tiles", 0, "points"), -1),
         (("tiles", 0, "layers", "cloud", "sha256"), "../../etc/passwd"),
         (("tiles", 0, "layers", "cloud", "bytes"), 1 << 40), (("tiles", 0, "layers"), {}),

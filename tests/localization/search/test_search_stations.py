@@ -6,13 +6,20 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.config import ConsensusConfig, LocalizerConfig, RetrievalConfig
+from coview_stream.errors import InputError
 from coview_stream.geometry.circle import Circle
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search import search_stations
+from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.pose_hints import PoseHints
 from coview_stream.localization.search.search_stations import SearchStations
 from coview_stream.localization.state import State
+from coview_stream.stream.node.engines import TrackEngine
+from coview_stream.stream.node.jobs import FrameJob
 
 
 @pytest.fixture
@@ -41,12 +48,18 @@ def test_every_station_is_in_one_square_and_its_middle_stands_for_it(few_are_man
 
 def test_storeys_have_squares_of_their_own(few_are_many, world_map):
     ground = world_map.stations[:80]
-    above = ground + np.array([0, 0, 4], dtype=np.float32)
-    grid = StationGrid(np.concatenate([ground, above[::2]]), world_map.config.block)
-    members = search_stations._members(grid, np.arange(len(grid)), 3)
-    heights = np.where(members < 0, np.nan, grid.stations[members, 2])
-    assert np.nanmax(np.nanmax(heights, axis=1) - np.nanmin(heights, axis=1)) < 3.0
-    np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(grid)))
+    above = ground + np.array([0, 0, 6], dtype=np.float32)
+    for lower, upper in ((ground, above[::2]), (ground[::2], above), (ground[::3], above[1::2])):
+        grid = StationGrid(np.concatenate([lower, upper]), world_map.config.block)
+        members = search_stations._members(grid, np.arange(len(grid)), 3)
+        heights = np.where(members < 0, np.nan, grid.stations[members, 2])
+        assert np.nanmax(np.nanmax(heights, axis=1) - np.nanmin(heights, axis=1)) < 3.0
+        np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(grid)))
+        # each of them is found at its height by the one that stands for it
+        coarse = StationGrid(grid.stations[members[:, 0]], 3 * grid.block)
+        found = coarse.at(grid.stations)
+        assert (found >= 0).all()
+        assert (np.abs(coarse.stations[found, 2] - grid.stations[:, 2]) < 3.0).all()
 
 
 def test_blocks_of_a_square_s_size_stand_for_themselves(few_are_many, world_map):
@@ -98,13 +111,8 @@ def test_robot_is_found_within_a_circle_and_not_beside_it(world_map, world_drive
             np.testing.assert_allclose(fix.T_map_body[:3, 3], plain.T_map_body[:3, 3], atol=0.1)
     away = world_map.stations[np.linalg.norm(world_map.stations[:, :2] - (x, y), axis=1).argmax()] + world_map.origin
     away[:2] += 45.0 * (away[:2] - (x, y)) / np.linalg.norm(away[:2] - (x, y))
-    localizer = Localizer(world_map)
-    there = driven(localizer, world_drive, PlaceGuess(*away[:2].tolist(), within=50.0))
+    there = driven(Localizer(world_map), world_drive, PlaceGuess(*away[:2].tolist(), within=50.0))
     assert all(fix.T_map_body is None for fix in there)
-    x_away, y_away = away[:2].tolist()
-    localizer.guess_place(PlaceGuess(x_away, y_away, distance=5.0, within=50.0))
-    last = world_drive.clouds[6], world_drive.T_odom_body[6]
-    assert localizer.step(*last, 3.0).state is not State.TRACKING
 
 
 def test_localizer_that_does_not_search_chooses_no_stations(world_map, world_drive, monkeypatch):
@@ -122,4 +130,61 @@ def test_hints_outside_the_circle_are_not_tried(world_map, world_drive):
         localizer.guess_place(PlaceGuess(x, y, within=50.0))
         request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
         assert len(request.hints) == tried
-        assert request.area == Circle(*(np.array([x, y]) - world_map.origin[:2]).tolist(), 50.0)
+        assert request.area == Circle(*(np.array([x, y]) - world_map.origin[:2]).tolist(), 62.5)
+
+
+def test_circle_grows_with_what_the_robot_drives():
+    hints, anchor, body = PoseHints(), np.array([100.0, 50.0, 0.0]), np.eye(4)
+    assert hints.area(anchor, body) is None
+    hints.guess(PlaceGuess(10.0, 20.0, within=80.0))
+    hints.guessed(np.zeros(3), anchor, body)
+    for metres, radius in ((0.0, 100.0), (19.0, 100.0), (30.0, 125.0), (400.0, 80.0 * 1.25**9)):
+        body[0, 3] = metres
+        assert hints.area(anchor, body) == Circle(10.0, 20.0, pytest.approx(radius))
+        assert radius >= 80.0 + metres
+        moved = body.copy()
+        moved[:3, 3] += (5.0, -4.0, 0.0)
+        assert hints.area(anchor - (5.0, -4.0, 0.0), moved) == hints.area(anchor, body)  # another anchor
+
+
+def test_circle_without_ground_is_searched_by_nothing(world_map, world_drive):
+    guess = PlaceGuess(9000.0, 9000.0, within=60.0)
+    localizer = Localizer(world_map)
+    with pytest.raises(InputError, match="no ground within 60 m"):
+        localizer.guess_place(guess)
+    engine = TrackEngine(world_map)
+    job = FrameJob("r1", 0, 0, world_drive.clouds[0], world_drive.T_odom_body[0], guess=guess)
+    result = engine.run(job)
+    assert result.request is None
+    assert "no ground in the circle" in result.fix.evidence.reason
+    assert result.fix.state is State.SEARCHING
+
+
+@pytest.mark.parametrize("lifted", [False, True])
+def test_result_of_a_search_from_before_the_circle_is_not_taken(world_map, world_drive, lifted):
+    localizer = Localizer(world_map)
+    search = GlobalSearch(world_map, localizer.config, LocalMaps(world_map, 50.0))
+    x, y = (world_map.stations[0] + world_map.origin)[:2].tolist()
+    if lifted:
+        localizer.guess_place(PlaceGuess(x, y, within=500.0))
+    frames = zip(world_drive.clouds, world_drive.T_odom_body, range(6), strict=False)
+    requests = [localizer.add_frame(cloud, T, 0.5 * k) for cloud, T, k in frames]
+    results = [search.update(each) for each in requests if each is not None]
+    assert any(result.accepted is not None for result in results)
+    localizer.guess_place(PlaceGuess(x, y, within=None if lifted else 500.0))
+    for result in results:
+        localizer.apply_search_result(result)
+    assert localizer.state is not State.TRACKING
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        LocalizerConfig(retrieval=RetrievalConfig(mode="ring_key")),
+        LocalizerConfig(consensus=ConsensusConfig(mode="single")),
+    ],
+)
+def test_circle_in_the_paper_s_modes_is_refused(world_map, config):
+    x, y = (world_map.stations[0] + world_map.origin)[:2].tolist()
+    with pytest.raises(InputError, match="exhaustive"):
+        Localizer(world_map, config).guess_place(PlaceGuess(x, y, within=60.0))

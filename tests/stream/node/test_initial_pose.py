@@ -89,7 +89,15 @@ def test_guess_is_told_again_to_an_engine_that_begins_anew():
     assert robot.session.guess_place(guess)
     assert robot.frame(0.0, unknown).guess is guess
     robot.session.restart_search("odometry jumped")
-    assert robot.frame(0.1, unknown).guess is guess
+    assert robot.frame(0.1, unknown).guess == PlaceGuess(1.0, 2.0)  # how far it is from the circle is not known
     assert robot.frame(0.2, unknown).guess is None
     robot.session.relocalize()
     assert robot.frame(0.3, unknown).guess is None
+
+
+@pytest.mark.parametrize("forget", ["reset", "relocalize", "give_up"])
+def test_guess_that_waits_is_forgotten_with_the_rest(forget):
+    robot = Robot()
+    assert robot.session.guess_place(PlaceGuess(1.0, 2.0, within=300.0))
+    getattr(robot.session, forget)()
+    assert robot.frame(0.0, unknown).guess is None

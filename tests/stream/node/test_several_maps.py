@@ -72,6 +72,10 @@ def test_places_that_a_search_considers_are_each_on_a_map(robot):
 
 def test_guess_names_its_map(robot):
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, map="west"))
+    assert robot.session.guess_place(PlaceGuess(1.0, 2.0, map="west", within=1e6))
+    part, area = robot.session.parts.named("west"), robot.session._guess.area(np.zeros(3))
+    beside = np.array([[part.begin + 1.0, 2.0], [part.end - 1.0, 2.0], [part.begin - 1.0, 2.0], [part.end + 1.0, 2.0]])
+    np.testing.assert_array_equal(area.holds(beside), [True, True, False, False])
     taken = robot.session._guess
     assert (taken.x, taken.y, taken.map) == (1.0 + WEST[0], 2.0 + WEST[1], None)
     with pytest.raises(InputError, match="no map is named: this node has west, east"):
