@@ -194,7 +194,7 @@ class StationIndex:
         return self.at_all([(query, stations, shifts)])[0]
 
     def at_all(self, requests: Sequence[tuple[ScoredQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[Floats32]:
-        """Return what :meth:`at` does of each request; the index of a large map is gone through once for all."""
+        """Return what :meth:`at` does of each request."""
         out = self.codes.at_all([(query.coded, stations, shifts) for query, stations, shifts in requests])
         out = [np.float32(query.zero) - one for (query, *_), one in zip(requests, out, strict=True)]
         if self.rest is not None:

@@ -1,10 +1,16 @@
-"""``coview-stream convert``: a map in one file from a directory of tiles, and the other way round."""
+"""``coview-stream convert``: a map in one file from a directory of tiles, the other way round, and a light copy."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.site.manifest import Manifest
 
 HELP = "make one .coview file of a directory of tiles, or a directory of a file"
 
@@ -12,7 +18,12 @@ HELP = "make one .coview file of a directory of tiles, or a directory of a file"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("map", type=Path, metavar="FROM", help="SITE.coview, or the directory of a site")
-    parser.add_argument("output", type=Path, metavar="TO", help="the other of them")
+    parser.add_argument("output", type=Path, metavar="TO", help="the other of them; with --light, a directory")
+    parser.add_argument(
+        "--light",
+        action="store_true",
+        help="from a directory to another: one point of each half metre, no features, for robots that fetch it",
+    )
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign it with this private key (keygen)")
 
 
@@ -21,28 +32,46 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.signature import SigningKey
+    from coview_stream.basemap.site.light import lighten
     from coview_stream.basemap.site.split import join, split
-    from coview_stream.errors import naming_missing_libraries
+    from coview_stream.errors import ConfigError
 
     key = None if args.sign is None else SigningKey(args.sign)
-    with naming_missing_libraries("coview-stream convert", "node"):
-        from tqdm import tqdm
-    if args.map.is_dir():
+    if args.light and not args.map.is_dir():
+        raise ConfigError(f"{args.map}: is no directory of tiles; convert it to one first, then that with --light")
+    if args.light:
+        with _bar() as step:
+            site = lighten(args.map, args.output, key, step)
+        _tell(args.output, site)
+    elif args.map.is_dir():
         file_format.check_target(args.output)
-        with tqdm(desc="converting", unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
-
-            def step(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
+        with _bar() as step:
             sha256 = join(args.map, args.output, key, step)
         print(f"{args.output}: {args.output.stat().st_size} bytes, sha256 {sha256[:12]}")
-        return 0
-    base_map = BaseMap.load(args.map)
-    site = split(base_map.arrays, base_map.parameters, args.output, key)
+    else:
+        base_map = BaseMap.load(args.map)
+        _tell(args.output, split(base_map.arrays, base_map.parameters, args.output, key))
+    return 0
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[int, int], None]]:
+    from coview_stream.errors import naming_missing_libraries
+
+    with naming_missing_libraries("coview-stream convert", "node"):
+        from tqdm import tqdm
+    with tqdm(desc="converting", unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield step
+
+
+def _tell(output: Path, site: Manifest) -> None:
     area = max(1, sum(tile.area for tile in site.tiles))
     print(
-        f"{args.output}: {len(site.tiles)} tiles of {site.tile:g} m, {site.nbytes} bytes, "
+        f"{output}: {len(site.tiles)} tiles of {site.tile:g} m, {site.nbytes} bytes, "
         f"{site.nbytes / area:.0f} MB per km2; manifest {site.sha256[:12]}"
     )
-    return 0

@@ -160,7 +160,8 @@ def locate(
 ) -> RunResult:
     """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
 
-    A frame that cannot be read is skipped and noted. ``guess``, of the place at the first frame, is tried, not trusted.
+    A frame that cannot be read is skipped and noted. ``guess``, of the place at the first frame, is tried, not trusted
+    but for its circle.
 
     Raises:
         InputError: not one frame could be used; the message ends with the first frame's. Or the map has no ground where

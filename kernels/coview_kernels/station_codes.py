@@ -266,7 +266,7 @@ class StationCodes:
         return self.at_all([(query, stations, shifts)])[0]
 
     def at_all(self, requests: Sequence[tuple[CodedQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[F32]:
-        """Return what :meth:`at` does of each request; large memory maps are gone through once for all of them."""
+        """Return what :meth:`at` does of each request; of a large file little is in memory at a time."""
         plain = []
         for query, stations, shifts in requests:
             index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))

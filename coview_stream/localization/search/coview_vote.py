@@ -57,5 +57,5 @@ class CoViewVote:
         return np.float32(self._query.screen_zero) - codes.at(self._query.coded, stations, shifts)
 
     def at_all(self, requests: Sequence[Request[CoViewVote]]) -> list[Floats32]:
-        """Return what :meth:`at` of each does, in one go through the index."""
+        """Return what :meth:`at` of each does."""
         return self._index.at_all([(vote._query, stations, shifts) for vote, stations, shifts in requests])

@@ -1,0 +1,77 @@
+"""Light copies of sites: fewer points where they were, the same cells occupied, no features."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.site.light import CUBE, lighten, one_of_each_cube
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.cli import main
+from coview_stream.errors import MapError
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+
+
+def test_each_cube_keeps_the_point_nearest_to_its_mean():
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-3.0, 3.0, (2000, 3)).astype(np.float32)
+    chosen = one_of_each_cube(points)
+    assert (np.diff(chosen) > 0).all()
+    cells = np.floor(points / CUBE).astype(int)
+    for cell in np.unique(cells, axis=0):
+        inside = np.flatnonzero((cells == cell).all(axis=1))
+        away = np.linalg.norm(points[inside] - points[inside].mean(axis=0), axis=1)
+        kept = np.intersect1d(chosen, inside)
+        assert len(kept) == 1
+        assert np.linalg.norm(points[kept[0]] - points[inside].mean(axis=0)) == pytest.approx(away.min(), abs=1e-5)
+    assert len(one_of_each_cube(points[:0])) == 0
+
+
+def test_light_copy_is_a_site_of_fewer_points_with_the_same_cells(site, cache, tmp_path):
+    before = Manifest.load(site)
+    light = lighten(site, tmp_path / "light")
+    assert light == Manifest.load(tmp_path / "light")
+    assert light.parameters["light"] == {"cube": CUBE, "of": before.sha256}
+    assert light.nbytes < 0.7 * before.nbytes
+    assert [tile.stations for tile in light.tiles] == [tile.stations for tile in before.tiles]
+    whole, few = BaseMap.load(site), BaseMap.load(tmp_path / "light")
+    np.testing.assert_array_equal(few.stations, whole.stations)
+    from scipy.spatial import cKDTree
+
+    assert cKDTree(whole.points).query(few.points)[0].max() < 0.04
+    cells = [set(map(tuple, np.floor(each.points / CUBE).astype(int).tolist())) for each in (whole, few)]
+    assert len(few.points) == len(cells[1]) == len(cells[0])
+    assert len(cells[1] - cells[0]) < 0.02 * len(cells[0])  # rounded over a border
+    assert lighten(site, tmp_path / "again").sha256 == light.sha256
+    assert lighten(site, tmp_path / "light").sha256 == light.sha256  # in its place
+
+
+def test_robot_is_found_on_a_light_copy(site, cache, tmp_path, world_drive):
+    from coview_stream import Localizer
+
+    lighten(site, tmp_path / "light")
+    localizer = Localizer(BaseMap.load(tmp_path / "light"))
+    steps = zip(world_drive.clouds, world_drive.T_odom_body, range(8), strict=False)
+    fixes = [localizer.step(cloud, T, 0.5 * k) for cloud, T, k in steps]
+    found = [(fix, T) for fix, T in zip(fixes, world_drive.T_map_body, strict=False) if fix.T_map_body is not None]
+    assert found
+    for fix, T in found:
+        off = fix.T_map_body[:3, 3] - (512_003.0, 5_120_005.0, 100.0) - T[:3, 3]
+        assert np.linalg.norm(off) < 0.3
+
+
+def test_light_copy_is_made_from_a_directory_to_another(site, tmp_path, capsys):
+    with pytest.raises(MapError, match="the site itself"):
+        lighten(site, site)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert main(["convert", str(site), str(tmp_path / "full"), "--light"]) == 2
+    assert main(["convert", str(tmp_path / "none.coview"), str(tmp_path / "light"), "--light"]) == 2
+    assert "is no directory of tiles" in capsys.readouterr().err
+    assert main(["convert", str(site), str(tmp_path / "light"), "--light"]) == 0
+    assert "MB per km2" in capsys.readouterr().out
