@@ -39,7 +39,7 @@ def is_reason(node):
         return getattr(node.func, "attr", getattr(node.func, "id", "")) in CALLS
     if isinstance(node, ast.Assign):
         names = [ast.unparse(target).lower() for target in node.targets]
-        return any("reason" in name or name in ("from_there", "by_features") for name in names)
+        return any("reason" in name or name in ("from_there", "by_features", "in_circle") for name in names)
     return isinstance(node, ast.AugAssign | ast.NamedExpr) and "reason" in ast.unparse(node.target)
 
 

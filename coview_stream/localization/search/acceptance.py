@@ -21,6 +21,9 @@ from coview_stream.localization.state import State
 BY_FEATURES = " (by learned features)"
 """What an evidence's reason ends with where learned features have named the best hypothesis."""
 
+IN_CIRCLE = " (searched in the circle given)"
+"""What a reason for no pose contains where nothing outside of a circle was searched."""
+
 
 @dataclass(frozen=True)
 class SearchResult:
@@ -63,6 +66,8 @@ def decide(
         undecided: metres between poses of the first place that are as probable; 0 if one is more probable than all.
     """
     state, reason = _verdict(scored, leader, rule, undecided)
+    if request.area is not None and state is not State.TRACKING:
+        reason += IN_CIRCLE
     if not scored.places:
         evidence = KeyframeEvidence(request.stamp, state, reason)
         return _result(request, None, evidence, scored.rivals)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_up_places import REQUEST, RULE, candidate, judged, moved, place
 
-from coview_stream.localization.search.acceptance import BY_FEATURES
+from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.circle import Circle
+from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, decide
 from coview_stream.localization.search.pose_hints import FROM_THERE
+from coview_stream.localization.search.scoring import Rivals, Scored
 from coview_stream.localization.state import State
 
 
@@ -126,3 +130,14 @@ def test_hint_alone_is_not_accepted_before_votes_have_named_rivals():
     assert result.evidence.state is State.AMBIGUOUS
     assert "no vote" in result.evidence.reason
     assert judged(hint, beside, place(0.0, moved(20)), error=1e-6).accepted is not None
+
+
+def test_reason_says_that_a_circle_was_searched_unless_there_is_a_pose():
+    request = replace(REQUEST, area=Circle(0.0, 0.0, 80.0))
+    scored = Scored(Rivals.none(), [], error=1.0)
+    assert decide(scored, None, request, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
+    assert not decide(scored, None, REQUEST, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
+    best = place(1.0)
+    found = decide(Scored(Rivals.none(), [best], error=1e-9, none=0.0), candidate(best), request, AcceptanceConfig())
+    assert found.evidence.state is State.TRACKING
+    assert IN_CIRCLE not in found.evidence.reason
