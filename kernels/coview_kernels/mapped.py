@@ -16,8 +16,6 @@ LARGE = 1 << 26
 """Bytes from which an array is used by windows, set by hand: each pass through it costs time, about an eighth of a
 second for a gigabyte (``python -m bench scale``)."""
 
-_COPIED = 512  # rows copied at a time: 32 MB are mapped for them at most; set by hand
-
 _CAN_RELEASE = hasattr(mmap.mmap, "madvise") and hasattr(mmap, "MADV_DONTNEED")
 
 
@@ -45,9 +43,9 @@ class Windows:
         """Return the numbers of the windows that rows are in."""
         return rows.astype(np.int64) // max(1, self._step)
 
-    def release(self, part: slice | None = None) -> None:
-        """Release all of it, or some rows."""
-        self._release(part or slice(0, self._rows))
+    def release(self) -> None:
+        """Release all of it."""
+        self._release(slice(0, self._rows))
 
     def __iter__(self) -> Iterator[slice]:
         """Yield slices of rows, in order."""
@@ -68,30 +66,20 @@ class Windows:
 
 
 def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-    """Return a copy (K, ...) of rows (K,) of an array; of a large mapped file, little is in memory at a time.
+    """Return a copy (K, ...) of rows (K,) of an array; of a large mapped file, a window is in memory at a time.
 
     Raises:
         IndexError: there is no such row.
     """
+    if len(rows) and not 0 <= rows.min() <= rows.max() < len(array):
+        raise IndexError(f"rows {rows.min()} to {rows.max()} of {len(array)}")
     out = np.empty((len(rows), *array.shape[1:]), dtype=array.dtype)
-    copy_rows(array, Windows(array), rows, out)
-    return out
-
-
-def copy_rows(array: npt.NDArray[Any], windows: Windows, rows: npt.NDArray[Any], out: npt.NDArray[Any]) -> None:
-    """Copy rows (K,) of an array (N, ...) to the first K of ``out``; IndexError where there is none.
-
-    Of a large mapped file they are gone through in order, some at a time, and what these brought into memory is
-    released: the system maps sixteen pages for each that is touched.
-    """
-    if not windows.several:
-        array.take(rows, axis=0, out=out[: len(rows)])
-        return
     order = np.argsort(rows, kind="stable")
-    for start in range(0, len(order), _COPIED):
-        own = order[start : start + _COPIED]
-        out[own] = array[rows[own]]
-        windows.release(slice(int(rows[own[0]]), int(rows[own[-1]]) + 1))
+    sorted_rows = rows[order]
+    for part in Windows(array):
+        begin, end = np.searchsorted(sorted_rows, (part.start, part.stop))
+        out[order[begin:end]] = array[sorted_rows[begin:end]]
+    return out
 
 
 def release(array: npt.NDArray[Any]) -> None:

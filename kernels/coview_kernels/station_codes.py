@@ -28,7 +28,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
 from coview_kernels.launch import Launch
-from coview_kernels.mapped import Windows, copy_rows, take_rows
+from coview_kernels.mapped import Windows, take_rows
 from coview_kernels.similarity import unit_columns
 
 ANGLES = 60
@@ -124,7 +124,7 @@ class StationCodes:
     """M stations in 512 bytes each, and what it takes to compare a query with them.
 
     Attributes:
-        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only some of it is held in memory.
+        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only a window is held in memory.
         basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
         step: (16, 2, 16) float32 what one unit of int8 stands for, real and imaginary.
         norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
@@ -266,7 +266,7 @@ class StationCodes:
         return self.at_all([(query, stations, shifts)])[0]
 
     def at_all(self, requests: Sequence[tuple[CodedQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[F32]:
-        """Return what :meth:`at` does of each request; of a large file little is in memory at a time."""
+        """Return what :meth:`at` does of each request; large memory maps are gone through once for all of them."""
         plain = []
         for query, stations, shifts in requests:
             index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
@@ -319,8 +319,6 @@ class _Kernels:
         self._factors = np.zeros((_ROWS, 4, _LANES), dtype=np.float32)
         self._products = np.zeros((_CHUNK, 2, 2, _LANES), dtype=np.float32)
         self._values = np.zeros(_CHUNK, dtype=np.float32)
-        # of a large file single rows are copied: to go through it by windows would map all of it, again and again
-        self._copied = np.zeros((_CHUNK, *codes.shape[1:]), dtype=np.int16) if self._windows.several else None
         serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
         name = "best_serial" if serial else "best_parallel"
         common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
@@ -353,39 +351,49 @@ class _Kernels:
     def products(self, factors: F32, stations: I32) -> F32:
         self._factors[:] = factors
         found = np.empty((len(stations), 2, 2, _LANES), dtype=np.float32)
-        launch = self._launches[_PRODUCTS]
-        for own in self._chunks(launch, stations):
-            launch.put(4, own.stop - own.start)
-            launch()
-            found[own] = self._products[: own.stop - own.start]
+        launch, chosen = self._launches[_PRODUCTS], _ByWindow(stations, self._windows)
+        for part in self._windows:
+            launch.put(0, self._codes[part].reshape(-1))
+            for own in chosen.chunks(part):
+                self._stations[: len(own)] = stations[own] - part.start
+                launch.put(4, len(own))
+                launch()
+                found[own] = self._products[: len(own)]
         return found
 
     def at(self, requests: Sequence[_Request]) -> list[F32]:
-        launch, out = self._launches[_AT], []
-        for query, stations, shifts in requests:
-            launch.put(1, query.table.reshape(-1))
-            found = np.zeros(len(stations), dtype=np.float32)
-            for own in self._chunks(launch, stations):
-                count = own.stop - own.start
-                self._shifts[:count] = shifts[own]
-                self._values[:count] = 0.0
-                launch.put(5, count)
-                launch()
-                found[own] = self._values[:count]
-            out.append(found)
-        return out
+        launch = self._launches[_AT]
+        found = [np.zeros(len(stations), dtype=np.float32) for _, stations, _ in requests]
+        chosen = [_ByWindow(stations, self._windows) for _, stations, _ in requests]
+        for part in self._windows:
+            launch.put(0, self._codes[part].reshape(-1))
+            for (query, stations, shifts), into, each in zip(requests, found, chosen, strict=True):
+                launch.put(1, query.table.reshape(-1))
+                for own in each.chunks(part):
+                    count = len(own)
+                    self._stations[:count], self._shifts[:count] = stations[own] - part.start, shifts[own]
+                    self._values[:count] = 0.0
+                    launch.put(5, count)
+                    launch()
+                    into[own] = self._values[:count]
+        return found
 
-    def _chunks(self, launch: Launch, stations: I32) -> Iterator[slice]:
-        """Yield the numbers of stations (K,) that a launch is ready for, not too many at a time."""
-        launch.put(0, (self._codes if self._copied is None else self._copied).reshape(-1))
-        for start in range(0, len(stations), _CHUNK):
-            own = slice(start, min(start + _CHUNK, len(stations)))
-            chosen = stations[own]
-            if self._copied is not None:
-                copy_rows(self._codes, self._windows, np.maximum(chosen, 0), self._copied)
-                chosen = np.where(chosen < 0, -1, np.arange(len(chosen)))
-            self._stations[: len(chosen)] = chosen
-            yield own
+
+class _ByWindow:
+    """Some stations (K,) by the window that they are in; stations of -1 are in none, or in the only one."""
+
+    def __init__(self, stations: I32, windows: Windows) -> None:
+        self._several = windows.several
+        self._order = np.argsort(stations, kind="stable") if windows.several else np.arange(len(stations))
+        self._sorted = stations[self._order]
+
+    def chunks(self, part: slice) -> Iterator[I64]:
+        """Yield which of the stations are in a window, not too many at a time."""
+        begin, end = 0, len(self._order)
+        if self._several:
+            begin, end = np.searchsorted(self._sorted, [part.start, part.stop]).tolist()
+        for start in range(begin, end, _CHUNK):
+            yield self._order[start : min(start + _CHUNK, end)]
 
 
 def _frequencies() -> I64:
