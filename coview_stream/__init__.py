@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from coview_stream.geometry.protection import ProtectionLevel
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.result import Fix, KeyframeEvidence
+    from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.localization.state import State
     from coview_stream.localization.tracking.monitor import RejectionReason
     from coview_stream.messages.types import PoseMessage
@@ -62,6 +63,7 @@ __all__ = [
     "MapConfig",
     "MapError",
     "MapSummary",
+    "PlaceGuess",
     "PoseMessage",
     "ProtectionLevel",
     "RejectionReason",
@@ -91,6 +93,7 @@ _HOMES = {
     "MapConfig": "config",
     "MapError": "errors",
     "MapSummary": "basemap.summary",
+    "PlaceGuess": "localization.search.place_guess",
     "PoseMessage": "messages.types",
     "ProtectionLevel": "geometry.protection",
     "RejectionReason": "localization.tracking.monitor",

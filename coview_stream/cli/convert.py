@@ -18,7 +18,7 @@ HELP = "make one .coview file of a directory of tiles, or a directory of a file"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("map", type=Path, metavar="FROM", help="SITE.coview, or the directory of a site")
-    parser.add_argument("output", type=Path, metavar="TO", help="the other of them; with --light, a directory")
+    parser.add_argument("output", metavar="TO", help="the other of them; with --light, a directory")
     parser.add_argument(
         "--light",
         action="store_true",
@@ -37,20 +37,31 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.errors import ConfigError
 
     key = None if args.sign is None else SigningKey(args.sign)
-    if args.light and not args.map.is_dir():
-        raise ConfigError(f"{args.map}: is no directory of tiles; convert it to one first, then that with --light")
+    output, directory = Path(args.output), args.output.endswith("/")
+    if not args.map.exists():
+        raise ConfigError(f"{args.map}: is not there; give SITE.coview, or the directory of a site")
     if args.light:
+        if not args.map.is_dir():
+            raise ConfigError(f"{args.map}: is no directory of tiles; convert it to one first, then that with --light")
+        if output.suffix == ".coview" and not directory:
+            raise ConfigError(
+                f"{output}: a light copy is a directory, {output.stem}/; only a file is called NAME.coview"
+            )
         with _bar() as step:
-            site = lighten(args.map, args.output, key, step)
-        _tell(args.output, site)
+            site = lighten(args.map, output, key, step)
+        _tell(output, site)
     elif args.map.is_dir():
-        file_format.check_target(args.output)
+        if directory:
+            raise ConfigError(
+                f"{args.output}: {args.map} is a directory already; name a file, NAME.coview, or add --light"
+            )
+        file_format.check_target(output)
         with _bar() as step:
-            sha256 = join(args.map, args.output, key, step)
-        print(f"{args.output}: {args.output.stat().st_size} bytes, sha256 {sha256[:12]}")
+            sha256 = join(args.map, output, key, step)
+        print(f"{output}: {output.stat().st_size} bytes, sha256 {sha256[:12]}")
     else:
         base_map = BaseMap.load(args.map)
-        _tell(args.output, split(base_map.arrays, base_map.parameters, args.output, key))
+        _tell(output, split(base_map.arrays, base_map.parameters, output, key))
     return 0
 
 

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     if directory is not None:
         facts["site"] = _site(directory)
     if source.mirror is not None:
-        facts["from"] = source.mirror.source.name + (", not reached now" if source.mirror.offline else "")
+        facts["fetched from"] = source.mirror.source.name + (", not reached now" if source.mirror.offline else "")
     facts["signature"] = _signature(directory or args.map, args.verify_key is not None)
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)

@@ -63,7 +63,8 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
         "--within",
         type=float,
         metavar="METRES",
-        help="around --initial, where the robot surely is: nothing else is searched until it is found (all of the map)",
+        help="around --initial, 50 or more, where the robot surely is: nothing farther than that, a quarter and what "
+        "it drives meanwhile is searched until it is found (all of the map)",
     )
 
 
@@ -74,12 +75,15 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
         ConfigError: it is no such text, or ``within`` is given without it, or is no distance.
     """
     from coview_stream.errors import ConfigError
-    from coview_stream.localization.search.place_guess import PlaceGuess
+    from coview_stream.geometry.validation import MAX_COORDINATE
+    from coview_stream.localization.search.place_guess import MIN_WITHIN, PlaceGuess
 
     if text is None:
         if within is not None:
             raise ConfigError("--within: it is metres around --initial; give that, too")
         return None
+    if within is not None and not MIN_WITHIN <= within < MAX_COORDINATE:
+        raise ConfigError(f"--within {within:g}: give metres, {MIN_WITHIN:g} or more")
     of, _, place = text.rpartition(":")
     try:
         numbers = [float(part) for part in place.split(",")]

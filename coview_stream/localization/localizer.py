@@ -287,10 +287,16 @@ class Localizer:
             check: refuse one of no use; without, nothing is found where the map has no ground in the circle.
 
         Raises:
-            InputError: the map has no ground there, or stations are not compared by their index, which circles need.
+            InputError: it is no guess, the map has no ground there, or stations are not compared by their index, which
+                circles need.
         """
+        if not isinstance(guess, PlaceGuess):
+            raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
         if guess.within is not None and (self.config.retrieval.mode, self.config.consensus.mode) != _BY_INDEX:
-            raise InputError("within: is for exhaustive retrieval and consensus, not for the paper's own modes")
+            raise InputError(
+                "within: is for exhaustive retrieval and consensus, not for the paper's own modes; leave out one of "
+                "them (--within or --retrieval ring_key)"
+            )
         if check and not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
             around = guess.within or guess.distance
             raise InputError(

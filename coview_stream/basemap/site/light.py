@@ -17,7 +17,7 @@ from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.cloud_layer import STEPS, cloud_layer, read_cloud_layer
 from coview_stream.basemap.site.grid import SiteGrid
 from coview_stream.basemap.site.layer_bytes import PACKING, encode
-from coview_stream.basemap.site.manifest import VERSION, LayerEntry, Manifest, TileEntry
+from coview_stream.basemap.site.manifest import VERSION, LayerEntry, Manifest, TileEntry, is_site
 from coview_stream.basemap.site.site_build import check_directory
 from coview_stream.basemap.site.tile_clouds import layer_of
 from coview_stream.basemap.site.tile_store import TileStore
@@ -30,6 +30,8 @@ from coview_stream.geometry.transforms import Points
 CUBE = 0.5
 """Edge of a cube, metres: a cell of the likelihood field."""
 
+_LIGHT = "light"  # parameter of a manifest
+
 
 def lighten(
     source: Path, target: Path, key: SigningKey | None = None, progress: Callable[[int, int], None] | None = None
@@ -38,7 +40,7 @@ def lighten(
 
     Args:
         source: directory of the site.
-        target: new or empty directory, or a site, which is replaced.
+        target: new or empty directory, or a light copy, which is replaced.
         key: signs the manifest.
         progress: called with tiles done and all tiles.
 
@@ -46,16 +48,14 @@ def lighten(
         MapError: no site, a layer is missing or damaged, or the target cannot be used.
     """
     manifest = Manifest.load(source)
-    if target.resolve() == source.resolve():
-        raise MapError(f"{target}: is the site itself; name another directory for the light copy")
-    check_directory(target)
+    _check(source, target, manifest)
     grid = SiteGrid(manifest.origin, manifest.tile, config_of_map(manifest.parameters["config"]))
     kept, made, entries = TileStore(source), TileStore(target), []
     for done, entry in enumerate(manifest.tiles, start=1):
         entries.append(_light_tile(entry, grid, kept, made))
         if progress:
             progress(done, len(manifest.tiles))
-    parameters = dict(manifest.parameters) | {"learned": None, "light": {"cube": CUBE, "of": manifest.sha256}}
+    parameters = dict(manifest.parameters) | {"learned": None, _LIGHT: {"cube": CUBE, "of": manifest.sha256}}
     parameters["config"] = dict(manifest.parameters["config"]) | {"learned": False}
     light = replace(manifest, parameters=parameters, tiles=tuple(entries), signer="", signature="", version=VERSION)
     if key is not None:
@@ -63,6 +63,20 @@ def lighten(
     light.save(target)
     made.prune(light.hashes())
     return light
+
+
+def _check(source: Path, target: Path, manifest: Manifest) -> None:
+    """Refuse what would lose something: another site in the target's place, a copy within a site, a copy of a copy."""
+    here, there = source.resolve(), target.resolve()
+    if here == there:
+        raise MapError(f"{target}: is the site itself; name another directory for the light copy")
+    if here in there.parents or there in here.parents:
+        raise MapError(f"{target}: one of {source} and {target} lies in the other; name a directory beside the site")
+    if _LIGHT in manifest.parameters:
+        raise MapError(f"{source}: is a light copy already; are the names the other way round?")
+    if is_site(target) and _LIGHT not in Manifest.load(target).parameters:
+        raise MapError(f"{target}: is a whole site, which a light copy would replace; name a new directory")
+    check_directory(target)
 
 
 def _light_tile(entry: TileEntry, grid: SiteGrid, kept: TileStore, made: TileStore) -> TileEntry:

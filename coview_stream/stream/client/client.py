@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from coview_stream.errors import MessageError, TransportError
+from coview_stream.errors import InputError, MessageError, TransportError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages.json_messages import read_status
@@ -203,19 +203,24 @@ class RobotClient:
             distance: metres around it that are tried as well, 20 at most.
             timeout: seconds.
             map: name of the one of several maps in whose frame x and y are.
-            within: metres around x and y outside of which nothing is searched until the place is known; this is
-                trusted.
+            within: metres around x and y, 50 or more, outside of which nothing is searched until the place is known;
+                this is trusted, a quarter wider than given, and grows with what the robot drives.
 
         Returns:
             The reply; ``taken`` is False while the place is known.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
+            InputError: a value is no number.
         """
         self._check_open()
         given = {"x": x, "y": y, "distance": distance} | ({} if yaw is None else {"yaw": yaw})
         given |= {} if within is None else {"within": within}
-        parameters = {k: repr(float(v)) for k, v in given.items()} | ({} if map is None else {"map": map})
+        try:
+            parameters = {name: repr(float(value)) for name, value in given.items()}
+        except (TypeError, ValueError) as error:
+            raise InputError(f"suggest: {error}; give numbers, metres and radians") from error
+        parameters |= {} if map is None else {"map": map}
         return self._transport.query(self.keys.suggest, parameters, timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:

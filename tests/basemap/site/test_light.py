@@ -49,6 +49,8 @@ def test_light_copy_is_a_site_of_fewer_points_with_the_same_cells(site, cache, t
     assert len(cells[1] - cells[0]) < 0.02 * len(cells[0])  # rounded over a border
     assert lighten(site, tmp_path / "again").sha256 == light.sha256
     assert lighten(site, tmp_path / "light").sha256 == light.sha256  # in its place
+    with pytest.raises(MapError, match="light copy already"):
+        lighten(tmp_path / "light", tmp_path / "lighter")
 
 
 def test_robot_is_found_on_a_light_copy(site, cache, tmp_path, world_drive):
@@ -68,10 +70,26 @@ def test_robot_is_found_on_a_light_copy(site, cache, tmp_path, world_drive):
 def test_light_copy_is_made_from_a_directory_to_another(site, tmp_path, capsys):
     with pytest.raises(MapError, match="the site itself"):
         lighten(site, site)
+    with pytest.raises(MapError, match="lies in the other"):
+        lighten(site, site / "sub")
+    other = tmp_path / "other"
+    Manifest.load(site).save(other.parent)  # any site, where a light copy is not to go
+    with pytest.raises(MapError, match="a whole site"):
+        lighten(site, other.parent)
+    (other.parent / "manifest.json").unlink()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     assert main(["convert", str(site), str(tmp_path / "full"), "--light"]) == 2
-    assert main(["convert", str(tmp_path / "none.coview"), str(tmp_path / "light"), "--light"]) == 2
-    assert "is no directory of tiles" in capsys.readouterr().err
+    (tmp_path / "one.coview").write_bytes(b"a map")
+    for words, said in (
+        ([tmp_path / "none.coview", tmp_path / "light", "--light"], "is not there"),
+        ([tmp_path / "one.coview", tmp_path / "light", "--light"], "is no directory of tiles"),
+        ([site, tmp_path / "light.coview", "--light"], "a light copy is a directory"),
+        ([site, f"{tmp_path}/copy/"], "name a file, NAME.coview, or add --light"),
+    ):
+        capsys.readouterr()
+        assert main(["convert", *map(str, words)]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "copy").exists()
     assert main(["convert", str(site), str(tmp_path / "light"), "--light"]) == 0
     assert "MB per km2" in capsys.readouterr().out

@@ -188,7 +188,7 @@ def test_site_of_a_web_server(site, tmp_path, capsys):
     try:
         assert Manifest.load(Mirror(WebSource(address + "/")).open()) == Manifest.load(site)
         assert main(["info", address, "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["from"] == address
+        assert json.loads(capsys.readouterr().out)["fetched from"] == address
     finally:
         served.shutdown()
         served.server_close()
