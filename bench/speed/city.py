@@ -116,7 +116,8 @@ def _figures(side: int, found: dict[str, float]) -> Iterator[Row]:
     yield informs(f"{title}: robots found in their first {_FRAMES} frames", seen["found"], f"of {seen['drives']}")
     if side > 1:
         yield from city_votes.rows(title, isolated(city_votes.voted, site, worlds))
-        yield city_votes.wrong_circle_row(title, isolated(city_votes.elsewhere, site, worlds))
+        for radius in city_votes.ELSEWHERE:
+            yield city_votes.wrong_circle_row(title, isolated(city_votes.elsewhere, site, worlds, radius))
     yield judged(f"{title}: false poses", f"{seen['false']} of {seen['poses']}", "none", seen["false"] == 0)
 
 

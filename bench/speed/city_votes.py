@@ -28,8 +28,8 @@ from coview_stream.localization.search.search_stations import SearchStations
 from coview_stream.localization.search.station_consensus import StationConsensus
 from coview_stream.recordings.open_run import open_run
 
-RADIUS, ELSEWHERE = 1000.0, 240.0
-"""Metres of the prior's circle, and of one in another town."""
+RADIUS, ELSEWHERE = 1000.0, (50.0, 240.0)
+"""Metres of the prior's circle, and of those in another town: the smallest that there is, and a town's."""
 
 VOTE_MS, LEAST_KEPT = 30.0, 99.0
 """The targets: milliseconds of a vote within the circle on one core, per cent of right places that squares keep."""
@@ -89,8 +89,8 @@ def _votes(consensus: StationConsensus, drives: Sequence[Sequence[_Keyframe]], a
     return {"ms": times, "ranks": ranks}
 
 
-def elsewhere(site: Path, worlds: Sequence[Path]) -> dict[str, int]:
-    """Search for each robot in a circle around another one's town; tell how many came to a pose."""
+def elsewhere(site: Path, worlds: Sequence[Path], radius: float) -> dict[str, float]:
+    """Search for each robot in a circle around where another one starts; tell how many came to a pose."""
     base_map = BaseMap.load(site)
     localizer = Localizer(base_map)
     starts = [read_tum(world / "truth.tum")[1][0][:2, 3] for world in worlds]
@@ -98,13 +98,13 @@ def elsewhere(site: Path, worlds: Sequence[Path]) -> dict[str, int]:
     for number, world in enumerate(worlds):
         localizer.reset()
         x, y = starts[(number + len(worlds) // 2 + 1) % len(worlds)].tolist()
-        localizer.guess_place(PlaceGuess(x, y, within=ELSEWHERE))
+        localizer.guess_place(PlaceGuess(x, y, within=radius))
         poses = 0
         for frame, _ in zip(open_run(world / "run"), range(_FRAMES), strict=False):
             poses += localizer.step(frame.points, frame.T_odom_body, frame.stamp).T_map_body is not None
             frames += 1
         posed += poses > 0
-    return {"posed": posed, "robots": len(worlds), "frames": frames}
+    return {"posed": posed, "robots": len(worlds), "frames": frames, "radius": radius}
 
 
 def rows(title: str, found: dict[str, Any]) -> Iterator[Row]:
@@ -126,8 +126,8 @@ def rows(title: str, found: dict[str, Any]) -> Iterator[Row]:
     yield informs(f"{title}: right place named in the circle, of {len(named)}", 100.0 * float(np.mean(named)), "%")
 
 
-def wrong_circle_row(title: str, found: dict[str, int]) -> Row:
+def wrong_circle_row(title: str, found: dict[str, float]) -> Row:
     """Return the row of :func:`elsewhere`."""
     said = f"{found['posed']} of {found['robots']}"
-    name = f"{title}: robots posed in a circle that they are not in, {found['frames']} frames"
+    name = f"{title}: robots posed in a circle of {found['radius']:g} m that they are not in, {found['frames']} frames"
     return judged(name, said, "none", found["posed"] == 0)
