@@ -195,8 +195,8 @@ class Session:
     def restart_search(self, reason: str) -> None:
         """Search from nothing in a new epoch: what came before no longer fits. Odometry that has come stays.
 
-        So does what somebody has guessed: the engine, which forgets it, is told again. A circle does not, for nobody
-        knows how far the robot has come.
+        So does what somebody has guessed: the engine, which forgets it, is told again. A circle does not, for it is not
+        known how far the robot has come.
         """
         with self._lock:
             self._epoch += 1
