@@ -34,7 +34,7 @@ from coview_stream.stream.node import (
 )
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.robot_state import Transition
-from coview_stream.stream.transport import inboxes, zenoh_io, zenoh_transport
+from coview_stream.stream.transport import zenoh_io, zenoh_transport
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
@@ -60,7 +60,7 @@ def test_docs_list_every_preset_and_its_keys():
 def test_figure_of_the_way_names_existing_functions():
     figure = re.search(r"```text\n(.*?)```", section("The way of one cloud"), re.DOTALL)[1]
     owners = (
-        zenoh_transport, zenoh_io, inboxes, node, session, frame_sync, buffer, engine_queue, engine_process, engines,
+        zenoh_transport, zenoh_io, node, session, frame_sync, buffer, engine_queue, engine_process, engines,
         worker, localizer, global_search, robot_state,
     )  # fmt: skip
     named = re.findall(r"\b(\w+)\.(\w+)\b", figure)

@@ -121,7 +121,7 @@ def _ignore(*said: object, **more: object) -> None:
 def _rpc() -> Target:
     from coview_stream.errors import CoViewError
     from coview_stream.messages.json_messages import read_object
-    from coview_stream.stream.client.fleet import FleetTable
+    from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.node.election import claim_in
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors

@@ -159,7 +159,7 @@ def _await_first(
 def _await_engines(endpoint: str) -> None:
     """Wait until the node's engines can search: on a busy machine the drive would be over before."""
     from coview_stream.stream.transport.keys import node_keys
-    from coview_stream.stream.transport.open_client import open_client
+    from coview_stream.stream.transport.zenoh_transport import open_client
 
     transport = open_client([endpoint], None, None)
     try:

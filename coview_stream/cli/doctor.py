@@ -149,7 +149,7 @@ def _check_zenoh_config(args: argparse.Namespace, connect: list[str]) -> bool:
 
 def _endpoints(args: argparse.Namespace) -> list[str] | None:
     """Return the endpoints to connect to; None if the network is not asked for."""
-    from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
+    from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
     if not (args.robot or args.connect or args.listen or args.config):
         return None

@@ -49,11 +49,10 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.errors import ConfigError
     from coview_stream.recordings.lidar_runs import open_bare_run
     from coview_stream.recordings.open_run import open_run
-    from coview_stream.stream.client.replay import replay
-    from coview_stream.stream.client.replay_schedule import ReplayConfig, odometry_spacing
+    from coview_stream.stream.client.replay import ReplayConfig, odometry_spacing, replay
     from coview_stream.stream.client.sender import Sender
     from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.stream.transport.open_client import open_client
+    from coview_stream.stream.transport.zenoh_transport import open_client
 
     if not args.wait >= 0:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")

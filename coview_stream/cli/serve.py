@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def fleet_name(text: str | None) -> str | None:
     """Return the name of a fleet; ConfigError where it is no part of a key."""
-    from coview_stream.stream.transport.key_expressions import check_chunk
+    from coview_stream.stream.transport.keys import check_chunk
 
     return None if text is None else check_chunk(text, "--fleet")
 
@@ -169,7 +169,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import ServeOptions
     from coview_stream.stream.transport.keys import node_keys, robot_keys
-    from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
+    from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
     start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)

@@ -19,7 +19,7 @@ from coview_stream.errors import ConfigError, MessageError
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
     from coview_stream.messages.types import Sample
-    from coview_stream.stream.client.fleet import FleetTable
+    from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.client.latest_queue import LatestQueue
     from coview_stream.stream.transport.transport import Transport
 
@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.cli.view import feed_of_watch, map_of_watch, open_sinks
-    from coview_stream.stream.client.fleet import FleetTable
-    from coview_stream.stream.transport.open_client import open_client
+    from coview_stream.stream.client.fleet_table import FleetTable
+    from coview_stream.stream.transport.zenoh_transport import open_client
 
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
@@ -93,8 +93,7 @@ class _Topic(NamedTuple):
 
 
 def _topics(args: argparse.Namespace) -> list[_Topic]:
-    from coview_stream.stream.transport.key_expressions import check_prefix
-    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.stream.transport.keys import check_prefix, robot_keys
 
     if args.robot:
         keys = [robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)]
@@ -191,7 +190,7 @@ class _Watch:
 
     def _print_silence(self) -> None:
         """Print the keys, the connections and the endpoints to which nothing has come."""
-        from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
+        from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from coview_stream.stream.transport.key_expressions import check_prefix
-from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.keys import RobotKeys, check_prefix
 
 TopicKind = Literal["pose", "status", "hypotheses", "cloud"]
 

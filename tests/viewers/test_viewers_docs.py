@@ -17,7 +17,7 @@ from coview_stream.basemap.map_view import POINTS_ON_WIRE, MapView
 from coview_stream.cli import build_parser
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.transport import open_client
+from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.viewers import web_hub, web_server, web_sink
 
@@ -34,7 +34,7 @@ def test_documented_commands_parse():
 
 def test_documented_program_prints_poses(monkeypatch, capsys):
     net = MemoryTransport()
-    monkeypatch.setattr(open_client, "open_client", lambda: net)
+    monkeypatch.setattr(zenoh_transport, "open_client", lambda: net)
 
     def stream(prompt):
         pose = PoseMessage(ns(0.0), "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, SHA)

@@ -17,12 +17,12 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.client.fleet import STALE
+from coview_stream.stream.client.fleet_table import STALE
 from coview_stream.stream.client.latest_queue import LatestQueue, Received
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import RobotKeys, robot_keys
-from coview_stream.stream.transport.open_client import open_client
 from coview_stream.stream.transport.transport import Transport
+from coview_stream.stream.transport.zenoh_transport import open_client
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +58,12 @@ class RobotClient:
         odometry_encoding: ``json``, ``cdr``, ``foxglove`` or ``keelson``; None takes the preset's.
         transport: one that is open already; the caller closes it.
 
+    Attributes:
+        robot: its name.
+        keys: keys that are published on and subscribed to.
+        latest_status: newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970.
+        malformed: number of poses and statuses that could not be decoded.
+
     Raises:
         ConfigError: a name, preset or encoding is not valid.
         TransportError: the session cannot be opened. A missing router is no error: the client waits for it in the
@@ -78,15 +84,14 @@ class RobotClient:
         transport: Transport | None = None,
     ) -> None:
         self.keys: RobotKeys = robot_keys(preset, base, robot)
+        self.robot = robot
+        self.latest_status: dict[str, Any] | None = None
+        self.malformed = 0
         self._owned = transport is None
-        self._transport = (
-            transport if transport is not None else open_client(endpoint, listen, config, check_silence=True)
-        )
+        self._transport = transport if transport is not None else open_client(endpoint, listen, config)
         self._poses: LatestQueue[PoseMessage] = LatestQueue(MAX_UNREAD_POSES)
         self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(_MAX_UNREAD_STATUSES)
         self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
-        self._latest_status: dict[str, Any] | None = None
-        self._malformed = 0
         self._closed = False
         try:
             self._sender = Sender(self._transport, self.keys, cloud_encoding, odometry_encoding)
@@ -98,11 +103,6 @@ class RobotClient:
             raise
 
     @property
-    def robot(self) -> str:
-        """The robot's name."""
-        return self.keys.robot
-
-    @property
     def latest_pose(self) -> PoseMessage | None:
         """The newest pose received, while it is valid.
 
@@ -110,19 +110,9 @@ class RobotClient:
         local time: a robot that is lost, or has lost its node, must not drive by an old pose.
         """
         newest = self._latest_pose
-        if newest is None or monotonic() - newest[0] >= STALE or not self._tracking():
+        if newest is None or monotonic() - newest[0] >= STALE or not _valid(self.latest_status):
             return None
         return newest[1]
-
-    @property
-    def latest_status(self) -> dict[str, Any] | None:
-        """The newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970."""
-        return self._latest_status
-
-    @property
-    def malformed(self) -> int:
-        """Number of poses and statuses that could not be decoded."""
-        return self._malformed
 
     def send_cloud(self, points: npt.ArrayLike, stamp: float, times: Floats | None = None) -> None:
         """Publish one lidar frame; it is dropped if the link is busy with the one before, or without subscriber.
@@ -257,7 +247,7 @@ class RobotClient:
 
     def __repr__(self) -> str:
         """Return robot, keys and the state that the node reports, in one line."""
-        status = self._latest_status
+        status = self.latest_status
         state = "no status yet" if status is None else f"state {str(status.get('state'))[:20]}"
         return f"RobotClient({self.robot!r}, sends on {self._sender.cloud_key}, {'closed' if self._closed else state})"
 
@@ -269,11 +259,6 @@ class RobotClient:
     def _check_open(self) -> None:
         if self._closed:
             raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
-
-    def _tracking(self) -> bool:
-        """Tell whether poses are valid; True without a status, which access rules may withhold."""
-        status = self._latest_status
-        return status is None or status.get("state", "TRACKING") == "TRACKING"
 
     def _on_pose(self, sample: Sample) -> None:
         from coview_stream.messages import decode_pose
@@ -294,12 +279,17 @@ class RobotClient:
         except MessageError as error:
             self._reject(sample, error)
             return
-        self._latest_status = status
-        if not self._tracking():
+        self.latest_status = status
+        if not _valid(self.latest_status):
             self._latest_pose = None  # a later TRACKING does not make the old pose valid again
         self._statuses.put(status)
 
     def _reject(self, sample: Sample, error: MessageError) -> None:
-        self._malformed += 1
-        if self._malformed == 1:  # once: a wrong sender is wrong ten times a second
+        self.malformed += 1
+        if self.malformed == 1:  # once: a wrong sender is wrong ten times a second
             _log.warning("%s: %s", sample.key, error)
+
+
+def _valid(status: dict[str, Any] | None) -> bool:
+    """Whether poses are valid under a status; True without one, as access rules may withhold it."""
+    return status is None or status.get("state", "TRACKING") == "TRACKING"

@@ -14,8 +14,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, is_pose, why_no_pose
 from coview_stream.geometry.validation import cloud_rows, to_array
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
-from coview_stream.stream.transport.key_expressions import check_expression
-from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.keys import RobotKeys, check_expression
 from coview_stream.stream.transport.rmw import RmwPublisher, publisher_token, type_hash
 from coview_stream.stream.transport.transport import Publisher, Transport, Urgency
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coview_stream.stream.transport.key_expressions import check_chunk, check_prefix
+from coview_stream.stream.transport.keys import check_chunk, check_prefix
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,6 @@ def open_node(
         reference = None if options.geo is None else MapReference(files, base_map.sha256)
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload,
-            check_silence=options.fleet is None,  # another session would hear the other nodes' robots
             lease_ms=None if options.fleet is None else LEASE_MS,
         )  # fmt: skip
         elections: Elections | FleetShares

@@ -14,7 +14,7 @@ from typing import Any
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.key_expressions import check_expression, matches
+from coview_stream.stream.transport.keys import check_expression, matches
 from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
 
 _log = logging.getLogger(__name__)

@@ -131,11 +131,6 @@ def mode_of(config: Any) -> str:
     return str(_get(config, "mode"))
 
 
-def has_identity(config: Any) -> bool:
-    """Tell whether the identity of sessions is given, so that there can be only one at a time."""
-    return _get(config, "id") is not None
-
-
 def endpoints_of(config: Any) -> str:
     """List the endpoints to connect to, for messages."""
     found = _get(config, "connect/endpoints")

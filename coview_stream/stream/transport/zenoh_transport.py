@@ -6,7 +6,7 @@ import atexit
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -15,11 +15,19 @@ from coview_stream.errors import TransportError
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.inboxes import THREADS, Inboxes
-from coview_stream.stream.transport.subscription_check import Subscription, SubscriptionCheck
-from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
+from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Transport, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
-from coview_stream.stream.transport.zenoh_io import FLUSH, Answers, Writer, ZenohPublisher, first_reply, plain, quality
+from coview_stream.stream.transport.zenoh_io import (
+    FLUSH,
+    THREADS,
+    Answers,
+    Inboxes,
+    Writer,
+    ZenohPublisher,
+    first_reply,
+    plain,
+    quality,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +50,6 @@ def open_transport(
     listen: Sequence[str] = (),
     config: Path | None = None,
     max_payload: int | None = None,
-    check_silence: bool = False,
     lease_ms: int | None = None,
 ) -> ZenohTransport:
     """Open a zenoh session.
@@ -55,8 +62,6 @@ def open_transport(
         listen: endpoints to listen on.
         config: zenoh configuration file; it wins over our defaults, ``connect`` and ``listen`` win over it.
         max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
-        check_silence: open the session anew once another one hears what this one does not, see
-            :mod:`coview_stream.stream.transport.subscription_check`; only of a client.
         lease_ms: how long others wait for a sign of life from this session; None leaves it at zenoh's 10 s.
 
     Raises:
@@ -66,13 +71,37 @@ def open_transport(
 
     # RUST_LOG=zenoh=warn prints why a router refuses us; without it this is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
-    return ZenohTransport(zenoh_config.compose(connect, listen, config, lease_ms), max_payload, check_silence)
+    return ZenohTransport(zenoh_config.compose(connect, listen, config, lease_ms), max_payload)
+
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Default endpoint of a client: zenoh's usual port, on this machine only."""
+
+
+def open_client(
+    endpoint: str | Sequence[str] | None = None,
+    listen: str | Sequence[str] | None = None,
+    config: str | Path | None = None,
+) -> Transport:
+    """Open a zenoh session for a client: to :data:`DEFAULT_ENDPOINT` unless something else is given.
+
+    Raises:
+        TransportError: as :func:`coview_stream.stream.transport.zenoh_transport.open_transport`.
+    """
+    connect = _listed(endpoint)
+    if not connect and not _listed(listen) and config is None:
+        connect = [DEFAULT_ENDPOINT]
+    return open_transport(connect, _listed(listen), None if config is None else Path(config))
+
+
+def _listed(endpoints: str | Sequence[str] | None) -> list[str]:
+    return [endpoints] if isinstance(endpoints, str) else list(endpoints or ())
 
 
 class ZenohTransport:
     """A zenoh session; made by :func:`open_transport`. All methods may be called from any thread."""
 
-    def __init__(self, config: Any, max_payload: int | None = None, check_silence: bool = False) -> None:
+    def __init__(self, config: Any, max_payload: int | None = None) -> None:
         self._config = config
         self._max_payload = max_payload
         self._waits = zenoh_config.mode_of(config) == "client"
@@ -81,9 +110,7 @@ class ZenohTransport:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         self._declared: list[Any] = []  # zenoh undeclares what is not referenced
-        self._declarations: list[Callable[[Any], None]] = []  # also those of before, for the session after this one
-        self._publishers: list[ZenohPublisher] = []
-        self._check = SubscriptionCheck(self._listen, self._reopen, self._guard)
+        self._declarations: list[Callable[[Any], None]] = []  # for a session that opens later
         self._answers = Answers(self._guard)
         self._inboxes = Inboxes(self._guard)
         self._writer = Writer(self._guard)
@@ -91,8 +118,6 @@ class ZenohTransport:
         # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
         atexit.register(self._at_exit)
         self._open()
-        if check_silence and self._waits and not zenoh_config.has_identity(config):
-            self._start("subscription check", self._check.run, self._closing)
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
         """Call ``handler`` on one of our threads; ``newest`` keeps one unread sample, ``all`` the newest 1024.
@@ -105,8 +130,7 @@ class ZenohTransport:
         import zenoh
 
         self._require_key(key)
-        subscription = self._check.add(key)
-        inbox = self._inboxes.open(key, self._receiver(subscription, handler), 1 if policy == "newest" else _QUEUE)
+        inbox = self._inboxes.open(key, self._receiver(handler), 1 if policy == "newest" else _QUEUE)
         declared: list[Any] = []
         ended = threading.Event()
 
@@ -124,7 +148,6 @@ class ZenohTransport:
         def end() -> None:
             ended.set()
             inbox.close()
-            self._check.remove(subscription)
             with self._lock:
                 if declare in self._declarations:
                     self._declarations.remove(declare)
@@ -142,7 +165,6 @@ class ZenohTransport:
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
         publisher = ZenohPublisher(key, self._guard, self._writer if urgency == "data" else None)
-        self._publishers.append(publisher)
 
         def declare(session: Any) -> None:
             publisher.attach(session.declare_publisher(key, **quality(urgency)))
@@ -334,39 +356,6 @@ class ZenohTransport:
                 return
         session.close()
 
-    def _listen(self, keys: Collection[str], seconds: float) -> set[str]:
-        """Listen to keys with another session for ``seconds`` at most; return those on which something came."""
-        import zenoh
-
-        heard: set[str] = set()
-        try:
-            with zenoh_errors("zenoh session"):
-                session: Any = zenoh.open(self._config)
-        except TransportError:
-            return heard
-        try:
-            readers = {key: session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in keys}
-            end = time.monotonic() + seconds
-            while len(heard) < len(keys) and time.monotonic() < end and not self._closing.wait(_POLL):
-                heard |= {key for key in readers.keys() - heard if readers[key].try_recv() is not None}
-        finally:
-            session.close()
-        return heard
-
-    def _reopen(self, keys: str) -> None:
-        """Open the session anew, with all that was declared on it, for it hears nothing on ``keys``."""
-        with self._lock:
-            if self._closing.is_set() or self._session is None:
-                return
-            session, self._session = self._session, None
-            declared, self._declared = self._declared, []
-        _log.warning("another session hears %s and this one does not: opening it anew", keys)
-        for publisher in self._publishers:
-            publisher.attach(None)
-        self._end_session(session)
-        declared.clear()
-        self._keep_trying(SimpleQueue())
-
     @staticmethod
     def _require_key(key: str) -> None:
         import zenoh
@@ -391,19 +380,12 @@ class ZenohTransport:
         self._threads.append(thread)
         thread.start()
 
-    def _receiver(self, subscription: Subscription, handler: Callable[[Sample], None]) -> Callable[[Any], None]:
-        """Return what a subscription's inbox calls with each of zenoh's samples."""
+    def _receiver(self, handler: Callable[[Sample], None]) -> Callable[[Any], None]:
+        """Return the function that an inbox calls with each of zenoh's samples."""
         import zenoh
 
         def handle(sample: Any) -> None:
-            if self._closing.is_set():
-                return
-            self._check.heard(subscription)
-            if sample.kind == zenoh.SampleKind.PUT:
-                subscription.handling = True
-                try:
-                    handler(plain(sample, self._max_payload))
-                finally:
-                    subscription.handling = False
+            if not self._closing.is_set() and sample.kind == zenoh.SampleKind.PUT:
+                handler(plain(sample, self._max_payload))
 
         return handle

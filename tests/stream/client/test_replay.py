@@ -16,8 +16,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z, yaw_of
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
-from coview_stream.stream.client.replay import replay
-from coview_stream.stream.client.replay_schedule import ReplayConfig, frame_times, odometry_spacing, schedule
+from coview_stream.stream.client.replay import ReplayConfig, frame_times, odometry_spacing, replay, schedule
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport

@@ -17,8 +17,7 @@ from sockets import until
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node.health import NodeHealth, prometheus_text
 from coview_stream.stream.node.metrics_server import MetricsServer
-from coview_stream.stream.transport.key_expressions import matches
-from coview_stream.stream.transport.keys import node_keys
+from coview_stream.stream.transport.keys import matches, node_keys
 from coview_stream.stream.transport.transport import Connection
 
 SAMPLE = re.compile(r'coview_[a-z_]+(\{[a-z_0-9]+="(\\.|[^"\\\n])*"(,[a-z_0-9]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')

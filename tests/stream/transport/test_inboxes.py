@@ -10,7 +10,7 @@ import pytest
 from sockets import until
 
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.inboxes import THREADS, Inboxes
+from coview_stream.stream.transport.zenoh_io import THREADS, Inboxes
 
 
 @pytest.fixture

@@ -4,8 +4,14 @@ import pytest
 import zenoh
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.transport.key_expressions import check_chunk, check_expression, check_prefix, matches
-from coview_stream.stream.transport.keys import PRESETS, robot_keys
+from coview_stream.stream.transport.keys import (
+    PRESETS,
+    check_chunk,
+    check_expression,
+    check_prefix,
+    matches,
+    robot_keys,
+)
 
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
 
