@@ -1,11 +1,20 @@
-"""The web page of a session: hub, sink and server put together."""
+"""Web page of a session: its files, the map and the events, on an HTTP server. Read only, without dependencies."""
 
 from __future__ import annotations
 
+from importlib import resources
+
+from coview_stream.stream.transport.http_server import EventStream, HttpServer, Reply, Route
 from coview_stream.viewers.scene import Sink
 from coview_stream.viewers.web_hub import WebHub
-from coview_stream.viewers.web_server import WebServer
 from coview_stream.viewers.web_sink import WebSink
+
+WEB_ADDRESS = "127.0.0.1:8642"
+"""Default address of the page."""
+
+_TICK = 1.0  # seconds between signs of life
+_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+_FILES = ("index.html", "style.css", "page.js", "state.js", "raster.js", "view.js", "cards.js", "icon.svg")
 
 
 class WebPage:
@@ -16,29 +25,60 @@ class WebPage:
 
     Attributes:
         url: of the page.
-        sink: takes in what there is to see.
+        sink: takes in the events.
 
     Raises:
-        ConfigError: ``address`` is none, or cannot be listened on.
+        ConfigError: ``address`` is malformed or cannot be listened on.
     """
 
     def __init__(self, address: str) -> None:
-        hub = WebHub()
-        sink = _ClosingSink(hub)
-        self._server = WebServer(address, hub, sink.maps)
-        sink.server = self._server
+        self._hub = WebHub()
+        sink = _ClosingSink(self._hub)
         self.sink: Sink = sink
+        self._maps = sink.maps
+        folder = resources.files("coview_stream.viewers") / "web"
+        routes: dict[str, Route] = {f"/{name}": _file((folder / name).read_bytes(), name) for name in _FILES}
+        routes |= {"/": routes["/index.html"], "/map/": self._map, "/events": self._events}
+        self._server = HttpServer(address, routes, ("--web", WEB_ADDRESS))
+        sink.page = self
         self.url = self._server.url
         self._server.start()
 
     def close(self) -> None:
-        """End all pages and stop listening."""
+        """End all streams and stop listening."""
+        self._hub.close()
         self._server.close()
+
+    def _map(self, sha256: str) -> Reply:
+        packed = self._maps.get(sha256)
+        if packed is None:
+            return Reply(b"there is no such map\n", code=404)
+        return Reply(packed, "application/octet-stream")
+
+    def _events(self, _: str) -> Reply | EventStream:
+        page = self._hub.open_page()
+        if page is None:
+            return Reply(b"too many pages are open\n", code=503)
+
+        def stream() -> EventStream:
+            try:
+                yield b"retry: 1000\n\n"
+                while not page.closed:
+                    yield page.take(_TICK) or b"event: tick\ndata: {}\n\n"
+            finally:
+                self._hub.close_page(page)
+
+        return stream()
 
 
 class _ClosingSink(WebSink):
-    server: WebServer | None = None
+    page: WebPage | None = None
 
     def close(self) -> None:
-        if self.server is not None:
-            self.server.close()
+        if self.page is not None:
+            self.page.close()
+
+
+def _file(content: bytes, name: str) -> Route:
+    reply = Reply(content, f"{_TYPES[name.rpartition('.')[2]]}; charset=utf-8")
+    return lambda _: reply

@@ -17,9 +17,9 @@ from coview_stream.basemap.map_view import POINTS_ON_WIRE, MapView
 from coview_stream.cli import build_parser
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.transport import zenoh_transport
+from coview_stream.stream.transport import http_server, zenoh_transport
 from coview_stream.stream.transport.memory_transport import MemoryTransport
-from coview_stream.viewers import web_hub, web_server, web_sink
+from coview_stream.viewers import web_hub, web_page, web_sink
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewers.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -49,15 +49,15 @@ def test_documented_program_prints_poses(monkeypatch, capsys):
 
 def test_documented_figures_are_those_of_the_code():
     for figure in (
-        web_server.WEB_ADDRESS,
-        f"At most {web_hub.MAX_PAGES} pages and {web_server._MAX_CONNECTIONS}\nconnections",
+        web_page.WEB_ADDRESS,
+        f"At most {web_hub.MAX_PAGES} pages and {http_server._MAX_CONNECTIONS}\nconnections",
         f"up to {web_sink._TRAIL:,} points",
         f"{POINTS_ON_WIRE:,} points",
-        "nothing for four seconds" if web_server._SEND_TIMEOUT == 4.0 else "?",
+        "nothing for four seconds" if http_server._SEND_TIMEOUT == 4.0 else "?",
     ):
         assert figure in TEXT, figure
     folder = resources.files("coview_stream.viewers") / "web"
-    scripts = sum(len((folder / name).read_bytes()) for name in web_server._FILES if name.endswith(".js"))
+    scripts = sum(len((folder / name).read_bytes()) for name in web_page._FILES if name.endswith(".js"))
     assert abs(scripts - 35_000) < 3_000  # "35 kB of scripts"
 
 

@@ -7,14 +7,16 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.http_server import HttpServer, Reply
 from coview_stream.stream.transport.keys import NodeKeys
 from coview_stream.version import __version__
 
@@ -110,6 +112,26 @@ class NodeHealth:
         while not stopping.wait(_INTERVAL):
             with self._errors.catch("health"):  # what cannot be told once must not end the telling
                 publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
+
+
+def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> HttpServer:
+    """Return a server of ``/metrics`` (Prometheus) and ``/health`` (JSON; 200 if the node is ready, else 503).
+
+    Raises:
+        ConfigError: ``address`` is no ``HOST:PORT``, or cannot be listened on.
+    """
+
+    def metrics(_: str) -> Reply:
+        return Reply(prometheus_text(document()).encode(), "text/plain; version=0.0.4; charset=utf-8")
+
+    def health(_: str) -> Reply:
+        found = document()
+        return Reply(f"{json.dumps(found)}\n".encode(), "application/json", 200 if found["ready"]["ok"] else 503)
+
+    routes = {"/metrics": metrics, "/health": health}
+    server = HttpServer(address, routes, ("--metrics", METRICS_ADDRESS), open_to_names=True)
+    log.info("metrics at %smetrics", server.url)
+    return server
 
 
 def prometheus_text(document: Mapping[str, Any]) -> str:

@@ -205,15 +205,14 @@ def open_node(
 
 def _add_health(node: Node, options: ServeOptions, notifier: Notifier) -> None:
     """Have the node tell how it is: on zenoh, to systemd, and over HTTP where that is asked for."""
-    from coview_stream.stream.node.health import NodeHealth
-    from coview_stream.stream.node.metrics_server import MetricsServer
+    from coview_stream.stream.node.health import NodeHealth, metrics_server
 
     health, keys = NodeHealth(node, needs_connection=bool(options.connect)), options.node_keys
     if keys is not None:
         health.answer(keys)
         node.run_beside("health", lambda stopping: health.run(stopping, keys))
     if options.metrics is not None:
-        node.run_beside("metrics", MetricsServer(options.metrics, health.document).run)
+        node.run_beside("metrics", metrics_server(options.metrics, health.document).run)
     if notifier.watchdog_period is not None:
         node.run_beside("systemd", lambda stopping: notifier.run(stopping, lambda: not health.live_reasons()))
 

@@ -15,8 +15,7 @@ from fake_node import STEP
 from sockets import until
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.node.health import NodeHealth, prometheus_text
-from coview_stream.stream.node.metrics_server import MetricsServer
+from coview_stream.stream.node.health import NodeHealth, metrics_server, prometheus_text
 from coview_stream.stream.transport.keys import matches, node_keys
 from coview_stream.stream.transport.transport import Connection
 
@@ -91,7 +90,7 @@ def test_keys_of_a_node_match_no_wildcard():
 @pytest.fixture
 def server():
     document = {"ok": True}
-    made = MetricsServer("127.0.0.1:0", lambda: {"ready": document})
+    made = metrics_server("127.0.0.1:0", lambda: {"ready": document})
     stopping = threading.Event()
     thread = threading.Thread(target=made.run, args=(stopping,))
     thread.start()
@@ -102,7 +101,7 @@ def server():
 
 
 def asked(server, method, page):
-    connection = http.client.HTTPConnection(server.address, timeout=10.0)
+    connection = http.client.HTTPConnection(server.url[7:-1], timeout=10.0)
     connection.request(method, page)
     answer = connection.getresponse()
     body = answer.read()
@@ -122,7 +121,7 @@ def test_server_has_two_pages_to_read(server):
 
 def test_slow_endless_and_vanishing_readers_are_cut_off(server):
     made, _ = server
-    host, port = made.address.split(":")
+    host, port = made.url[7:-1].split(":")
     silent = socket.create_connection((host, int(port)))
     flood = socket.create_connection((host, int(port)))
     flood.settimeout(1.0)
@@ -138,7 +137,7 @@ def test_slow_endless_and_vanishing_readers_are_cut_off(server):
 
 def test_metrics_of_a_real_node_are_served(site):
     site.frame("r1", STEP)
-    made = MetricsServer("127.0.0.1:0", NodeHealth(site.node).document)
+    made = metrics_server("127.0.0.1:0", NodeHealth(site.node).document)
     stopping = threading.Event()
     thread = threading.Thread(target=made.run, args=(stopping,))
     thread.start()
@@ -152,7 +151,7 @@ def test_metrics_of_a_real_node_are_served(site):
 @pytest.mark.parametrize("address", ["", "nonsense", "127.0.0.1:", "127.0.0.1:99999999", "192.0.2.7:9464"])
 def test_bad_address_is_refused(address):
     with pytest.raises(ConfigError, match="--metrics"):
-        MetricsServer(address, dict)
+        metrics_server(address, dict)
 
 
 def test_telling_goes_on_after_something_could_not_be_told(site, monkeypatch):
@@ -179,12 +178,12 @@ def test_a_page_that_cannot_be_made_is_reported(caplog):
     def document():
         raise KeyError("engines")
 
-    server = MetricsServer("127.0.0.1:0", document)
+    server = metrics_server("127.0.0.1:0", document)
     stopping = threading.Event()
     thread = threading.Thread(target=server.run, args=(stopping,), daemon=True)
     thread.start()
     with contextlib.suppress(http.client.HTTPException, OSError):
-        connection = http.client.HTTPConnection(*server.address.split(":"), timeout=5)
+        connection = http.client.HTTPConnection(*server.url[7:-1].split(":"), timeout=5)
         connection.request("GET", "/health")
         connection.getresponse()
     until(lambda: "metrics" in caplog.text and "engines" in caplog.text)

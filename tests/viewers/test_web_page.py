@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import re
 import socket
-import threading
 import time
 from importlib import resources
 
@@ -16,9 +16,9 @@ from sockets import until
 
 from coview_stream.errors import ConfigError
 from coview_stream.messages.types import PoseMessage
-from coview_stream.viewers import web_server
+from coview_stream.stream.transport import http_server
+from coview_stream.stream.transport.http_server import known_host
 from coview_stream.viewers.web_page import WebPage
-from coview_stream.viewers.web_server import known_host
 
 
 @pytest.fixture
@@ -72,9 +72,7 @@ def test_nothing_in_the_page_comes_from_elsewhere():
         assert [url for url in found if url != "http://www.w3.org/2000/svg"] == [], file.name
 
 
-@pytest.mark.parametrize(
-    "path", ["/../web_server.py", "/%2e%2e/web_server.py", "/map/", "/map/ab", "/nothing", "//etc"]
-)
+@pytest.mark.parametrize("path", ["/../web_page.py", "/%2e%2e/web_page.py", "/map/", "/map/ab", "/nothing", "//etc"])
 def test_what_is_not_there_is_not_found(served, path):
     assert get(served, path)[0].status == 404
 
@@ -116,8 +114,8 @@ def test_too_many_pages_are_told_so(served, monkeypatch):
 
 @pytest.mark.slow
 def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served, monkeypatch):
-    monkeypatch.setattr(web_server, "_SEND_TIMEOUT", 0.2)
-    monkeypatch.setattr(web_server, "_SEND_BUFFER", 4096)
+    monkeypatch.setattr(http_server, "_SEND_TIMEOUT", 0.2)
+    monkeypatch.setattr(http_server, "_SEND_BUFFER", 4096)
     with socket.create_connection(("127.0.0.1", port(served))) as idle:
         idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         idle.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -133,12 +131,14 @@ def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served, monkey
     assert longest < 0.2  # far below the time that the page was waited for by its own thread
 
 
-def test_more_connections_than_allowed_are_hung_up_on(served, monkeypatch):
-    server = served._server._server
-    server._free = threading.BoundedSemaphore(1)
-    with socket.create_connection(("127.0.0.1", port(served)), timeout=5) as first:
+def test_more_connections_than_allowed_are_hung_up_on(monkeypatch):
+    monkeypatch.setattr(http_server, "_MAX_CONNECTIONS", 1)
+    with (
+        contextlib.closing(WebPage("127.0.0.1:0")) as served,
+        socket.create_connection(("127.0.0.1", port(served)), timeout=5) as first,
+    ):
         first.sendall(b"GET / HT")  # half a request
-        until(lambda: not server._free.acquire(blocking=False) or server._free.release())
+        time.sleep(0.5)  # it has been accepted
         with socket.create_connection(("127.0.0.1", port(served)), timeout=5) as second:
             assert second.recv(1) == b""
 
