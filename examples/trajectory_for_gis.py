@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream import BaseMap, Localizer, State, read_cloud
-from coview_stream.clouds.geo_reference import GeoReference
+from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.recordings import open_run
 from coview_stream.report.export import export, trajectory_of
 

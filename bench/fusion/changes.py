@@ -21,7 +21,7 @@ from bench.harness.files import folder
 from bench.harness.rows import Row
 from bench.harness.tables import table
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.clouds.filters import open3d
 from coview_stream.fusion.fuse import FuseConfig, Fused, fuse
 from coview_stream.fusion.localized_run import LocalizedRun, RunPair
 from coview_stream.fusion.records import GONE, NEW

@@ -10,7 +10,7 @@ import numpy as np
 from bench.harness.worlds import Place
 from bench.peers.methods import Answer, started
 from coview_stream import BaseMap
-from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.clouds.filters import open3d
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, pose_from

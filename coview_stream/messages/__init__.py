@@ -27,11 +27,12 @@ from typing import Generic, TypeVar
 from coview_stream.errors import ConfigError, MessageError
 from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
 from coview_stream.messages.choose import MessageKind, codec_for
-from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import MAX_PAYLOAD, MAX_POINTS, OversizedError, check_size, read_attachment
 
 __all__ = [
     "CLOUD_CODECS",
+    "LOCATION_CODECS",
     "MAX_PAYLOAD",
     "MAX_POINTS",
     "ODOMETRY_CODECS",
@@ -41,12 +42,14 @@ __all__ = [
     "decode_odometry",
     "decode_pose",
     "encode_cloud",
+    "encode_location",
     "encode_odometry",
     "encode_pose",
     "prepare",
 ]
 
 M = TypeVar("M")
+C = TypeVar("C")
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,11 @@ POSE_CODECS: Mapping[str, Codec[PoseMessage]] = {
     "foxglove": Codec(foxglove.decode_pose, foxglove.encode_pose),
     "cdr": Codec(ros2.decode_pose, ros2.encode_pose),
     "keelson": Codec(keelson.decode_pose, keelson.encode_pose),
+}
+LOCATION_CODECS: Mapping[str, Callable[[LocationMessage], Encoded]] = {
+    "json": json_messages.encode_location,
+    "cdr": ros2.encode_location,
+    "foxglove": foxglove.encode_location,
 }
 _PREPARE: Mapping[str, Callable[[], object]] = {
     "foxglove": foxglove.schemas,
@@ -124,13 +132,18 @@ def encode_pose(message: PoseMessage, name: str) -> Encoded:
     return _named("pose", POSE_CODECS, name).encode(message)
 
 
+def encode_location(message: LocationMessage, name: str) -> Encoded:
+    """Write a location by the codec ``name`` of :data:`LOCATION_CODECS`; locations are written only."""
+    return _named("locations", LOCATION_CODECS, name)(message)
+
+
 def prepare(*names: str) -> None:
     """Import now what the named codecs need, so that no frame waits 0.25 s for it."""
     for name in names:
         _PREPARE.get(name, lambda: None)()
 
 
-def _named(kind: MessageKind, codecs: Mapping[str, Codec[M]], name: str) -> Codec[M]:
+def _named(kind: str, codecs: Mapping[str, C], name: str) -> C:
     if name not in codecs:
         raise ConfigError(f"encoding {name!r} for {kind}; it must be one of {', '.join(codecs)}")
     return codecs[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -11,10 +11,99 @@ import numpy as np
 
 from coview_stream.errors import MessageError, require_library
 from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
-from coview_stream.messages import protobuf_wire
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
-from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
+
+_FIXED = {1: 8, 5: 4}
+_LENGTH = 2
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One field on the wire; offsets in bytes from the start of the message.
+
+    Attributes:
+        number: of the field.
+        sized: whether it has a length.
+        start: offset of its tag.
+        value: offset of its value, after the length.
+        end: offset of what follows.
+    """
+
+    number: int
+    sized: bool
+    start: int
+    value: int
+    end: int
+
+
+def wire_entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
+    """List the top-level fields in order; MessageError if they overrun the payload or are more than ``limit``."""
+    found: list[Entry] = []
+    position = 0
+    while position < len(payload):
+        start = position
+        tag, position = _varint(payload, position)
+        kind = tag & 7
+        value = position
+        if kind == 0:
+            _, position = _varint(payload, position)
+        elif kind == _LENGTH:
+            length, value = _varint(payload, position)
+            position = value + length
+        elif kind in _FIXED:
+            position += _FIXED[kind]
+        else:
+            raise MessageError("the payload is no protobuf message")
+        if position > len(payload) or tag < 8:
+            raise MessageError("the protobuf message is truncated or malformed")
+        found.append(Entry(tag >> 3, kind == _LENGTH, start, value, position))
+        if len(found) > limit:
+            raise MessageError(f"the protobuf message has more than {limit} fields")
+    return found
+
+
+def _varint(payload: bytes | memoryview, position: int) -> tuple[int, int]:
+    value = 0
+    for index, byte in enumerate(payload[position : position + 10]):
+        value |= (byte & 127) << 7 * index
+        if byte < 128:
+            return value, position + index + 1
+    raise MessageError("the protobuf message is truncated or malformed")
+
+
+def split_field(payload: bytes | memoryview, number: int, limit: int) -> tuple[bytes, memoryview]:
+    """Cut a message into all but the sized field ``number``, and a view on that field's last value."""
+    view = memoryview(payload)
+    rest: list[memoryview] = []
+    value = view[:0]
+    for entry in wire_entries(view, limit):
+        if entry.number == number and entry.sized:
+            value = view[entry.value : entry.end]
+        else:
+            rest.append(view[entry.start : entry.end])
+    return b"".join(rest), value
+
+
+def sized_field(number: int, value: bytes) -> bytes:
+    """Write a field of bytes or of a nested message."""
+    return _packed(number << 3 | _LENGTH) + _packed(len(value)) + value
+
+
+def _packed(value: int) -> bytes:
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def wire_timestamp(seconds: int, nanos: int) -> bytes:
+    """Write a google.protobuf.Timestamp; varints are of 64 bits, negative ones in two's complement."""
+    return b"\x08" + _packed(seconds % 2**64) + b"\x10" + _packed(nanos)
+
 
 _ENCODING = "application/protobuf;foxglove."
 _KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
@@ -55,7 +144,7 @@ def _pose(p: Any, q: Any) -> Pose:
 
 def read_cloud(payload: bytes | memoryview) -> CloudMessage:
     """Read a PointCloud and apply its ``pose``, if set, to the points; they are a view where packed and unmoved."""
-    head, data = protobuf_wire.split(payload, _DATA, MAX_FIELDS)
+    head, data = split_field(payload, _DATA, MAX_FIELDS)
     cloud = _parse(schemas().PointCloud, head)
     fields = tuple((f.name, _KINDS[f.type], f.offset) for f in cloud.fields if f.type in _KINDS)
     step = cloud.point_stride
@@ -73,7 +162,7 @@ def read_cloud(payload: bytes | memoryview) -> CloudMessage:
 
 def read_pose(payload: bytes | memoryview) -> tuple[int, Pose, str]:
     """Read stamp, pose and parent frame of a PoseInFrame or a FrameTransform, told apart by their fields."""
-    numbers = {entry.number for entry in protobuf_wire.entries(payload, MAX_FIELDS)}
+    numbers = {entry.number for entry in wire_entries(payload, MAX_FIELDS)}
     if _ROTATION in numbers:
         moved = _parse(schemas().FrameTransform, bytes(payload))
         return _stamp(moved), _pose(moved.translation, moved.rotation), moved.parent_frame_id
@@ -113,7 +202,7 @@ def write_cloud(message: CloudMessage, frame_id: str = "base_link") -> bytes:
     cloud.timestamp.seconds, cloud.timestamp.nanos = stamp_split(message.stamp_ns)
     for name, kind, offset in table.fields:
         cloud.fields.add(name=name, offset=offset, type=_NUMBERS[kind])
-    return bytes(cloud.SerializeToString()) + protobuf_wire.sized_field(_DATA, bytes(table.data))
+    return bytes(cloud.SerializeToString()) + sized_field(_DATA, bytes(table.data))
 
 
 def write_transform(stamp_ns: int, T: Pose, parent: str, child: str) -> bytes:
@@ -141,3 +230,20 @@ def encode_odometry(message: OdometryMessage) -> Encoded:
 def encode_pose(message: PoseMessage) -> Encoded:
     """Write a foxglove.PoseInFrame; it carries neither covariance nor confidence."""
     return _in_frame(message.stamp_ns, message.T_map_body, message.frame_id)
+
+
+def encode_location(message: LocationMessage) -> Encoded:
+    """Write a foxglove.LocationFix."""
+    module: Any = require_library(
+        "foxglove_schemas_protobuf.LocationFix_pb2", "foxglove-schemas-protobuf>=0.3", "Foxglove messages"
+    )
+    fix = module.LocationFix(
+        frame_id="base_link",
+        latitude=message.latitude,
+        longitude=message.longitude,
+        altitude=message.height,
+        position_covariance=np.asarray(message.covariance, dtype=np.float64).ravel().tolist(),
+        position_covariance_type=3,  # known
+    )
+    fix.timestamp.seconds, fix.timestamp.nanos = stamp_split(message.stamp_ns)
+    return Encoded(fix.SerializeToString(), "application/protobuf;foxglove.LocationFix")

@@ -1,6 +1,6 @@
-"""JSON odometry, poses and statuses, strictly read.
+"""JSON odometry, poses, statuses, hypotheses and locations.
 
-Every value is checked, and what is wrong is a MessageError that names the field; extra fields are ignored.
+Reading is strict: every value is checked, a MessageError names the field, and extra fields are ignored.
 """
 
 from __future__ import annotations
@@ -14,13 +14,22 @@ import numpy as np
 from coview_stream.errors import MessageError
 from coview_stream.geometry.pose_numbers import place_fields
 from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Pose, pose_to_tum
-from coview_stream.messages.types import Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.geometry.transforms import Pose
+from coview_stream.messages.types import (
+    Encoded,
+    HypothesesMessage,
+    LocationMessage,
+    OdometryMessage,
+    PoseMessage,
+    Sample,
+)
 from coview_stream.messages.validation import check_size, checked_pose, stamp_from
 
-_ENCODING = "application/json"
-_MAX_BYTES = 64 * 1024  # a pose has 0.8 kB
-_MAX_STATUS_BYTES = 1024 * 1024  # a status has a few kB for each robot
+_MAX_BYTES = 64 * 1024  # a pose takes 0.8 kB
+_MAX_STATUS_BYTES = 1024 * 1024  # a status takes a few kB per robot
+_MAX_HYPOTHESES_BYTES = 16 * 1024  # ours stay below 3 kB
+_MAX_PLACES = 64  # a newer node may send more hypotheses than this one
+_PLACE_DIGITS = {"x": 2, "y": 2, "z": 2, "yaw": 3, "probability": 6, "log_ratio": 1}
 
 
 def decode_odometry(sample: Sample) -> OdometryMessage:
@@ -29,8 +38,13 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
     return OdometryMessage(stamp_from(fields.get("stamp_ns")), _pose(fields))
 
 
+def encode_odometry(message: OdometryMessage) -> Encoded:
+    """Write odometry in the form that :func:`decode_odometry` reads."""
+    return _dump({"stamp_ns": int(message.stamp_ns), **place_fields(message.T_odom_body)}, "pose")
+
+
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read what :func:`encode_pose` writes; what follows ``map_sha256`` may be missing."""
+    """Read a pose in the form that :func:`encode_pose` writes; fields after ``map_sha256`` are optional."""
     fields = read_object(sample.payload)
     return PoseMessage(
         stamp_ns=stamp_from(fields.get("stamp_ns")),
@@ -47,19 +61,17 @@ def decode_pose(sample: Sample) -> PoseMessage:
     )
 
 
-def encode_odometry(message: OdometryMessage) -> Encoded:
-    """Write what :func:`decode_odometry` reads."""
-    return _dump(message.stamp_ns, message.T_odom_body, {}, {})
-
-
 def encode_pose(message: PoseMessage) -> Encoded:
-    """Write a pose with its covariance in rows, (x, y, z, roll, pitch, yaw).
+    """Write a pose with its covariance row by row, (x, y, z, roll, pitch, yaw).
 
-    Fields: stamp_ns, robot, state, position, orientation, covariance, confidence, map_sha256, age_s, frame_id,
-    protection_level and T_map_odom (position and orientation, map <- odometry; null where they are not known).
+    ``protection_level`` and ``T_map_odom`` (position and orientation, map <- odometry) are null where unknown.
     NaN is a MessageError.
     """
-    after = {
+    fields = {
+        "stamp_ns": int(message.stamp_ns),
+        "robot": message.robot,
+        "state": message.state,
+        **place_fields(message.T_map_body),
         "covariance": np.asarray(message.covariance, dtype=np.float64).ravel().tolist(),
         "confidence": float(message.confidence),
         "map_sha256": message.map_sha256,
@@ -68,48 +80,97 @@ def encode_pose(message: PoseMessage) -> Encoded:
         "protection_level": None if message.protection is None else message.protection.to_json(),
         "T_map_odom": None if message.T_map_odom is None else place_fields(message.T_map_odom),
     }
-    before = {"robot": message.robot, "state": message.state}
-    return _dump(message.stamp_ns, message.T_map_body, before, after)
-
-
-def read_status(sample: Sample) -> dict[str, Any]:
-    """Read a node's status, a JSON object; no field of it is required.
-
-    Raises:
-        MessageError: it is none.
-    """
-    try:
-        return read_object(sample.payload, _MAX_STATUS_BYTES)
-    except MessageError as error:
-        raise MessageError(f"{sample.key}: the status is no JSON object ({error})") from error
+    return _dump(fields, "pose")
 
 
 def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
-    """Return a pose's fields as in the native JSON, null where its format does not carry one.
+    """Return a pose's fields as in the native JSON, null where the pose's format lacks one.
 
-    A sample that is JSON is returned as it came, with any fields that a newer node added.
+    A JSON sample is returned unchanged, including fields that a newer node added.
     """
     if sample.payload[:1] == b"{":
         return read_object(sample.payload)
     return pose.to_json()
 
 
+def read_status(sample: Sample) -> dict[str, Any]:
+    """Read a node's status, a JSON object without required fields; MessageError if it is no object."""
+    try:
+        return read_object(sample.payload, _MAX_STATUS_BYTES)
+    except MessageError as error:
+        raise MessageError(f"{sample.key}: the status is no JSON object ({error})") from error
+
+
+def encode_hypotheses(message: HypothesesMessage) -> Encoded:
+    """Write hypotheses as JSON: ``stamp_ns, robot, map_sha256, none, places``, each place an object."""
+    rows: list[dict[str, Any]] = [
+        {name: round(float(value), digits) for (name, digits), value in zip(_PLACE_DIGITS.items(), row, strict=True)}
+        for row in message.places
+    ]
+    for row, name in zip(rows, message.maps, strict=False):
+        row["map"] = name
+    fields = {
+        "stamp_ns": message.stamp_ns,
+        "robot": message.robot,
+        "map_sha256": message.map_sha256,
+        "none": round(message.none, 6),
+        "places": rows,
+    }
+    return _dump(fields, "hypothesis")
+
+
+def decode_hypotheses(sample: Sample) -> HypothesesMessage:
+    """Read hypotheses in the form that :func:`encode_hypotheses` writes; a MessageError names the wrong field."""
+    try:
+        fields = read_object(sample.payload, _MAX_HYPOTHESES_BYTES)
+        rows = fields.get("places")
+        if not isinstance(rows, list) or len(rows) > _MAX_PLACES:
+            raise MessageError(f"places: write a list of at most {_MAX_PLACES}")
+        places = np.array([_place(row) for row in rows], dtype=np.float64).reshape(-1, len(_PLACE_DIGITS))
+        maps = tuple(text(row, "map") for row in rows) if all("map" in row for row in rows) else ()
+        return HypothesesMessage(
+            stamp_ns=stamp_from(fields.get("stamp_ns")),
+            robot=text(fields, "robot"),
+            places=places,
+            none=number(fields.get("none"), "none"),
+            map_sha256=text(fields, "map_sha256"),
+            maps=maps,
+        )
+    except MessageError as error:
+        raise MessageError(f"{sample.key}: {error}") from error
+
+
+def encode_location(message: LocationMessage) -> Encoded:
+    """Write a location as JSON, in degrees and metres."""
+    fields = {
+        "stamp_ns": int(message.stamp_ns),
+        "robot": message.robot,
+        "latitude": round(message.latitude, 9),
+        "longitude": round(message.longitude, 9),
+        "height": round(message.height, 4),
+        "heading_deg": round(math.degrees(message.heading), 3),
+        "covariance_enu": np.asarray(message.covariance, dtype=np.float64).ravel().tolist(),
+        "confidence": None if math.isnan(message.confidence) else message.confidence,
+    }
+    return _dump(fields, "location")
+
+
 def read_object(payload: bytes, limit: int = _MAX_BYTES) -> dict[str, Any]:
-    """Read the fields of a JSON object of at most ``limit`` bytes; no field twice, no NaN, else MessageError."""
+    """Read the fields of a JSON object of at most ``limit`` bytes; MessageError for a repeated field or NaN."""
     check_size(payload, limit)
     try:
-        found = json.loads(payload, parse_constant=_no_constant, object_pairs_hook=_unique)
+        fields = json.loads(payload, parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except MessageError:
         raise
     except (ValueError, RecursionError) as error:
         raise MessageError(f"no JSON: {str(error)[:80]}") from error
-    if not isinstance(found, dict):
+    if not isinstance(fields, dict):
         raise MessageError("the JSON is no object with fields")
-    return found
+    return fields
 
 
 def number(value: object, name: str) -> float:
-    """Check that ``value`` is a finite number, and return it."""
+    """Return ``value`` if it is a finite number; the MessageError names the field ``name``."""
     try:
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
@@ -132,6 +193,13 @@ def text(fields: dict[str, Any], name: str, default: str | None = None) -> str:
     if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
         raise MessageError(f"{name}: write a text")
     return value
+
+
+def _dump(fields: dict[str, Any], noun: str) -> Encoded:
+    try:
+        return Encoded(json.dumps(fields, allow_nan=False, separators=(",", ":")).encode(), "application/json")
+    except ValueError as error:
+        raise MessageError(f"JSON cannot say NaN or infinity: leave such a {noun} out") from error
 
 
 def _pose(fields: dict[str, Any]) -> Pose:
@@ -159,21 +227,18 @@ def _protection(value: object) -> ProtectionLevel | None:
     )
 
 
-def _dump(stamp_ns: int, T: Pose, before: dict[str, Any], after: dict[str, Any]) -> Encoded:
-    row = pose_to_tum(T).tolist()
-    fields = {"stamp_ns": int(stamp_ns), **before, "position": row[:3], "orientation": row[3:], **after}
-    try:
-        return Encoded(json.dumps(fields, allow_nan=False, separators=(",", ":")).encode(), _ENCODING)
-    except ValueError as error:
-        raise MessageError("JSON cannot say NaN or infinity: leave such a pose out") from error
+def _place(row: Any) -> list[float]:
+    if not isinstance(row, dict):
+        raise MessageError(f"places: write objects with {', '.join(_PLACE_DIGITS)}")
+    return [number(row.get(name), f"places.{name}") for name in _PLACE_DIGITS]
 
 
-def _no_constant(name: str) -> NoReturn:
+def _refuse_constant(name: str) -> NoReturn:
     raise MessageError(f"{name} is no JSON number")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
         raise MessageError("a field occurs twice")
-    return found
+    return fields

@@ -7,7 +7,8 @@ inner message's: when it was enclosed is no sensor time.
 from __future__ import annotations
 
 from coview_stream.errors import MessageError
-from coview_stream.messages import foxglove, protobuf_wire
+from coview_stream.messages import foxglove
+from coview_stream.messages.foxglove import sized_field, split_field, wire_timestamp
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import bare_pose, stamp_split
 
@@ -18,7 +19,7 @@ _MAX_ENTRIES = 64
 
 
 def _open(envelope: bytes) -> memoryview:
-    _, payload = protobuf_wire.split(envelope, _PAYLOAD, _MAX_ENTRIES)
+    _, payload = split_field(envelope, _PAYLOAD, _MAX_ENTRIES)
     if not payload:
         raise MessageError("the core.Envelope has no payload")
     return payload
@@ -26,8 +27,8 @@ def _open(envelope: bytes) -> memoryview:
 
 def _close(stamp_ns: int, payload: bytes) -> Encoded:
     """Enclose in an envelope, dated with the sensor's time: a codec has no clock."""
-    enclosed_at = protobuf_wire.timestamp(*stamp_split(stamp_ns))
-    envelope = protobuf_wire.sized_field(_ENCLOSED_AT, enclosed_at) + protobuf_wire.sized_field(_PAYLOAD, payload)
+    enclosed_at = wire_timestamp(*stamp_split(stamp_ns))
+    envelope = sized_field(_ENCLOSED_AT, enclosed_at) + sized_field(_PAYLOAD, payload)
     return Encoded(envelope, _ENCODING)
 
 

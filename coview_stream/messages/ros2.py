@@ -14,7 +14,7 @@ import numpy as np
 from coview_stream.errors import MessageError, require_library
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
-from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -180,3 +180,19 @@ def encode_pose(message: PoseMessage) -> Encoded:
     """Write a PoseWithCovarianceStamped in the map frame; covariance order x, y, z, roll, pitch, yaw, as there."""
     head = header(message.stamp_ns, message.frame_id)
     return write(new(POSE, header=head, pose=_pose_out(message.T_map_body, message.covariance)), POSE)
+
+
+def encode_location(message: LocationMessage) -> Encoded:
+    """Write a sensor_msgs/NavSatFix in CDR; its service is none of a satellite (0)."""
+    status = new("sensor_msgs/msg/NavSatStatus", status=0, service=0)
+    fix = new(
+        "sensor_msgs/msg/NavSatFix",
+        header=header(message.stamp_ns, "base_link"),
+        status=status,
+        latitude=message.latitude,
+        longitude=message.longitude,
+        altitude=message.height,
+        position_covariance=np.ascontiguousarray(message.covariance, dtype=np.float64).ravel(),
+        position_covariance_type=3,  # known
+    )
+    return write(fix, "sensor_msgs/msg/NavSatFix")

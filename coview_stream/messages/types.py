@@ -173,3 +173,49 @@ class PoseMessage:
         """Return robot, stamp, state and pose in one line."""
         pose = pose_in_words(self.T_map_body, self.covariance)
         return f"PoseMessage({self.robot!r}, {self.stamp:.3f} s, {self.state}: {pose})"
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesesMessage:
+    """Places that a search for one robot considers, none of which is known to be right.
+
+    Attributes:
+        stamp_ns: sensor time of the keyframe, nanoseconds.
+        robot: name.
+        places: (K, 6) float64, the most probable first: x, y, z (metres) and yaw (radians) of the body in the map's
+            frame, posterior probability, log-likelihood ratio against chance.
+        none: probability that the robot is at no place of the map.
+        map_sha256: hash of the base map.
+        maps: of several maps, the name of the one that each place is on, in whose frame it is; empty of one map.
+    """
+
+    stamp_ns: int
+    robot: str
+    places: Floats
+    none: float
+    map_sha256: str
+    maps: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LocationMessage:
+    """Where a robot is on Earth (WGS 84).
+
+    Attributes:
+        stamp_ns: sensor time, nanoseconds.
+        robot: name.
+        latitude: degrees, north positive. longitude: east positive.
+        height: metres; see :class:`coview_stream.clouds.reference_system.GeoReference`.
+        heading: radians, clockwise from true north.
+        covariance: (3, 3) east, north, up, m2.
+        confidence: as of the pose.
+    """
+
+    stamp_ns: int
+    robot: str
+    latitude: float
+    longitude: float
+    height: float
+    heading: float
+    covariance: Floats
+    confidence: float

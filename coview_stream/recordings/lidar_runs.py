@@ -15,9 +15,8 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import Pose, Poses
 from coview_stream.odometry.lidar_odometry import LidarOdometry
-from coview_stream.recordings.bags import BagClouds, open_bag
+from coview_stream.recordings.bags import BagClouds, Track, open_bag
 from coview_stream.recordings.layouts import find_bag, find_layout, read_stamps
-from coview_stream.recordings.odometry_track import Track
 from coview_stream.recordings.run import Run, single_frame_run
 
 Progress = Callable[[int, int], None]

@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.clouds.geo_reference import GeoReference
+from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, pose_to_tum

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.clouds.filters import open3d
 from coview_stream.geometry.arrays import Floats32, Indices
 from coview_stream.sim.mesh import Mesh
 from coview_stream.sim.scenes import SceneState

@@ -12,8 +12,7 @@ from coview_stream.basemap.map_view import MapView
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, pose_to_tum, rot_z, transform
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
 
 _NS = 1_000_000_000

@@ -17,8 +17,7 @@ from coview_stream.basemap.map_view import MapView
 from coview_stream.errors import ConfigError, DependencyError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
 
 _HOST = "127.0.0.1"

@@ -1,7 +1,7 @@
 """Scene: what there is to see of a session, as plain data.
 
 Poses and hypotheses are the messages themselves (:class:`~coview_stream.messages.types.PoseMessage`,
-:class:`~coview_stream.messages.hypotheses.HypothesesMessage`), a status is the node's JSON, and the map is a
+:class:`~coview_stream.messages.types.HypothesesMessage`), a status is the node's JSON, and the map is a
 :class:`~coview_stream.basemap.map_view.MapView`; what else there is stands here.
 """
 
@@ -15,8 +15,7 @@ import numpy as np
 
 from coview_stream.basemap.map_view import MapView
 from coview_stream.geometry.transforms import Points, Pose, interpolate
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 
 # set by hand
 _KEPT = 64  # poses of a robot, to look scans' poses up in

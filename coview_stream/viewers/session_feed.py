@@ -17,8 +17,8 @@ import numpy as np
 from coview_stream.basemap.map_view import MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
-from coview_stream.messages.hypotheses import HypothesesMessage, decode_hypotheses
-from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.messages.json_messages import decode_hypotheses
+from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Policy, Transport

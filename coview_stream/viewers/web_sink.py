@@ -15,8 +15,7 @@ import numpy as np
 from coview_stream.basemap.map_view import MapView
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, transform, yaw_of
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
 from coview_stream.viewers.web_hub import WebHub, encode_event
 

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from coview_stream.clouds import open3d_loader
+from coview_stream.clouds import filters
 from coview_stream.errors import DependencyError
 
 
 @pytest.fixture(autouse=True)
 def _fresh_cache() -> Iterator[None]:
-    open3d_loader.open3d.cache_clear()
+    filters.open3d.cache_clear()
     yield
-    open3d_loader.open3d.cache_clear()
+    filters.open3d.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -34,15 +34,15 @@ def test_missing_open3d_library_is_named_with_remedy(
     def fail() -> None:
         raise error
 
-    monkeypatch.setattr(open3d_loader, "_import_open3d", fail)
+    monkeypatch.setattr(filters, "_import_open3d", fail)
     with pytest.raises(DependencyError, match=remedy):
-        open3d_loader.open3d()
+        filters.open3d()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libusb is preloaded on Linux only")
 def test_libusb_is_preloaded_and_open3d_import_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     attempts = []
-    real = open3d_loader._import_open3d
+    real = filters._import_open3d
 
     def first_without_libusb() -> object:
         attempts.append(1)
@@ -50,6 +50,6 @@ def test_libusb_is_preloaded_and_open3d_import_retried(monkeypatch: pytest.Monke
             raise ImportError("libusb-1.0.so.0: cannot open shared object file")
         return real()
 
-    monkeypatch.setattr(open3d_loader, "_import_open3d", first_without_libusb)
-    assert open3d_loader.open3d().__name__ == "open3d"
+    monkeypatch.setattr(filters, "_import_open3d", first_without_libusb)
+    assert filters.open3d().__name__ == "open3d"
     assert len(attempts) == 2

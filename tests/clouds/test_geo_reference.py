@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from coview_stream.clouds.geo_reference import GeoReference
+from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import InputError
 
 pyproj = pytest.importorskip("pyproj", reason="pyproj is not there; pip install 'coview-stream[geo]'")

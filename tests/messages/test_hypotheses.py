@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import MessageError
-from coview_stream.messages.hypotheses import HypothesesMessage, decode_hypotheses, encode_hypotheses
-from coview_stream.messages.types import Sample
+from coview_stream.messages.json_messages import decode_hypotheses, encode_hypotheses
+from coview_stream.messages.types import HypothesesMessage, Sample
 
 KEY = "coview/r1/out/hypotheses"
 

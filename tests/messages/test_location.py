@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import ConfigError
-from coview_stream.messages import ros2
-from coview_stream.messages.location import LocationMessage, encode_location
+from coview_stream.messages import encode_location, ros2
+from coview_stream.messages.types import LocationMessage
 
 MESSAGE = LocationMessage(
     1_700_000_000_000_000_005, "r1", 50.123456789, -8.5, 101.25, math.radians(270), np.diag([1.0, 2.0, 3.0]), 0.999

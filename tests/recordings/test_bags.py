@@ -17,7 +17,7 @@ from coview_stream.clouds import write_tum
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.recordings.bag_reader import BagReader
-from coview_stream.recordings.odometry_track import Track
+from coview_stream.recordings.bags import Track
 from coview_stream.recordings.open_run import open_run
 
 START = 1_700_000_000_000_000_000

@@ -11,9 +11,8 @@ import pytest
 from bag_files import cloud, odometry, write_bag
 
 from coview_stream.errors import CoViewError, RunError
-from coview_stream.recordings import bounded_decompression
-from coview_stream.recordings.bag_reader import BagReader
-from coview_stream.recordings.bounded_decompression import bounded
+from coview_stream.recordings import bag_reader
+from coview_stream.recordings.bag_reader import BagReader, bounded
 from coview_stream.recordings.open_run import open_run
 
 WORDS = [b"", b"a", b"abc" * 1000]
@@ -32,9 +31,9 @@ def test_frames_come_back_whole_and_no_longer_than_allowed(
     bomb = pack(bytes(10**7))
     with pytest.raises(ValueError, match="early"):
         unpack(bomb[: len(bomb) // 2])
-    monkeypatch.setattr(bounded_decompression, "LIMIT", 10**7)
+    monkeypatch.setattr(bag_reader, "LIMIT", 10**7)
     assert len(unpack(bomb)) == 10**7
-    monkeypatch.setattr(bounded_decompression, "LIMIT", 10**7 - 1)
+    monkeypatch.setattr(bag_reader, "LIMIT", 10**7 - 1)
     with pytest.raises(ValueError, match="more than"):
         unpack(bomb)
 
@@ -48,7 +47,7 @@ def test_a_recording_that_unpacks_to_too_much_is_refused(
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(3)]}  # fmt: skip
     bag = write_bag(tmp_path / "a", topics, storage, compression)
     assert len(open_run(bag)) == 3
-    monkeypatch.setattr(bounded_decompression, "LIMIT", 1000)
+    monkeypatch.setattr(bag_reader, "LIMIT", 1000)
     with pytest.raises(CoViewError, match=r"unpacks to more than|not one"):
         open_run(bag)
 
@@ -59,10 +58,10 @@ def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, m
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(5)]}  # fmt: skip
     bag = write_bag(tmp_path / "a", topics, "sqlite3", "FILE")
     packed = next(bag.glob("*.zstd")).stat().st_size
-    monkeypatch.setattr(bounded_decompression, "LIMIT", 10_000_000)
+    monkeypatch.setattr(bag_reader, "LIMIT", 10_000_000)
     assert len(open_run(bag)) == 5
-    monkeypatch.setattr(bounded_decompression, "LIMIT", 0)
-    assert 5 * points.nbytes > bounded_decompression.RATIO * packed
+    monkeypatch.setattr(bag_reader, "LIMIT", 0)
+    assert 5 * points.nbytes > bag_reader.RATIO * packed
     with pytest.raises(CoViewError, match="a hundred times its size"):
         open_run(bag)
 
@@ -76,4 +75,4 @@ def test_readers_are_bounded_once_opened(tmp_path: Path) -> None:
         BagReader(tmp_path / "a.mcap")
     found = [storage_mcap.DECOMPRESSORS[name] for name in ("zstd", "lz4")]
     found += [reader.decompressors[name] for name in ("bz2", "lz4")]
-    assert all(each.__module__ == bounded_decompression.__name__ for each in found)
+    assert all(each.__module__ == bag_reader.__name__ for each in found)

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from coview_stream.clouds.geo_reference import GeoReference
+from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.report.export import FORMATS, chosen_formats, export, reference_for, trajectory_of

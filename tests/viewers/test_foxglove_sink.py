@@ -10,8 +10,7 @@ import pytest
 from coview_stream.basemap.map_view import MapView
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not there; pip install 'coview-stream[foxglove]'")

@@ -16,8 +16,8 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose
-from coview_stream.messages.hypotheses import HypothesesMessage, encode_hypotheses
-from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.messages.json_messages import encode_hypotheses
+from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.viewers import session_feed

@@ -15,8 +15,8 @@ from coview_stream.basemap.map_view import MapView
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose
-from coview_stream.messages.hypotheses import HypothesesMessage, encode_hypotheses
-from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.messages.json_messages import encode_hypotheses
+from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.viewers.session_feed import SessionFeed
 from coview_stream.viewers.topics import topics_of_robots

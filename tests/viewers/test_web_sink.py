@@ -13,8 +13,7 @@ from test_web_hub import events
 from coview_stream.basemap.map_view import MapView
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan
 from coview_stream.viewers.web_hub import WebHub
 from coview_stream.viewers.web_sink import WebSink, packed_map

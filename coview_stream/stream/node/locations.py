@@ -11,11 +11,11 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.joined.map_parts import MapParts
-from coview_stream.clouds.geo_reference import GeoReference
+from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import yaw_of
-from coview_stream.messages.location import LocationMessage, encode_location
-from coview_stream.messages.types import PoseMessage
+from coview_stream.messages import encode_location
+from coview_stream.messages.types import LocationMessage, PoseMessage
 from coview_stream.stream.transport.transport import Publisher
 
 log = logging.getLogger("coview_stream.node")

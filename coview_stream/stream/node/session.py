@@ -22,8 +22,7 @@ from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry
-from coview_stream.messages.hypotheses import HypothesesMessage
-from coview_stream.messages.types import CloudMessage, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.types import CloudMessage, HypothesesMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of
 from coview_stream.stream.node.engine_queue import EngineQueue

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from coview_stream.localization.state import State
-from coview_stream.messages.hypotheses import encode_hypotheses
+from coview_stream.messages.json_messages import encode_hypotheses
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections

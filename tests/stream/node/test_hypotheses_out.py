@@ -14,7 +14,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import TransportError
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.messages.hypotheses import decode_hypotheses
+from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.stream.node.map_view import MapViewAnswer
 from coview_stream.stream.node.session import Session
 

@@ -13,7 +13,7 @@ from coview_stream.basemap.joined.map_parts import MapPart, MapParts
 from coview_stream.errors import InputError
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.messages.hypotheses import decode_hypotheses, encode_hypotheses
+from coview_stream.messages.json_messages import decode_hypotheses, encode_hypotheses
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.initial_pose import guess_of_fields
 from coview_stream.stream.node.status import status
