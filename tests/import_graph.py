@@ -39,6 +39,22 @@ FOLDERS = (
 """Folders in the way of the data: each may import those before it, none those after it."""
 
 INNER = {
+    "basemap": (
+        "signature",
+        "file_format",
+        "tiles",
+        "ground",
+        "stations",
+        "station_index",
+        "likelihood_field",
+        "sources",
+        "build",
+        "map_parts",
+        "summary",
+        "site",
+        "basemap",
+        "joined",
+    ),
     "localization": ("state", "registration", "evidence", "calibration", "tracking", "result", "search"),
     "stream": ("transport", "maps", "node", "client"),
 }

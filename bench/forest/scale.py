@@ -25,7 +25,7 @@ from bench.harness.clock import Clock
 from bench.harness.rows import Row, bounded
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.geometry.arrays import Bools, Floats32, Ints

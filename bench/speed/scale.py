@@ -31,8 +31,8 @@ from bench.harness.rows import Row, against, bounded, informs, reached
 from bench.harness.worlds import WORLDS, opened, prepare, world_name
 from bench.speed.search import last_core
 from coview_stream import BaseMap
-from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32, Ints

@@ -16,12 +16,11 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_kernels.mapped import release
 from coview_stream.basemap import file_format, tiles
+from coview_stream.basemap.file_format import check_arrays
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, field_of
-from coview_stream.basemap.shapes import check_arrays
-from coview_stream.basemap.signature import SigningKey, VerifyKey, read_verify_key
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.signature import FileIdentity, SigningKey, Trust, VerifyKey, read_verify_key
 from coview_stream.basemap.station_index import StationIndex
-from coview_stream.basemap.trust import FileIdentity, Trust
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.clouds.reference_system import short_name
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, config_of_map, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError, naming_missing_libraries
@@ -128,7 +127,7 @@ class BaseMap:
                 checked.
             verify_key: public key, or its PEM file, that the map has to be signed with; its content is compared with
                 the signed hashes then, whatever ``check`` says. A
-                :class:`~coview_stream.basemap.trust.Trust` names a file that has been compared already, and is not
+                :class:`~coview_stream.basemap.signature.Trust` names a file that has been compared already, and is not
                 read again.
 
         Raises:
@@ -219,7 +218,7 @@ class BaseMap:
         Raises:
             DependencyError: matplotlib is missing.
         """
-        from coview_stream.basemap.plan import draw_plan
+        from coview_stream.basemap.summary import draw_plan
 
         return draw_plan(self.sampled_points, self.origin, self.config.voxel, axes)
 

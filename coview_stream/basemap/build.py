@@ -12,12 +12,11 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from coview_stream.basemap.file_format import Arrays
-from coview_stream.basemap.floors import below_another
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.sources import Source
 from coview_stream.basemap.station_index import StationIndex
-from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
+from coview_stream.basemap.stations import Progress, below_another, describe_storeys, find_stations
 from coview_stream.basemap.tiles import scaled_normals, sort_by_tile, unit_normals
 from coview_stream.clouds.cloud import Cloud, merge
 from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -19,10 +19,20 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels.mapped import release
-from coview_stream.basemap import trust as trusting
-from coview_stream.basemap.signature import SigningKey
-from coview_stream.basemap.trust import FileIdentity, Trust
+from coview_kernels.reference.field import TILE as FIELD_TILE
+from coview_stream.basemap.signature import (
+    FileIdentity,
+    SigningKey,
+    Trust,
+    check_sections,
+    check_signature,
+    file_identity,
+    serialized,
+    sha256_of,
+    sign_header,
+)
 from coview_stream.clouds.atomic_file import atomic_file
+from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
 
 FORMAT = "coview-map"
@@ -77,7 +87,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
     names, header = _layout(contiguous, metadata)
     if key is not None:
-        trusting.sign(header, {name: trusting.digest(_chunks(contiguous[name])) for name in sorted(names)}, key)
+        sign_header(header, {name: sha256_of(_chunks(contiguous[name])) for name in sorted(names)}, key)
     try:
         with atomic_file(path, sync=True) as file:
             _write(file, contiguous, names, header)
@@ -124,7 +134,7 @@ def _layout(arrays: Arrays, metadata: dict[str, str]) -> tuple[list[str], dict[s
 
 def _header_bytes(header: dict[str, Any]) -> bytes:
     """Return a header with its length, padded to fill cache lines."""
-    text = trusting.serialized(header)
+    text = serialized(header)
     text += b" " * (-(8 + len(text)) % _CACHE_LINE)
     return len(text).to_bytes(8, "little") + text
 
@@ -183,7 +193,7 @@ def open_file(
     with file:
         if opened is not None:
             opened(file)
-        identity = trusting.identity(file)
+        identity = file_identity(file)
         header, start = _header(path, file)
         metadata = header.get("__metadata__", {})
         if metadata.get("format") != FORMAT:
@@ -193,7 +203,7 @@ def open_file(
                 f"{path}: map format {metadata.get('version')}, this program reads {VERSION}; build the map again"
             )
         if trust is not None:
-            trusting.check_signature(path, header, _is_exact(file, header, start), trust.key)
+            check_signature(path, header, _is_exact(file, header, start), trust.key)
         try:
             names = sorted(header.keys() - {"__metadata__"})
             if len(names) > _MAX_ARRAYS:
@@ -206,7 +216,7 @@ def open_file(
                 raise ValueError("it holds bytes that belong to no array and are not signed")
             digest = str(metadata.get("sha256"))
             if trust is not None and trust.verified != identity:
-                trusting.check_sections(header, lambda name: _read(file, start, header[name]))
+                check_sections(header, lambda name: _read(file, start, header[name]))
             elif trust is None and check and checked != identity:
                 digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
             parameters = json.loads(metadata["parameters"])
@@ -216,7 +226,7 @@ def open_file(
             raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
         if digest != metadata.get("sha256"):
             raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
-        if trust is not None and trusting.identity(file) != identity:
+        if trust is not None and file_identity(file) != identity:
             raise MapError(f"{path}: the map was written to while it was verified; open it again when that is done")
     return Loaded(arrays, parameters, digest, identity)
 
@@ -296,3 +306,79 @@ def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[b
         for chunk in content(name):
             total.update(chunk)
     return total.hexdigest()
+
+
+_Shape = tuple[str | int, ...]
+
+_EXPECTED: dict[str, tuple[str, _Shape]] = {
+    "origin": ("<f8", (3,)),
+    "stations": ("<f4", ("stations", 3)),
+    "points": ("<f4", ("points", 3)),
+    "normals": ("|i1", ("points", 3)),
+    "tile_index": ("<i8", ("tiles", 4)),
+    "surveyed": ("|u1", ("rows", "columns")),
+    "surveyed_corner": ("<f8", (2,)),
+    **{
+        f"station_codes{tier}{part}": what
+        for tier in ("", ".rest")
+        for part, what in {
+            "": ("<i2", ("stations", 16, 16)),
+            ".basis": ("<f4", (16, 16, "columns of the basis", 2)),
+            ".step": ("<f4", (16, 2, 16)),
+            ".norm": ("<f4", (33,)),
+        }.items()
+    },
+    "field.tiles": ("<i4", ("field tiles", 3)),
+    "field.occupied": ("<i8", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "field.ground": ("<i2", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "field.edge": ("|u1", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "learned.local": ("|i1", ("learned tiles", "learned rows", "learned columns", "features")),
+    "learned.sigma": ("|u1", ("learned tiles", "learned rows", "learned columns")),
+    "learned.tiles": ("<i4", ("learned tiles", 2)),
+    "learned.place": ("|i1", ("places", "numbers")),
+    "learned.place_at": ("<f4", ("places", 2)),
+}
+"""Type and shape of each array; a dimension with a name is as long wherever it occurs."""
+
+_MAX_METRES = 1e7  # set by hand, of a corner or a station: no map of the Earth is larger
+
+
+def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> None:
+    """Compare type, shape and what else is read as an index.
+
+    Raises:
+        MapError: an array is not what a map of this configuration has; the message names it.
+    """
+    descriptor = ("<f2", ("stations", config.descriptor.rings, config.descriptor.sectors))
+    expected = _EXPECTED | {f"descriptor.{name}": descriptor for name in config.descriptor.channels}
+    known: dict[str, int] = {}
+    for name, (kind, dimensions) in expected.items():
+        array = arrays.get(name)
+        if array is None:
+            continue  # which ones there have to be, the map says itself
+        if array.dtype != np.dtype(kind) or array.ndim != len(dimensions):
+            raise _refused(
+                name, f"is {array.dtype} {array.shape}, not {np.dtype(kind)} in {len(dimensions)} dimensions"
+            )
+        for found, dimension in zip(array.shape, dimensions, strict=True):
+            length = dimension if isinstance(dimension, int) else known.setdefault(dimension, found)
+            if found != length:
+                raise _refused(name, f"has the shape {array.shape}, with {found} where {length} were expected")
+    _check_values(arrays)
+
+
+def _check_values(arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    if not np.isfinite(arrays["origin"]).all():
+        raise _refused("origin", "is not finite")
+    for name in ("surveyed_corner", "stations"):
+        with np.errstate(invalid="ignore"):
+            # false for NaN as well
+            if not (np.abs(arrays[name]) < _MAX_METRES).all():
+                raise _refused(name, f"is not finite, or beyond {_MAX_METRES:g} m")
+    begin, end = arrays["tile_index"][:, 2], arrays["tile_index"][:, 3]
+    if not ((begin >= 0) & (begin <= end) & (end <= len(arrays["points"]))).all():
+        raise _refused("tile_index", "names points that are not there")
+
+
+def _refused(name: str, what: str) -> MapError:
+    return MapError(f"the map's {name} {what}; copy or build it again")

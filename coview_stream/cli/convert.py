@@ -32,8 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.signature import SigningKey
-    from coview_stream.basemap.site.light import lighten
-    from coview_stream.basemap.site.split import join, split
+    from coview_stream.basemap.site.convert import join, lighten, split
     from coview_stream.errors import ConfigError
 
     key = None if args.sign is None else SigningKey(args.sign)

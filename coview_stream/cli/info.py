@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.site.part import site_directory
+    from coview_stream.basemap.site.manifest import site_directory
     from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError
 

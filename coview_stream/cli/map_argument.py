@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.joined.served_maps import ServedMaps
+    from coview_stream.basemap.joined import ServedMaps
     from coview_stream.basemap.signature import VerifyKey
-    from coview_stream.basemap.site.mirror import Mirror
+    from coview_stream.basemap.site.fetch import Mirror
     from coview_stream.basemap.site.served_site import ServedSite
 
 
@@ -71,10 +71,9 @@ def local_map(
     if around is None and "://" not in name:
         return LocalMap(Path(name))  # without the modules below: most maps are files
 
-    from coview_stream.basemap.site.manifest import Manifest, is_site
-    from coview_stream.basemap.site.part import Around, part_file, tiles_around
+    from coview_stream.basemap.site.fetch import is_site_address
+    from coview_stream.basemap.site.manifest import Around, Manifest, is_site, part_file, tiles_around
     from coview_stream.basemap.site.served_site import ServedSite
-    from coview_stream.basemap.site.site_source import is_site_address
     from coview_stream.errors import ConfigError
 
     circle = None if around is None else Around.parse(around)
@@ -134,7 +133,7 @@ def _several(
     follows: bool,
 ) -> LocalMap:
     """Return several maps as one, by their names; the arguments are those of :func:`local_map`."""
-    from coview_stream.basemap.joined.served_maps import ServedMaps
+    from coview_stream.basemap.joined import ServedMaps
 
     found = [(name, local_map(path, around, verify_key, base, connect, config)) for name, path in maps]
     mirrors = [each.mirror for _, each in found if each.mirror is not None]

@@ -31,8 +31,8 @@ def run(args: argparse.Namespace) -> int:
 
     from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.stream.maps.map_keys import MapKeys
     from coview_stream.stream.maps.map_server import MapServer
+    from coview_stream.stream.maps.zenoh_source import MapKeys
 
     start_logging(logging.ERROR if args.quiet else logging.INFO, False)
     if args.name is not None and len(args.directories) > 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.map_view import MapView
+    from coview_stream.basemap.summary import MapView
     from coview_stream.config.mount import Mount
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.transport.keys import RobotKeys
@@ -133,6 +133,6 @@ def map_of_watch(path: Path | None) -> MapView | None:
     if path is None:
         return None
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.map_view import MapView
+    from coview_stream.basemap.summary import MapView
 
     return MapView.of(BaseMap.load(path, check=False))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, pose_to_tum, rot_z, transform

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from coview_stream.basemap.map_view import MAX_WIRE_BYTES, MapView
+from coview_stream.basemap.summary import MAX_WIRE_BYTES, MapView
 from coview_stream.stream.transport.transport import Transport
 
 _TIMEOUT = 10.0  # seconds of a question, set by hand: the first makes the node thin its map

@@ -2,7 +2,7 @@
 
 Poses and hypotheses are the messages themselves (:class:`~coview_stream.messages.types.PoseMessage`,
 :class:`~coview_stream.messages.types.HypothesesMessage`), a status is the node's JSON, and the map is a
-:class:`~coview_stream.basemap.map_view.MapView`; what else there is stands here.
+:class:`~coview_stream.basemap.summary.MapView`; what else there is stands here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.transforms import Points, Pose, interpolate
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 

@@ -14,7 +14,7 @@ from operator import methodcaller
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
 from coview_stream.messages.json_messages import decode_hypotheses

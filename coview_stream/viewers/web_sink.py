@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, transform, yaw_of
 from coview_stream.messages.types import HypothesesMessage, PoseMessage

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.geometry.transforms import Pose, inverse

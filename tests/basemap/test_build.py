@@ -9,7 +9,7 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.build import surveyed_cells
-from coview_stream.basemap.cloth import cloth_available
+from coview_stream.basemap.ground import cloth_available
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import CloudError, ConfigError, CoViewError, MapError

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from coview_stream.basemap.cloth import cloth_available
-from coview_stream.basemap.floors import LevelConfig, ground_levels, indoor_floors
-from coview_stream.basemap.ground import GroundConfig, GroundRaster, ground_filter, ground_mask
+from coview_stream.basemap.ground import GroundConfig, GroundRaster, cloth_available, ground_filter, ground_mask
+from coview_stream.basemap.stations import LevelConfig, ground_levels, indoor_floors
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rasters import filled
 

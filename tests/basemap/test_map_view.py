@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.errors import MessageError
 
 

@@ -12,8 +12,7 @@ import pytest
 
 from coview_stream.basemap import file_format, signature
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.signature import SigningKey, VerifyKey, make_keys, read_verify_key
-from coview_stream.basemap.trust import Trust
+from coview_stream.basemap.signature import SigningKey, Trust, VerifyKey, make_keys, read_verify_key
 from coview_stream.errors import DependencyError, InputError, MapError
 from coview_stream.stream.node.engines import open_engine
 
@@ -128,14 +127,14 @@ def test_signature_of_another_map_does_not_fit(path, keys, key, tmp_path):
 def test_file_that_is_replaced_while_it_is_verified_is_not_mixed(path, key, keys, monkeypatch, tmp_path):
     other = tmp_path / "other.coview"
     file_format.save(other, arrays(1), PARAMETERS, SigningKey(f"{keys[0]}.key"))
-    check = file_format.trusting.check_signature
+    check = file_format.check_signature
 
     def replace_then_check(*args):
         if other.exists():
             other.replace(path)
         check(*args)
 
-    monkeypatch.setattr(file_format.trusting, "check_signature", replace_then_check)
+    monkeypatch.setattr(file_format, "check_signature", replace_then_check)
     with pytest.raises(MapError, match="while it was verified; open it again"):
         opened(path, key)
     np.testing.assert_array_equal(opened(path, key).arrays["points"], arrays(1)["points"])
@@ -143,7 +142,7 @@ def test_file_that_is_replaced_while_it_is_verified_is_not_mixed(path, key, keys
 
 def test_file_that_is_written_to_while_it_is_verified_is_refused(path, key, monkeypatch):
     whole = path.read_bytes()
-    check = file_format.trusting.check_sections
+    check = file_format.check_sections
 
     def check_then_write(*args):
         check(*args)
@@ -152,7 +151,7 @@ def test_file_that_is_written_to_while_it_is_verified_is_refused(path, key, monk
             file.write(b"\xff")
         os.utime(path, ns=(1, 1))
 
-    monkeypatch.setattr(file_format.trusting, "check_sections", check_then_write)
+    monkeypatch.setattr(file_format, "check_sections", check_then_write)
     with pytest.raises(MapError, match="written to while it was verified"):
         opened(path, key)
 
@@ -160,7 +159,7 @@ def test_file_that_is_written_to_while_it_is_verified_is_refused(path, key, monk
 def test_verified_file_is_not_read_again_and_a_changed_one_is(path, key, monkeypatch):
     known = opened(path, key).identity
     with monkeypatch.context() as patch:
-        patch.setattr(file_format.trusting, "check_sections", lambda *_: pytest.fail("read again"))
+        patch.setattr(file_format, "check_sections", lambda *_: pytest.fail("read again"))
         opened(path, key, known)
     damaged = bytearray(path.read_bytes())
     damaged[-1] ^= 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 
 BLOCK = 2.0
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.basemap.floors import below_another
-from coview_stream.basemap.stations import describe_storeys
+from coview_stream.basemap.stations import below_another, describe_storeys
 from coview_stream.config import DescriptorConfig
 
 

@@ -7,7 +7,7 @@ import socket
 import numpy as np
 import pytest
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages.types import HypothesesMessage, PoseMessage

@@ -11,7 +11,7 @@ import pytest
 from fake_robot import KEYS, SHA, cloud, ns
 from sockets import until
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.geometry.transforms import pose_from, rot_z

@@ -13,7 +13,7 @@ import numpy as np
 from fake_robot import KEYS, SHA, ns
 from sockets import until
 
-from coview_stream.basemap.map_view import POINTS_ON_WIRE, MapView
+from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
 from coview_stream.cli import build_parser
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample

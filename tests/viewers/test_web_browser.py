@@ -11,7 +11,7 @@ from fake_robot import KEYS, SHA, cloud, ns
 from sockets import until
 from web_driver import Browser
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose

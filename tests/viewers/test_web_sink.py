@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_web_hub import events
 
-from coview_stream.basemap.map_view import MapView
+from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages.types import HypothesesMessage, PoseMessage

@@ -21,10 +21,9 @@ from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, LAYERS, field_a
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble_codes import station_codes
 from coview_stream.basemap.site.earlier import PARAMETER, Earlier, record, states_of
-from coview_stream.basemap.site.grid import Key, SiteGrid
-from coview_stream.basemap.site.manifest import Manifest, TileEntry
+from coview_stream.basemap.site.manifest import Key, Manifest, SiteGrid, TileEntry
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_clouds import TileClouds, layer_of
-from coview_stream.basemap.site.tile_store import TileStore
 from coview_stream.basemap.tiles import unit_normals
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError

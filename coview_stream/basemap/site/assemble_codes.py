@@ -10,7 +10,7 @@ from coview_kernels import StationCodes
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.earlier import Earlier
-from coview_stream.basemap.site.grid import HALO, Key
+from coview_stream.basemap.site.manifest import HALO, Key
 from coview_stream.basemap.site.tile_clouds import TileClouds
 from coview_stream.basemap.station_index import CODES, StationIndex, sampled_stations
 from coview_stream.basemap.stations import Described, describe_storeys

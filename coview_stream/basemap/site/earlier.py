@@ -22,9 +22,8 @@ from coview_kernels.mapped import release
 from coview_stream.basemap import file_format
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
-from coview_stream.basemap.site import cache
-from coview_stream.basemap.site.grid import Key
-from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.manifest import Key, Manifest
+from coview_stream.basemap.site.store import cache_folder, checked, read_record, write_record
 from coview_stream.basemap.site.tile_clouds import TileClouds
 from coview_stream.basemap.station_index import CODES, StationIndex
 from coview_stream.config import Channel, config_of_map
@@ -56,7 +55,7 @@ class Earlier:
         if path is None:
             return
         try:
-            loaded = file_format.open_file(path, checked=cache.checked(path))
+            loaded = file_format.open_file(path, checked=checked(path))
             known = {
                 str(state): (slice(first, first + count), slice(row, row + rows))
                 for state, first, count, row, rows in loaded.parameters.get(PARAMETER, ())
@@ -124,15 +123,15 @@ def states_of(manifest: Manifest, clouds: TileClouds) -> dict[Key, str]:
 def earlier_file(directory: Path) -> Path | None:
     """Return the working file that was made last of a site's directory, if it is still there."""
     try:
-        path = cache.cache_folder() / str(cache.read_record(cache.cache_folder() / "parts" / _record_name(directory)))
+        path = cache_folder() / str(read_record(cache_folder() / "parts" / _record_name(directory)))
     except (OSError, ValueError):
         return None
-    return path if path.parent == cache.cache_folder() and path.is_file() else None
+    return path if path.parent == cache_folder() and path.is_file() else None
 
 
 def remember_file(directory: Path, path: Path) -> None:
     """Keep which working file was made last of a site's directory."""
-    cache.write_record(_record_name(directory), path.name)
+    write_record(_record_name(directory), path.name)
 
 
 def _record_name(directory: Path) -> str:

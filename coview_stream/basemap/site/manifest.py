@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from coview_stream.basemap.signature import SigningKey, VerifyKey
-from coview_stream.basemap.site.tile_store import SHA256
+from coview_stream.basemap.site.store import SHA256, cache_folder, read_record, write_record
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.errors import MapError
+from coview_stream.config import MapConfig
+from coview_stream.errors import ConfigError, MapError
+from coview_stream.geometry.arrays import Floats, Ints, Reals
 
 FORMAT = "coview-site"
 VERSION = 2
@@ -251,3 +257,181 @@ def _number(value: Any) -> float:
     if type(value) not in (int, float) or not math.isfinite(value) or abs(value) > _MAX_METRES:
         raise ValueError(f"{str(value)[:40]} is no length")
     return float(value)
+
+
+TILE = 320.0
+"""Edge of a tile, metres: a multiple of what else the map is cut into (20, 16 and 32 m, stations' blocks of 2 m)."""
+
+HALO = 64.0
+"""Metres around a tile whose points take part in what is found on it: radius of a virtual scan, and some more."""
+
+FEATURE_HALO = 112.0
+"""Metres around a tile that its learned features see: 64 for the network and 48 for the ground below those."""
+
+Key = tuple[int, int]
+"""Column and row of a tile."""
+
+
+@dataclass(frozen=True)
+class SiteGrid:
+    """Where a site's tiles lie, and how they are built.
+
+    Attributes:
+        origin: (3,) metres, in the frame of the sources; a tile's corner lies there.
+        tile: metres, a multiple of 320.
+        config: of the map.
+    """
+
+    origin: tuple[float, float, float]
+    tile: float
+    config: MapConfig
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tile <= 4 * TILE or self.tile % TILE:
+            raise ConfigError(f"tile={self.tile}: tiles are of 320, 640, 960 or 1280 m")
+        if TILE % self.config.tile:
+            raise ConfigError(f"tile={self.config.tile} of the cloud: a site needs one that divides {TILE:g} m")
+
+    def cells(self, xy: Reals) -> Ints:
+        """Return column and row (N, 2) of the tiles that positions (N, 2 or 3) in the sources' frame lie in."""
+        return np.asarray(np.floor((xy[:, :2] - np.asarray(self.origin[:2])) / self.tile), dtype=np.int64)
+
+    def corner(self, key: Key) -> Floats:
+        """Return the lower corner (3,) of a tile, metres from the origin."""
+        return np.array([key[0] * self.tile, key[1] * self.tile, 0.0])
+
+    @staticmethod
+    def around(key: Key) -> list[Key]:
+        """Return a tile and those that touch it, by row and column."""
+        column, row = key
+        return [(column + i, row + j) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+
+
+def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, float]:
+    """Choose the origin of a site by the corners (3,) of its extent: in its middle, a multiple of 320 m, of 10 in z."""
+    middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
+    x, y = (math.floor(float(each) / TILE) * TILE for each in middle[:2])
+    return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0
+
+
+log = logging.getLogger("coview_stream.maps")
+
+PART_SUFFIX = ".tiles"
+_FORMAT = "coview-part"
+
+
+@dataclass(frozen=True)
+class Around:
+    """A circle.
+
+    Attributes:
+        x, y: its centre, in the frame of the site's sources, metres.
+        radius: metres.
+    """
+
+    x: float
+    y: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        """Check it; ConfigError where it is none."""
+        if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
+            raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
+
+    @classmethod
+    def parse(cls, text: str) -> Around:
+        """Return the circle that ``X,Y,RADIUS`` means; ConfigError where it means none."""
+        try:
+            x, y, radius = map(float, text.split(","))
+        except ValueError:
+            raise ConfigError(f"around {text!r}: give X,Y,RADIUS in the map's coordinates, metres") from None
+        return cls(x, y, radius)
+
+    def __str__(self) -> str:
+        """Return it as it is given."""
+        return ",".join(f"{value:.15g}" for value in (self.x, self.y, self.radius))
+
+
+def tiles_around(manifest: Manifest, *circles: Around) -> set[Key]:
+    """Return the tiles that circles meet.
+
+    Raises:
+        MapError: there is none; how far the nearest one is, is said.
+    """
+    near, nearest = set(), []
+    for around in circles:
+        distances = _distances(manifest, around)
+        near |= {key for key, distance in distances.items() if distance <= around.radius}
+        nearest.append(min(distances.values(), default=math.inf))
+    if not near:
+        away = f"the nearest is {min(nearest):.0f} m away" if manifest.tiles else "it has none"
+        raise MapError(f"around {circles[0]}: no tile of the site is there, {away}; check the coordinates")
+    return near
+
+
+def _distances(manifest: Manifest, around: Around) -> dict[Key, float]:
+    """Return how far each tile is from the middle of a circle, metres."""
+    x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
+
+    def away(column: int, row: int) -> float:
+        beside = (
+            max(k * manifest.tile - value, 0.0, value - (k + 1) * manifest.tile) for k, value in ((column, x), (row, y))
+        )
+        return math.hypot(*beside)
+
+    return {(tile.column, tile.row): away(tile.column, tile.row) for tile in manifest.tiles}
+
+
+def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
+    """Write which tiles of a site to open, and return the file, one for each site and name.
+
+    Raises:
+        MapError: the cache cannot be written.
+    """
+    place = str(directory.resolve())
+    record = hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + PART_SUFFIX
+    return write_record(record, {"format": _FORMAT, "directory": place, "tiles": sorted(keys)})
+
+
+def read_part(path: Path) -> tuple[Path, set[Key]]:
+    """Return the site's directory and the tiles that a file names.
+
+    Raises:
+        MapError: it is something else.
+    """
+    try:
+        data = read_record(path)
+        if data["format"] != _FORMAT:
+            raise ValueError("another format")
+        return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise MapError(f"{path}: names no part of a site ({error}); use --around again") from error
+
+
+def keep_places(directory: Path, name: str, places: Mapping[str, tuple[float, float]]) -> None:
+    """Write where robots were on a part of a site, for the next start; what goes wrong is left to the log."""
+    try:
+        write_record(_places_record(directory, name), places)
+    except MapError as error:
+        log.warning("%s", error)
+
+
+def kept_places(directory: Path, name: str) -> dict[str, tuple[float, float]]:
+    """Return what :func:`keep_places` has written, nothing where there is no such file, or another one."""
+    try:
+        data = read_record(cache_folder() / "parts" / _places_record(directory, name))
+        found = {str(robot): (float(x), float(y)) for robot, (x, y) in data.items()}
+        return {robot: place for robot, place in found.items() if all(map(math.isfinite, place))}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _places_record(directory: Path, name: str) -> str:
+    return hashlib.sha256(f"{directory.resolve()}\n{name}".encode()).hexdigest()[:16] + ".places"
+
+
+def site_directory(path: Path) -> Path | None:
+    """Return the directory of the site that a map's path means, or is a part of; None for a file."""
+    if path.suffix == PART_SUFFIX and path.is_file():
+        return read_part(path)[0]
+    return path if path.is_dir() else None

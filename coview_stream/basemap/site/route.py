@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from coview_stream.basemap.site.part import Around
+from coview_stream.basemap.site.manifest import Around
 
 Place = tuple[float, float]
 """x and y in the frame of the site's sources, metres."""

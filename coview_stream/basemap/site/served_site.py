@@ -6,10 +6,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from coview_stream.basemap.site.grid import Key
-from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.mirror import Mirror
-from coview_stream.basemap.site.part import Around, keep_places, kept_places, part_file, tiles_around
+from coview_stream.basemap.site.fetch import Mirror
+from coview_stream.basemap.site.manifest import Around, Key, Manifest, keep_places, kept_places, part_file, tiles_around
 from coview_stream.basemap.site.route import Route, Whereabouts
 from coview_stream.errors import TransportError
 

@@ -10,12 +10,9 @@ import numpy as np
 from coview_stream.basemap.build import cells_of
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.cloud_layer import read_cloud_layer
-from coview_stream.basemap.site.grid import Key, SiteGrid
-from coview_stream.basemap.site.layer_bytes import decode
-from coview_stream.basemap.site.manifest import Manifest, TileEntry
-from coview_stream.basemap.site.stations_layer import read_stations_layer
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.layers import decode, read_cloud_layer, read_stations_layer
+from coview_stream.basemap.site.manifest import Key, Manifest, SiteGrid, TileEntry
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.tiles import sort_by_tile_packed
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats32, Int8s, Ints

@@ -11,14 +11,20 @@ from pathlib import Path
 
 from coview_stream.basemap import file_format
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site import cache
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import assemble, layers
 from coview_stream.basemap.site.earlier import VERSION, earlier_file, remember_file
-from coview_stream.basemap.site.grid import Key
-from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.part import read_part
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.manifest import Key, Manifest, read_part
+from coview_stream.basemap.site.store import (
+    TileStore,
+    cache_folder,
+    checked,
+    evict,
+    hold,
+    lock,
+    remember_checked,
+    remember_written,
+)
 from coview_stream.errors import MapError
 
 log = logging.getLogger("coview_stream.maps")
@@ -50,17 +56,17 @@ def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, file_
         MapError: as ``make``.
     """
     path = make()
-    checked = cache.checked(path)
+    before = checked(path)
     try:
-        loaded = file_format.open_file(path, check, checked=checked, opened=cache.hold)
+        loaded = file_format.open_file(path, check, checked=before, opened=hold)
     except MapError as error:
         log.warning("%s; it is made again", error)
         path.unlink(missing_ok=True)
         path = make()
-        checked = cache.checked(path)
-        loaded = file_format.open_file(path, check, checked=checked, opened=cache.hold)
-    if check and loaded.identity != checked:
-        cache.remember_checked(path, loaded.identity)
+        before = checked(path)
+        loaded = file_format.open_file(path, check, checked=before, opened=hold)
+    if check and loaded.identity != before:
+        remember_checked(path, loaded.identity)
     return path, loaded
 
 
@@ -86,8 +92,8 @@ def working_file(
     manifest = Manifest.load(directory)
     if verify_key is not None:
         manifest.check_signature(verify_key, str(directory))
-    folder, path = cache.cache_folder(), _path(manifest, keys)
-    with cache.lock(path):
+    folder, path = cache_folder(), _path(manifest, keys)
+    with lock(path):
         if path.is_file():
             remember_file(directory, path)
             return path
@@ -95,9 +101,9 @@ def working_file(
             earlier = earlier_file(directory)
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
             file_format.save(path, arrays | layers(arrays, into), parameters)
-        cache.remember_written(path)
+        remember_written(path)
         remember_file(directory, path)
-        cache.evict(folder, path, directory)
+        evict(folder, path, directory)
     return path
 
 
@@ -108,7 +114,7 @@ def working_path(directory: Path, keys: Collection[Key] | None = None) -> Path:
 
 def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
     part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
-    return cache.cache_folder() / f"{manifest.sha256[:40]}{part}.{VERSION}.coview"
+    return cache_folder() / f"{manifest.sha256[:40]}{part}.{VERSION}.coview"
 
 
 @contextmanager

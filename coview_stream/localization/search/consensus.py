@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config.checks import require
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.circle import Circle

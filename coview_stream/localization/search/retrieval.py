@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
 from coview_stream.geometry.arrays import Floats, Floats32

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coview_kernels import StationCodes
-from coview_stream.basemap.station_grid import LEVEL_GAP, StationGrid
 from coview_stream.basemap.station_index import StationIndex
+from coview_stream.basemap.stations import LEVEL_GAP, StationGrid
 from coview_stream.geometry.arrays import Floats32, Int32s, Ints
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.coview_vote import CoViewVote

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from coview_stream.basemap.joined.served_maps import ServedMaps
+from coview_stream.basemap.joined import ServedMaps
 from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.errors import CoViewError, TransportError

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.errors import MapError
-from coview_stream.stream.maps.map_keys import MapKeys
+from coview_stream.stream.maps.zenoh_source import MapKeys
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 

@@ -3,13 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coview_stream.basemap.site.manifest import MAX_MANIFEST
 from coview_stream.errors import TransportError
-from coview_stream.stream.maps.map_keys import MapKeys
 from coview_stream.stream.transport import zenoh_config
+from coview_stream.stream.transport.keys import check_chunk, check_prefix
+
+
+@dataclass(frozen=True)
+class MapKeys:
+    """The keys of one site.
+
+    Attributes:
+        prefix: of all of them.
+    """
+
+    prefix: str
+
+    @classmethod
+    def of(cls, site: str, base: str = "coview") -> MapKeys:
+        """Return those of a site by its name; ConfigError where that is no chunk of a key."""
+        return cls(f"{check_prefix(base, '--base')}/maps/{check_chunk(site, 'the name of a site')}")
+
+    @property
+    def manifest(self) -> str:
+        """Answered with the manifest's bytes."""
+        return f"{self.prefix}/manifest"
+
+    def layer(self, sha256: str) -> str:
+        """Answered with a layer's bytes."""
+        return f"{self.prefix}/layers/{sha256}"
+
+    @property
+    def changed(self) -> str:
+        """Published whenever the manifest changes: its sha256, as text."""
+        return f"{self.prefix}/changed"
+
+    @property
+    def all(self) -> str:
+        """Expression of all of them."""
+        return f"{self.prefix}/**"
+
 
 _NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
 _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s; set by hand

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from coview_stream.clouds.python_child import python_command, python_environment
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.trust import Trust
+    from coview_stream.basemap.signature import Trust
 
 NICE = {"odometry": 2, "track": 4, "search": 10}
 """Niceness of the engines, which stand back: the pose clock and the receiving threads are in the parent. Every pose

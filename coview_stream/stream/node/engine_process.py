@@ -22,7 +22,7 @@ from coview_stream.stream.node.engine_child import EngineChild, Opening, end
 from coview_stream.stream.node.watchdog import Watchdog
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.trust import Trust
+    from coview_stream.basemap.signature import Trust
     from coview_stream.stream.node.engines import Engine
     from coview_stream.stream.node.jobs import Job, Result
 

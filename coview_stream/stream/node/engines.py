@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.trust import Trust
+from coview_stream.basemap.signature import Trust
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer

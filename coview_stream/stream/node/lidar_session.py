@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coview_stream.basemap.joined.map_parts import MapParts
+from coview_stream.basemap.map_parts import MapParts
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.messages.types import CloudMessage, OdometryMessage

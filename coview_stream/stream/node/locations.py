@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.joined.map_parts import MapParts
+from coview_stream.basemap.map_parts import MapParts
 from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import yaw_of

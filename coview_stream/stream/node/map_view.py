@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.map_view import POINTS_ON_WIRE, MapView
+from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
 from coview_stream.errors import MapError
 
 
 class MapViewAnswer:
-    """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.map_view.MapView.to_json` of the map that is served.
+    """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.summary.MapView.to_json` of the map that is served.
 
     Args:
         files: of the maps that the node has opened, by their hashes.

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.joined.load_map import load_map
-from coview_stream.basemap.joined.map_parts import MapParts
-from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.trust import Trust
+from coview_stream.basemap.joined import load_map
+from coview_stream.basemap.map_parts import MapParts
+from coview_stream.basemap.signature import Trust, VerifyKey
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
@@ -24,7 +23,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.joined.served_maps import ServedMaps
+    from coview_stream.basemap.joined import ServedMaps
     from coview_stream.basemap.site.route import Whereabouts
     from coview_stream.basemap.site.served_site import ServedSite
     from coview_stream.localization.search.place_guess import PlaceGuess
@@ -273,7 +272,7 @@ def open_map(
     Raises:
         MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.
     """
-    from coview_stream.stream.maps.prepare_map import prepare_map
+    from coview_stream.stream.maps.fetch_map import prepare_map
     from coview_stream.stream.node.reload import OpenedMap
 
     prepare_map(options.map_path, cancelled)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coview_stream.basemap.joined.map_parts import MapParts
+from coview_stream.basemap.map_parts import MapParts
 from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError

@@ -10,11 +10,11 @@ import small_world
 from small_world import pose_error
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.file_format import check_arrays
+from coview_stream.basemap.joined import join_maps, joined_file
 from coview_stream.basemap.joined import join_maps as joining
-from coview_stream.basemap.joined.join_maps import join_maps, joined_file
-from coview_stream.basemap.joined.map_parts import MapPart, MapParts
-from coview_stream.basemap.map_view import MapView
-from coview_stream.basemap.shapes import check_arrays
+from coview_stream.basemap.map_parts import MapPart, MapParts
+from coview_stream.basemap.summary import MapView
 from coview_stream.clouds.files import write_cloud
 from coview_stream.errors import InputError, MapError
 from coview_stream.localization.localizer import Localizer

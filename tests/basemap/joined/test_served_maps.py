@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.joined.joined_names import read_names, write_names
-from coview_stream.basemap.joined.load_map import load_map
-from coview_stream.basemap.joined.map_parts import MapParts
-from coview_stream.basemap.joined.served_maps import ServedMaps
+from coview_stream.basemap.joined import ServedMaps, load_map, read_names, write_names
+from coview_stream.basemap.map_parts import MapParts
 from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
 from coview_stream.errors import MapError, TransportError
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap import file_format
-from coview_stream.basemap.site import cache
+from coview_stream.basemap.site.store import cache_folder, evict, hold
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path))
     monkeypatch.setenv("COVIEW_CACHE_GB", "2.5e-5")  # three of the files below are more
-    return cache.cache_folder()
+    return cache_folder()
 
 
 def made(folder, name, age):
@@ -27,19 +27,19 @@ def made(folder, name, age):
 
 def test_what_was_not_used_for_longest_goes(folder):
     paths = [made(folder, f"{k}.coview", 1000 * k) for k in range(3)]
-    cache.evict(folder)
+    evict(folder)
     assert [path.exists() for path in paths] == [False, True, True]
 
 
 def test_what_is_asked_for_and_what_is_open_stays(folder):
     paths = [made(folder, f"{k}.coview", 1000 * k) for k in range(3)]
-    held = file_format.open_file(paths[0], opened=cache.hold)
-    cache.evict(folder, paths[1])
+    held = file_format.open_file(paths[0], opened=hold)
+    evict(folder, paths[1])
     assert [path.exists() for path in paths] == [True, True, False]
     assert held.arrays["a"].sum() > 0
     del held
     made(folder, "2.coview", 2000)
-    cache.evict(folder)
+    evict(folder)
     assert [path.exists() for path in paths] == [False, True, True]
 
 
@@ -49,5 +49,5 @@ def test_mirror_that_was_used_stays(folder):
         path.mkdir(parents=True)
         (path / "x").write_bytes(bytes(15_000))
     os.utime(old, (1, 1))
-    cache.evict(folder)
+    evict(folder)
     assert (old.exists(), new.exists()) == (False, True)

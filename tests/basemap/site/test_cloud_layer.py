@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.basemap.site.cloud_layer import STEPS, cloud_layer, read_cloud_layer
-from coview_stream.basemap.site.layer_bytes import encode
-from coview_stream.basemap.site.stations_layer import read_stations_layer, stations_layer
+from coview_stream.basemap.site.layers import (
+    STEPS,
+    cloud_layer,
+    encode,
+    read_cloud_layer,
+    read_stations_layer,
+    stations_layer,
+)
 from coview_stream.clouds.filters import voxel_grid
 from coview_stream.errors import MapError
 

@@ -11,7 +11,7 @@ from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
 from coview_stream.basemap.site import earlier
 from coview_stream.basemap.site.earlier import PARAMETER, earlier_file
 from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import working_file
 
 

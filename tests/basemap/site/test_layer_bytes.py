@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from coview_stream.basemap.site.layer_bytes import decode, encode
+from coview_stream.basemap.site.layers import decode, encode
 from coview_stream.errors import MapError
 
 RNG = np.random.default_rng(4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.site.light import CUBE, lighten, one_of_each_cube
+from coview_stream.basemap.site.convert import CUBE, lighten, one_of_each_cube
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.cli import main
 from coview_stream.errors import MapError

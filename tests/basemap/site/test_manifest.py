@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.errors import MapError
 
 SHA = "ab" * 32

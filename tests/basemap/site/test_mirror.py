@@ -14,11 +14,9 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, read_verify_key
-from coview_stream.basemap.site.manifest import FILE, Manifest
-from coview_stream.basemap.site.mirror import Mirror
-from coview_stream.basemap.site.part import Around, part_file, read_part, tiles_around
-from coview_stream.basemap.site.site_source import DirectorySource, ObjectStoreSource, WebSource, is_site_address
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.fetch import DirectorySource, Mirror, ObjectStoreSource, WebSource, is_site_address
+from coview_stream.basemap.site.manifest import FILE, Around, Manifest, part_file, read_part, tiles_around
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
 
@@ -28,7 +26,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+    monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
     return tmp_path / "cache"
 
 

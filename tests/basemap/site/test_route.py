@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.basemap.site.part import Around
+from coview_stream.basemap.site.manifest import Around
 from coview_stream.basemap.site.route import Route, Whereabouts
 
 START = Around(100.0, 200.0, 90.0)

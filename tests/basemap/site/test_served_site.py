@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.mirror import Mirror
-from coview_stream.basemap.site.part import Around, kept_places, read_part
+from coview_stream.basemap.site.fetch import DirectorySource, Mirror
+from coview_stream.basemap.site.manifest import Around, Manifest, kept_places, read_part
 from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
-from coview_stream.basemap.site.site_source import DirectorySource
 from coview_stream.errors import MapError, TransportError
 
 pytestmark = pytest.mark.slow
@@ -25,7 +23,7 @@ WEST, EAST = (CORNER[0] - 50.0, CORNER[1] + 50.0), (CORNER[0] + 50.0, CORNER[1] 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+    monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
 
 
 class Source(DirectorySource):

@@ -11,11 +11,11 @@ from nightly import nightly
 from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site import tile_build
+from coview_stream.basemap.site.convert import join, split
 from coview_stream.basemap.site.executors import ProcessExecutor, SerialExecutor
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.site_build import WORK, build_site
-from coview_stream.basemap.site.split import join, split
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import CloudError, InputError, MapError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dense_consensus import dense_scores
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.selection import argsmallest
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 import pytest
 
-from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ring_key
 from coview_stream.localization.search import retrieval

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.circle import Circle

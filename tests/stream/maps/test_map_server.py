@@ -15,23 +15,20 @@ import zenoh
 from sockets import free_endpoint, until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.mirror import Mirror
-from coview_stream.basemap.site.part import Around, part_file, read_part
+from coview_stream.basemap.site.fetch import Mirror
+from coview_stream.basemap.site.manifest import Around, Manifest, part_file, read_part
 from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.basemap.site.site_build import build_site
-from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import working_path
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import ConfigError, TransportError
-from coview_stream.stream.maps.map_address import source_of
+from coview_stream.stream.maps.fetch_map import prepare_map, source_of
 from coview_stream.stream.maps.map_follower import MapFollower
-from coview_stream.stream.maps.map_keys import MapKeys
 from coview_stream.stream.maps.map_server import MapServer
-from coview_stream.stream.maps.prepare_map import prepare_map
-from coview_stream.stream.maps.zenoh_source import ZenohSource
+from coview_stream.stream.maps.zenoh_source import MapKeys, ZenohSource
 from coview_stream.stream.transport.zenoh_config import compose
 
 pytestmark = pytest.mark.slow
@@ -48,7 +45,7 @@ def built(map_points, tmp_path_factory):
 @pytest.fixture
 def site(built, tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+    monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
     monkeypatch.setattr("coview_stream.stream.maps.map_server._LOOK", 0.05)
     monkeypatch.setattr("coview_stream.stream.maps.zenoh_source._TIMEOUT", 5.0)
     return shutil.copytree(built, tmp_path / "yard")

@@ -15,8 +15,7 @@ from nightly import nightly
 from sockets import free_endpoint
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.site.manifest import Manifest
-from coview_stream.basemap.site.part import Around, tiles_around
+from coview_stream.basemap.site.manifest import Around, Manifest, tiles_around
 from coview_stream.clouds import read_tum
 from coview_stream.clouds.python_child import python_command, python_environment
 

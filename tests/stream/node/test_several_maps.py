@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fake_robot import SHA, T_MAP_ODOM, Robot, pose, search_request, search_result, unknown
 
-from coview_stream.basemap.joined.map_parts import MapPart, MapParts
+from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.errors import InputError
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess

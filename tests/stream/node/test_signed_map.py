@@ -9,8 +9,7 @@ import pytest
 from sockets import free_endpoint
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
-from coview_stream.basemap.trust import Trust
+from coview_stream.basemap.signature import SigningKey, Trust, make_keys, read_verify_key
 from coview_stream.errors import CoViewError, MapError
 from coview_stream.stream.node import serve
 from coview_stream.stream.node.engine_process import EngineProcess

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.geometry.transforms import transform
 from coview_stream.localization.search.learned.recognizer import LearnedRecognizer

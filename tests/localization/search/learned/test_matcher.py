@@ -7,7 +7,7 @@ import pytest
 from planted_features import LOW, SECTORS, TILES, Planted
 from scipy import ndimage
 
-from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, LearnedConfig
 from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import TILE, FeatureMap

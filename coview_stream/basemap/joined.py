@@ -1,8 +1,4 @@
-"""Joining of maps: several side by side in one frame, so that one search weighs the places of all of them.
-
-Nothing of the search or of its evidence knows of it: places of other maps are rivals like those of the same map, and a
-robot that fits two storeys alike stays without a place. Between two maps is a gap that no scan reaches across.
-"""
+"""Several maps as a node serves them: what changes at the source of any of them is taken over."""
 
 from __future__ import annotations
 
@@ -19,13 +15,16 @@ from coview_kernels.reference.field import TILE as FIELD_TILE
 from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import Arrays
-from coview_stream.basemap.joined.map_parts import MapPart, MapParts
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, layers_arrays
+from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.cache import cache_folder, evict, remember_written
+from coview_stream.basemap.site.fetch import Mirror
+from coview_stream.basemap.site.route import Whereabouts
+from coview_stream.basemap.site.store import cache_folder, evict, read_record, remember_written, write_record
+from coview_stream.basemap.site.working_file import open_made
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
-from coview_stream.errors import MapError
+from coview_stream.errors import MapError, TransportError
 from coview_stream.geometry.arrays import Floats, Ints
 
 _CODE = 2
@@ -200,3 +199,108 @@ def _parameters(maps: Mapping[str, BaseMap], parts: Sequence[MapPart], learned: 
         "source_points": sum(int(each.parameters.get("source_points", 0)) for each in several),
         "learned": first.get("learned") if learned else None,
     }
+
+
+JOINED_SUFFIX = ".joined"
+_NAMES_FORMAT = "coview-joined"
+
+
+def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
+    """Write names and paths of maps, and return the file, one for each list.
+
+    Raises:
+        MapError: two have one name, or the cache cannot be written.
+    """
+    names = [name for name, _ in maps]
+    for name, path in maps:
+        if names.count(name) > 1:
+            raise MapError(f"two maps are called {name}: name them, as in first={path}")
+    rows = [[name, str(path.absolute())] for name, path in maps]
+    name = hashlib.sha256(repr(rows).encode()).hexdigest()[:16] + JOINED_SUFFIX
+    return write_record(name, {"format": _NAMES_FORMAT, "maps": rows})
+
+
+def read_names(file: Path) -> list[tuple[str, Path]]:
+    """Return the names and paths that a file has.
+
+    Raises:
+        MapError: it is something else.
+    """
+    try:
+        data = read_record(file)
+        if data["format"] != _NAMES_FORMAT:
+            raise ValueError("another format")
+        return [(str(name), Path(str(path))) for name, path in data["maps"]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise MapError(f"{file}: names no maps ({error}); name the maps themselves again") from error
+
+
+def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
+    """Return a map.
+
+    Args:
+        path: as :meth:`BaseMap.load` takes it; or a file of names (:func:`write_names`), whose joined map is made
+            first where it is not there.
+        verify_key: has to have signed it, or each of several.
+
+    Raises:
+        As :meth:`BaseMap.load`; MapError: maps cannot be joined.
+    """
+    if path.suffix != JOINED_SUFFIX:
+        return BaseMap.load(path, verify_key=verify_key)
+    maps = read_names(path)
+    joined, _ = open_made(lambda: joined_file(maps, verify_key))
+    return BaseMap.load(joined, check=False)
+
+
+class ServedMaps:
+    """Maps by name, of which some are mirrors of sites elsewhere; tiles of parts stay those of their circles.
+
+    Attributes:
+        map_path: what they are opened from, as one.
+        route: None: no robot is followed.
+    """
+
+    route = None
+
+    def __init__(self, maps: Sequence[tuple[str, Path]], mirrors: Sequence[Mirror]) -> None:
+        """Take the maps' names and paths, and the mirrors among them, which have been opened."""
+        self.map_path = write_names(maps)
+        self._mirrors = mirrors
+
+    @property
+    def name(self) -> str:
+        """Where those are that come from elsewhere, for messages."""
+        return ", ".join(each.source.name for each in self._mirrors)
+
+    @property
+    def offline(self) -> str:
+        """Why a source could not be asked the last time; empty where all could."""
+        return "; ".join(each.offline for each in self._mirrors if each.offline)
+
+    def refresh(self) -> bool:
+        """Ask all sources, fetch what is missing, and return whether anything has changed.
+
+        Raises:
+            TransportError: one cannot be asked, and none has changed. MapError: what one gave is not what it should be.
+        """
+        changed, failed = False, None
+        for mirror in self._mirrors:
+            try:
+                if mirror.refresh():
+                    changed = True
+                    _ = mirror.map_path  # a part's tiles may be others now
+            except TransportError as error:
+                mirror.offline, failed = str(error), error
+        if failed is not None and not changed:
+            raise failed
+        return changed
+
+    def follow(self, robots: Mapping[str, Whereabouts | None]) -> bool:
+        """Return False: tiles do not follow robots here."""
+        return False
+
+    def close(self) -> None:
+        """End connections."""
+        for mirror in self._mirrors:
+            mirror.source.close()

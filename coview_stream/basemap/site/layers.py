@@ -1,0 +1,250 @@
+"""Layer ``stations`` of a tile: the blocks that stations stand in, and their heights to the centimetre."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import lzma
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import MapError
+from coview_stream.geometry.arrays import Floats, Floats32, Int8s
+from coview_stream.geometry.transforms import Points
+
+LayerArrays = Mapping[str, npt.NDArray[Any]]
+Packing = Literal["bz2", "lzma"]
+
+_MAGIC = b"COVIEWL1"
+_TYPES = {"u1": "|u1", "i1": "|i1", "u2": "<u2", "i2": "<i2", "i4": "<i4", "f4": "<f4"}
+_MAX_HEADER = 1 << 16  # bytes
+_MAX_ARRAYS = 32
+MAX_BYTES = 1 << 29
+"""Bytes that a layer may take in memory: ten times what the densest tile does; set by hand."""
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 22}]
+"""Bytes are predicted by nothing: rows of small numbers, whose neighbours in memory tell little of each other."""
+
+PACKING: Mapping[str, Packing] = {"cloud": "bz2", "stations": "bz2", "features": "lzma"}
+"""How the arrays of a tile's layers are compressed."""
+
+
+def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
+    """Return the bytes of arrays of small integers or float32, whose names are sorted."""
+    entries: list[dict[str, Any]] = []
+    parts = []
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        kind = next(kind for kind, dtype in _TYPES.items() if np.dtype(dtype) == array.dtype)
+        entry = {"name": name, "type": kind, "shape": list(array.shape)}
+        if packing == "bz2":
+            part = bz2.compress(array.tobytes())
+            entry["packing"] = packing
+        else:
+            part = lzma.compress(_planes(array), format=lzma.FORMAT_RAW, filters=_FILTERS)
+        entries.append(entry | {"bytes": len(part)})
+        parts.append(part)
+    header = json.dumps(entries, separators=(",", ":")).encode()
+    return b"".join([_MAGIC, len(header).to_bytes(4, "little"), header, *parts])
+
+
+def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays that :func:`encode` wrote, from anywhere.
+
+    Args:
+        raw: all of it.
+        name: of the layer, for messages.
+
+    Raises:
+        MapError: it is something else, cut off, or larger than a layer can be.
+    """
+    try:
+        return _decode(raw)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError, EOFError, lzma.LZMAError) as error:
+        raise MapError(f"{name}: is no layer of a tile ({error}); fetch or build it again") from error
+
+
+def _decode(raw: bytes) -> dict[str, npt.NDArray[Any]]:
+    size = int.from_bytes(raw[8:12], "little")
+    if raw[:8] != _MAGIC or size > _MAX_HEADER or 12 + size > len(raw):
+        raise ValueError("its header is not one")
+    entries = json.loads(raw[12 : 12 + size])
+    if not isinstance(entries, list) or len(entries) > _MAX_ARRAYS:
+        raise ValueError("its header lists no arrays")
+    at, total, arrays = 12 + size, 0, {}
+    for entry in entries:
+        dtype, shape, length = np.dtype(_TYPES[entry["type"]]), entry["shape"], entry["bytes"]
+        if not all(type(n) is int and 0 <= n < 1 << 31 for n in [*shape, length]) or len(shape) > 4:
+            raise ValueError("a shape is impossible")
+        wanted = math.prod(shape) * dtype.itemsize
+        total += wanted
+        if total > MAX_BYTES or at + length > len(raw):
+            raise ValueError("it is too large or cut off")
+        if entry.get("packing", "lzma") not in ("bz2", "lzma"):
+            raise ValueError("an array is compressed in a way that is not known")
+        unpack = _from_bz2 if entry.get("packing") == "bz2" else _from_lzma
+        arrays[str(entry["name"])] = unpack(raw[at : at + length], wanted, dtype).reshape(shape)
+        at += length
+    if at != len(raw):
+        raise ValueError("something follows its end")
+    return arrays
+
+
+def _from_lzma(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
+    planes = _whole(decoder.decompress(part, max_length=wanted + 1), wanted).reshape(dtype.itemsize, -1)
+    return np.ascontiguousarray(planes.T).view(dtype)
+
+
+def _from_bz2(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    found = bz2.BZ2Decompressor().decompress(part, max_length=wanted + 1)
+    return _whole(found, wanted).view(dtype)
+
+
+def _whole(found: bytes, wanted: int) -> npt.NDArray[np.uint8]:
+    if len(found) != wanted:
+        raise ValueError(f"an array has {len(found)} bytes or more, not {wanted}")
+    return np.frombuffer(bytearray(found), dtype=np.uint8)
+
+
+def _planes(array: npt.NDArray[Any]) -> bytes:
+    """Return an array's bytes, the lowest ones of all numbers first: of small numbers the others are alike."""
+    return array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()
+
+
+# set by hand
+STEPS = 12
+"""Steps of a voxel's edge."""
+_CELLS = 64  # of the octahedral map, along each edge
+_PLANARITY = 15  # steps
+_MAX_LEVEL = 30_000  # voxels above or below zero
+_MAX_COLUMNS = 1 << 24
+
+Layer = dict[str, npt.NDArray[Any]]
+
+
+def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: float, voxel: float) -> Layer:
+    """Return the arrays of a tile's cloud.
+
+    Args:
+        points: (N, 3) float32 metres about the tile's lower corner, in [0, tile) in x and y.
+        normals: (N, 3) unit normals, none of which points down.
+        planarity: (N,) in [0, 1].
+        tile: metres.
+        voxel: metres.
+    """
+    across = columns_of(tile, voxel)
+    cell = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
+    np.clip(cell[:, :2], 0, across - 1, out=cell[:, :2])
+    np.clip(cell[:, 2], -_MAX_LEVEL, _MAX_LEVEL, out=cell[:, 2])
+    order = np.lexsort((cell[:, 2], cell[:, 0], cell[:, 1]))
+    cell = cell[order]
+    inside = points[order].astype(np.float64) / voxel - cell
+    counts = np.bincount(cell[:, 1] * across + cell[:, 0], minlength=across * across)
+    return {
+        "counts": counts.astype(np.uint16).reshape(across, across),
+        "levels": np.diff(cell[:, 2], prepend=0).astype(np.int32),
+        "inside": np.ascontiguousarray(np.clip(np.floor(inside * STEPS), 0, STEPS - 1).astype(np.uint8).T),
+        "normals": _octahedral(normals[order]),
+        "planarity": np.rint(planarity[order] * _PLANARITY).astype(np.uint8),
+    }
+
+
+def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) -> tuple[Points, Int8s]:
+    """Return a tile's points (N, 3) float32, and normals (N, 3) as a map keeps them, as long as the planarity.
+
+    Args:
+        layer: arrays of :func:`cloud_layer`, from anywhere.
+        corner: (3,) lower corner of the tile in the map's frame, metres.
+        tile: metres.
+        voxel: metres.
+
+    Raises:
+        MapError: they do not fit together.
+    """
+    across = columns_of(tile, voxel)
+    try:
+        counts, levels, inside = layer["counts"], layer["levels"], layer["inside"]
+        normals, planarity = layer["normals"], layer["planarity"]
+    except KeyError as error:
+        raise MapError(f"a tile's cloud lacks {error}; fetch or build it again") from error
+    kinds = [each.dtype.str for each in (counts, levels, inside, normals, planarity)]
+    number = len(levels)
+    shapes = inside.shape == (3, number) and normals.shape == (number, 2) and planarity.shape == (number,)
+    if kinds != ["<u2", "<i4", "|u1", "|u1", "|u1"] or counts.shape != (across, across) or not shapes:
+        raise MapError("a tile's cloud has other arrays than it should; fetch or build it again")
+    level = np.cumsum(levels, dtype=np.int64)
+    if int(counts.sum(dtype=np.int64)) != number or (number and np.abs(level).max() > _MAX_LEVEL):
+        raise MapError("a tile's cloud does not fit together; fetch or build it again")
+    column = np.repeat(np.arange(across * across), counts.reshape(-1))
+    cell = np.stack([column % across, column // across, level])
+    places = (cell + (inside.astype(np.float64) + 0.5) / STEPS) * voxel
+    points = (places.T + np.asarray(corner, dtype=np.float64)).astype(np.float32)
+    length = np.maximum(planarity.astype(np.float32) * np.float32(127.0 / _PLANARITY), np.float32(8.0))
+    return points, np.rint(_directions(normals) * length[:, None]).astype(np.int8)
+
+
+def square_metres(points: Points) -> int:
+    """Return how many squares of a metre hold points (N, 3)."""
+    column, row = np.floor(points[:, :2]).astype(np.int64).T
+    return len(np.unique(column * (1 << 32) + row))
+
+
+def columns_of(tile: float, voxel: float) -> int:
+    """Return how many voxels a tile has along an edge.
+
+    Raises:
+        MapError: too many, or none.
+    """
+    across = int(np.ceil(tile / voxel - 1e-6)) if voxel > 0 else 0
+    if not 0 < across * across <= _MAX_COLUMNS:
+        raise MapError(f"tiles of {tile:g} m in voxels of {voxel:g} m: choose smaller tiles or larger voxels")
+    return across
+
+
+def _octahedral(normals: Points) -> npt.NDArray[np.uint8]:
+    """Return cells (N, 2) of normals that do not point down: on the octahedron's upper half, a turned square."""
+    length = np.abs(normals).sum(axis=1, dtype=np.float64)
+    x, y = (normals[:, :2] / np.maximum(length, 1e-9)[:, None]).T
+    square = np.stack([x + y, x - y], axis=1)
+    return np.rint(np.clip((square + 1.0) * 0.5, 0.0, 1.0) * (_CELLS - 1)).astype(np.uint8)
+
+
+def _directions(cells: npt.NDArray[np.uint8]) -> Floats32:
+    """Return the unit normals (N, 3) of cells (N, 2)."""
+    a, b = cells.astype(np.float64).T / (_CELLS - 1) * 2.0 - 1.0
+    x, y = (a + b) * 0.5, (a - b) * 0.5
+    normal = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+    return normal.astype(np.float32)
+
+
+_MAX_BLOCK = 1 << 26  # blocks from the origin: 100,000 km
+
+
+def stations_layer(stations: Floats32, block: float) -> Layer:
+    """Return the arrays of stations (M, 3) at the centres of blocks, metres in the site's frame."""
+    cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
+    order = np.lexsort((stations[:, 2], cells[:, 0], cells[:, 1]))
+    height = np.rint(stations[order, 2].astype(np.float64) * 100.0).astype(np.int64)
+    rows = np.column_stack([cells[order], height])
+    return {"steps": np.ascontiguousarray(np.diff(rows, axis=0, prepend=np.zeros((1, 3), dtype=np.int64)).T, "<i4")}
+
+
+def read_stations_layer(layer: Layer, block: float) -> Floats32:
+    """Return the stations (M, 3), by rows and columns and from low to high.
+
+    Raises:
+        MapError: the arrays, which may come from anywhere, are others.
+    """
+    steps = layer.get("steps")
+    if steps is None or steps.dtype.str != "<i4" or steps.ndim != 2 or len(steps) != 3:
+        raise MapError("a tile's stations are not what they should be; fetch or build it again")
+    rows = np.cumsum(steps.astype(np.int64), axis=1)
+    if rows.size and np.abs(rows).max() > _MAX_BLOCK:
+        raise MapError("a tile's stations lie beyond any site; fetch or build it again")
+    xy, height = (rows[:2] + 0.5) * block, rows[2] / 100.0
+    return np.column_stack([*xy, height]).astype(np.float32)
