@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     for line in config.dirt.describe():
         print(f"dirt: {line}")
     if args.mcap is not None:
-        from coview_stream.viewers.world_recording import record_world
+        from coview_stream.viewers.foxglove_sink import record_world
 
         print(f"{args.mcap}: {record_world(args.out, args.mcap)} frames")
     return 0

@@ -90,9 +90,7 @@ def feed_of_watch(
     if not sinks:
         return None
     from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.viewers.map_source import asked_of_node
-    from coview_stream.viewers.session_feed import SessionFeed
-    from coview_stream.viewers.topics import topics_of_base, topics_of_robots
+    from coview_stream.viewers.session_feed import SessionFeed, asked_of_node, topics_of_base, topics_of_robots
 
     topics = topics_of_base(args.base)
     if args.robot:
@@ -108,9 +106,7 @@ def feed_of_node(node: Node, keys: Sequence[RobotKeys], mount: Mount, sinks: Seq
     """
     if not sinks:
         return None
-    from coview_stream.viewers.map_source import read_from_files
-    from coview_stream.viewers.session_feed import SessionFeed
-    from coview_stream.viewers.topics import topics_of_robots
+    from coview_stream.viewers.session_feed import SessionFeed, read_from_files, topics_of_robots
 
     source = read_from_files(node.map_files, lambda: node.map_sha256)
     feed = SessionFeed(node.transport, topics_of_robots(keys), None, source, mount=mount, policy="newest")

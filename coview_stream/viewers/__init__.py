@@ -1,1 +1,1 @@
-"""Viewers: what there is to see of a session, robots on their map, handed to all that show or record it."""
+"""Viewers: robots on their map, decoded once and handed to the web page, Foxglove, rerun and recordings."""

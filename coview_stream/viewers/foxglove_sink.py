@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.summary import MapView
+from coview_stream.clouds.files import read_cloud
+from coview_stream.clouds.trajectory import read_tum
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, pose_to_tum, rot_z, transform
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_to_tum, rot_z, transform
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
+from coview_stream.recordings.open_run import open_run
 from coview_stream.viewers.scene import Scan, Sink
 
 _NS = 1_000_000_000
@@ -20,7 +23,7 @@ _FRAME = "map"
 """Frame of all that is drawn: the map's axes, about its origin, for viewers draw in float32."""
 _SOURCE = "map_source"
 """Frame of the map's sources (UTM, say), whose child ``map`` is."""
-_SIGMAS = 3.0  # of the ellipsoid that is drawn; set by hand
+_SIGMAS = 3.0  # of the covariance ellipsoid
 _COLOURS = {"TRACKING": (0.1, 0.7, 0.3), "AMBIGUOUS": (0.9, 0.6, 0.0), "LOST": (0.85, 0.15, 0.15)}
 _GREY = (0.4, 0.5, 0.7)
 
@@ -32,7 +35,7 @@ class FoxgloveSink(Sink):
     ``hypotheses``, ``status`` (the node's JSON) and ``state`` (changes, as a log).
 
     Args:
-        by_stamp: log each message at its own stamp, as for what was recorded earlier; otherwise at the time of now.
+        by_stamp: log messages at their own stamps, as for recorded runs; otherwise at the current time.
 
     Raises:
         DependencyError: there is no foxglove-sdk.
@@ -223,3 +226,39 @@ class FoxgloveSink(Sink):
     def _stamp(self, stamp_ns: int) -> Any:
         seconds, rest = divmod(max(0, int(stamp_ns)), _NS)
         return self._messages.Timestamp(seconds, rest)
+
+
+def record_world(world: Path, out: Path) -> int:
+    """Write a simulated world as ``out`` (MCAP, Foxglove's schemas), at the run's stamps.
+
+    ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts there and goes
+    where odometry leads.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        InputError: ``out`` is there already or cannot be written.
+        DependencyError: there is no foxglove-sdk.
+    """
+    sink = FoxgloveSink(by_stamp=True)
+    sink.record(out)
+    try:
+        survey = read_cloud(world / "base.laz")
+        sink.map(MapView.of_cloud(survey.points, survey.origin))
+        run = open_run(world / "run")
+        _, truth = read_tum(world / "truth.tum")
+        T_map_odom = truth[0] @ inverse(run.poses[0])
+        for frame, T_map_body in zip(run, truth, strict=True):
+            stamp_ns = round(frame.stamp * 1e9)
+            sink.pose(_pose("truth", stamp_ns, T_map_body))
+            sink.pose(_pose("odometry", stamp_ns, T_map_odom @ frame.T_odom_body))
+            sink.scan(Scan("truth", stamp_ns, frame.points, T_map_body))
+    finally:
+        sink.close()
+    return len(truth)
+
+
+def _pose(robot: str, stamp_ns: int, T_map_body: Pose) -> PoseMessage:
+    unknown = np.full((6, 6), np.nan)
+    return PoseMessage(stamp_ns, robot, "TRACKING", T_map_body, unknown, np.nan, "")

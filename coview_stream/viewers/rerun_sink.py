@@ -21,9 +21,9 @@ from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
 
 _HOST = "127.0.0.1"
-_MAX_START = 10.0  # seconds for the viewer to listen; set by hand
-_STRIP = 50  # poses of one line strip: redrawing the whole way at each pose is quadratic; set by hand
-_SIGMAS = 3.0  # of the ellipsoid that is drawn; set by hand
+_MAX_START = 10.0  # seconds for the viewer to listen
+_STRIP = 50  # poses of one line strip: redrawing the whole path at each pose is quadratic
+_SIGMAS = 3.0  # of the covariance ellipsoid
 _AXES = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
 _GROUND, _STRUCTURE = (150, 150, 140), (90, 110, 140)
 
@@ -101,7 +101,7 @@ class RerunSink(Sink):
         self._log(f"map/robots/{scan.robot}/scan", self._rerun.Points3D(points.astype(np.float32), radii=0.04))
 
     def close(self) -> None:
-        """Send what waits."""
+        """Flush and disconnect."""
         self._stream.flush()
         self._stream.disconnect()
 
@@ -129,8 +129,8 @@ class RerunSink(Sink):
     def _at(self, stamp_ns: int) -> None:
         self._stream.set_time("sensor", timestamp=stamp_ns * 1e-9)
 
-    def _log(self, path: str, what: Any, static: bool = False) -> None:
-        self._stream.log(path, what, static=static)
+    def _log(self, path: str, entity: Any, static: bool = False) -> None:
+        self._stream.log(path, entity, static=static)
 
 
 def _start_viewer() -> int:
@@ -141,7 +141,9 @@ def _start_viewer() -> int:
         probe.bind((_HOST, 0))
         port = int(probe.getsockname()[1])
     folders = (Path(sysconfig.get_path("scripts")), Path(sys.executable).parent)
-    viewer = next((each / name for each in folders for name in ("rerun", "rerun.exe") if (each / name).exists()), None)
+    viewer = next(
+        (folder / name for folder in folders for name in ("rerun", "rerun.exe") if (folder / name).exists()), None
+    )
     if viewer is None:
         raise DependencyError("--rerun: its viewer is not installed; pip install --force-reinstall 'rerun-sdk>=0.20'")
     process = subprocess.Popen(

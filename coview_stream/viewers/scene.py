@@ -1,8 +1,8 @@
-"""Scene: what there is to see of a session, as plain data.
+"""Scene of a session as plain data, and the interface of its viewers.
 
 Poses and hypotheses are the messages themselves (:class:`~coview_stream.messages.types.PoseMessage`,
 :class:`~coview_stream.messages.types.HypothesesMessage`), a status is the node's JSON, and the map is a
-:class:`~coview_stream.basemap.summary.MapView`; what else there is stands here.
+:class:`~coview_stream.basemap.summary.MapView`; scans and tracks are defined here.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.transforms import Points, Pose, interpolate
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 
-# set by hand
 _KEPT = 64  # poses of a robot, to look scans' poses up in
-_TOLERANCE_NS = 150_000_000  # beside the poses that are known: the next one is near enough to draw by
+_TOLERANCE_NS = 150_000_000  # beyond the known poses: the nearest one is near enough to draw by
 _MAX_GAP_NS = 2_000_000_000  # between two poses: across a longer one nothing is interpolated
 
 
@@ -41,14 +40,14 @@ class Scan:
 
 
 class Sink:
-    """Receiver of what there is to see; override what you show.
+    """Receiver of a session's events; override the methods of those that you show.
 
-    All methods are called on one thread, the feed's, and have to return soon: what comes meanwhile waits, and of what
-    waits too long the oldest is dropped. What they raise is logged.
+    All methods are called on the feed's thread and have to return soon: events queue meanwhile, and of a full queue the
+    oldest is dropped. Their errors are logged.
     """
 
     def map(self, view: MapView) -> None:
-        """Take in the map: the first one that is known, and each other one that is served later."""
+        """Take in the map: the first known one, and any served later."""
 
     def pose(self, pose: PoseMessage) -> None:
         """Take in a pose; ``pose.robot`` is always set."""
@@ -73,7 +72,7 @@ class PoseTrack:
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=_KEPT)
 
     def add(self, stamp_ns: int, T_map_body: Pose) -> None:
-        """Take in a pose; stamps that go back begin anew."""
+        """Take in a pose; a stamp that goes back starts a new track."""
         if self._poses and stamp_ns < self._poses[-1][0]:
             self._poses.clear()
         if not self._poses or stamp_ns > self._poses[-1][0]:

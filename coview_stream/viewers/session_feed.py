@@ -1,4 +1,4 @@
-"""Feed of a session: subscribes to what there is to see of robots, and hands it to any number of sinks.
+"""Feed of a session: subscribes to robots' poses, statuses, hypotheses and clouds, and hands them to sinks.
 
 The network's threads only queue. One thread decodes and calls the sinks; another one asks for the map.
 """
@@ -8,29 +8,104 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from operator import methodcaller
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coview_stream.basemap.summary import MapView
+from coview_stream.basemap.summary import MAX_WIRE_BYTES, MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
 from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import RobotKeys, check_prefix
 from coview_stream.stream.transport.transport import Policy, Transport
-from coview_stream.viewers.map_source import MapSource
 from coview_stream.viewers.scene import PoseTrack, Scan, Sink
-from coview_stream.viewers.topics import Topic
+
+_TIMEOUT = 10.0  # seconds of a query: the first makes the node thin its map
+
+MapSource = Callable[[str], MapView]
+"""Returns the map that a robot is served on, or raises a CoViewError."""
+
+
+def asked_of_node(transport: Transport, base: str) -> MapSource:
+    """Return a map source that asks the node of a robot."""
+
+    def ask(robot: str) -> MapView:
+        key = f"{base}/{robot}/rpc/map_view"
+        return MapView.from_json(transport.query(key, timeout=_TIMEOUT, max_bytes=MAX_WIRE_BYTES))
+
+    return ask
+
+
+def read_from_files(files: Mapping[str, Path], sha256: Callable[[], str]) -> MapSource:
+    """Return a map source that reads a node's files, by the hash of the map that the node serves: ``sha256()``."""
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.errors import MapError
+
+    def load(robot: str) -> MapView:
+        served = sha256()
+        base_map = BaseMap.load(files[served], check=False)  # the node has compared it when it opened the map
+        if base_map.sha256 != served:
+            raise MapError(f"{files[served]}: the file is of another map than the one that is served")
+        return MapView.of(base_map)
+
+    return load
+
+
+TopicKind = Literal["pose", "status", "hypotheses", "cloud"]
+
+
+class Topic(NamedTuple):
+    """One key expression to subscribe to.
+
+    Attributes:
+        key: the expression.
+        kind: of its messages.
+        robot: whose; None if the keys of the samples say.
+        hint: codec of messages without an Encoding; None if there is no such rule.
+        depth: chunks of a sample's key before the robot's name, where ``robot`` is None.
+    """
+
+    key: str
+    kind: TopicKind
+    robot: str | None = None
+    hint: str | None = None
+    depth: int = 0
+
+
+def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
+    """Return the topics of named robots, of any preset."""
+    found = []
+    for k in keys:
+        found += [
+            Topic(k.pose, "pose", k.robot, k.pose_hint),
+            Topic(k.status, "status", k.robot),
+            Topic(k.hypotheses, "hypotheses", k.robot),
+            Topic(k.cloud, "cloud", k.robot, k.cloud_hint),
+        ]
+    return found
+
+
+def topics_of_base(base: str) -> list[Topic]:
+    """Return the topics of all robots of a base, with native keys; ConfigError if it cannot start a key."""
+    base = check_prefix(base, "--base")
+    depth = len(base.split("/"))
+    ends: tuple[tuple[str, TopicKind], ...] = (
+        ("out/pose", "pose"), ("out/status", "status"), ("out/hypotheses", "hypotheses"), ("in/cloud", "cloud"),
+    )  # fmt: skip
+    return [Topic(f"{base}/*/{end}", kind, depth=depth) for end, kind in ends]
+
 
 _log = logging.getLogger(__name__)
 
-# set by hand
 MAX_ROBOTS = 256
-"""Robots that are looked at: names come from the network."""
+"""Limit of robots in view: names come from the network."""
 _MAX_QUEUED = 4_000  # messages waiting for slow sinks
 _POLL = 0.05  # seconds
 _SCAN_PERIOD = 0.2  # seconds between two scans of a robot that are decoded
@@ -45,7 +120,7 @@ class SessionFeed:
 
     Args:
         transport: stays the caller's.
-        topics: what to subscribe to.
+        topics: to subscribe to.
         map_view: the map, if it is known; else ``map_source`` is asked.
         map_source: asked with a robot's name whenever its status names a map that is not known yet; None for no map.
         clouds: whether to look at clouds too, which are most of the traffic.
@@ -243,11 +318,11 @@ class SessionFeed:
         points = points[:: max(1, -(-len(points) // _SCAN_POINTS))]
         return Scan(robot, message.stamp_ns, np.array(self._mount.to_body(points), dtype=np.float32), None)
 
-    def _hand_out(self, what: str, call: Callable[[Sink], None]) -> None:
+    def _hand_out(self, event: str, call: Callable[[Sink], None]) -> None:
         with self._lock:
             sinks = list(self._sinks)
         for sink in sinks:
-            with self._errors.catch(f"{type(sink).__name__}.{what}"):
+            with self._errors.catch(f"{type(sink).__name__}.{event}"):
                 call(sink)
 
     # ---- the map's thread

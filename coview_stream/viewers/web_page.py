@@ -6,8 +6,7 @@ from importlib import resources
 
 from coview_stream.stream.transport.http_server import EventStream, HttpServer, Reply, Route
 from coview_stream.viewers.scene import Sink
-from coview_stream.viewers.web_hub import WebHub
-from coview_stream.viewers.web_sink import WebSink
+from coview_stream.viewers.web_sink import WebHub, WebSink
 
 WEB_ADDRESS = "127.0.0.1:8642"
 """Default address of the page."""

@@ -1,4 +1,7 @@
-"""Sink of the web page: turns what there is to see into events for the hub, and keeps each robot's trail."""
+"""Sink and hub of the web page: events for every open page at its own pace, and the robots' trails.
+
+Of each kind of event about a robot a page holds the newest only, so that a slow page delays nobody.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,10 @@ import base64
 import json
 import math
 import struct
+import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,9 +22,111 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, transform, yaw_of
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
-from coview_stream.viewers.web_hub import WebHub, encode_event
 
-# set by hand
+MAX_PAGES = 8
+"""Pages served at a time."""
+_MAX_KEPT = 4_000  # events that a page may have to take: four kinds of a thousand robots
+
+Slot = tuple[str, str]
+"""Kind of an event, and the robot or map that it is about."""
+
+
+class Page:
+    """Events that one page has not read yet: one for each slot, in order of arrival."""
+
+    def __init__(self) -> None:
+        self._events: OrderedDict[Slot, bytes] = OrderedDict()
+        self._changed = threading.Condition()
+        self.closed = False
+
+    def put(self, slot: Slot, event: bytes) -> None:
+        """Add an event in place of the one before in its slot."""
+        with self._changed:
+            self._events.pop(slot, None)
+            if len(self._events) < _MAX_KEPT and not self.closed:
+                self._events[slot] = event
+                self._changed.notify()
+
+    def take(self, timeout: float) -> bytes:
+        """Take all events; empty if there is none for ``timeout`` seconds, or it is closed."""
+        with self._changed:
+            if not self._events and not self.closed:
+                self._changed.wait(timeout)
+            taken = b"".join(self._events.values())
+            self._events.clear()
+        return taken
+
+    def close(self) -> None:
+        """Wake the taker; nothing more comes."""
+        with self._changed:
+            self.closed = True
+            self._events.clear()
+            self._changed.notify_all()
+
+
+class WebHub:
+    """All open pages, and the events that a new one gets first."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pages: list[Page] = []
+        self._kept: OrderedDict[Slot, bytes] = OrderedDict()
+        self._first: list[Callable[[], list[bytes]]] = []
+        self._closed = False
+
+    @property
+    def pages(self) -> int:
+        """Number of pages that are open."""
+        return len(self._pages)
+
+    def publish(self, kind: str, about: str, data: dict[str, Any], keep: bool = True) -> None:
+        """Send an event to all pages, and, if it is kept, to those that open later."""
+        slot, event = (kind, about), encode_event(kind, data)
+        with self._lock:
+            if keep and (slot in self._kept or len(self._kept) < _MAX_KEPT):
+                self._kept[slot] = event
+            pages = list(self._pages)
+        for page in pages:
+            page.put(slot, event)
+
+    def tell_first(self, events: Callable[[], list[bytes]]) -> None:
+        """Send these events to every new page, before all others."""
+        self._first.append(events)
+
+    def open_page(self) -> Page | None:
+        """Return a new page with the first and the kept events; None if there are too many."""
+        page = Page()
+        for number, event in enumerate(event for events in self._first for event in events()):
+            page.put(("first", str(number)), event)
+        with self._lock:
+            if self._closed or len(self._pages) >= MAX_PAGES:
+                return None
+            for slot, event in self._kept.items():
+                page.put(slot, event)
+            self._pages.append(page)
+        return page
+
+    def close_page(self, page: Page) -> None:
+        """Forget a page."""
+        page.close()
+        with self._lock:
+            if page in self._pages:
+                self._pages.remove(page)
+
+    def close(self) -> None:
+        """Close all pages; none can be opened any more."""
+        with self._lock:
+            self._closed = True
+            pages = list(self._pages)
+        for page in pages:
+            page.close()
+
+
+def encode_event(kind: str, data: dict[str, Any]) -> bytes:
+    """Return a server-sent event; ValueError for NaN, which JSON cannot say."""
+    return f"event: {kind}\ndata: {json.dumps(data, allow_nan=False, separators=(',', ':'))}\n\n".encode()
+
+
 _TRAIL = 4_000  # points of a robot's trail
 _TRAIL_STEP = 0.25  # metres between them
 _TRAIL_GAP = 2.0  # seconds without a pose: the trail is interrupted
@@ -42,7 +149,7 @@ class WebSink(Sink):
     """Events of a session for the pages of a hub.
 
     Attributes:
-        maps: what the pages read, by hash: see :func:`packed_map`.
+        maps: packed maps by hash, see :func:`packed_map`.
     """
 
     def __init__(self, hub: WebHub) -> None:
@@ -88,7 +195,7 @@ class WebSink(Sink):
         )
 
     def status(self, robot: str, status: dict[str, Any]) -> None:
-        """Tell what a person wants to know of a status; its fields come from the network, and any may be missing."""
+        """Publish the fields of a status that the page shows; they come from the network, and any may be missing."""
         data: dict[str, Any] = {"robot": robot} | {name: _plain(status.get(name)) for name in _STATUS}
         for part, names in _PARTS.items():
             fields = status.get(part)

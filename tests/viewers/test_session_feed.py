@@ -21,10 +21,8 @@ from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.viewers import session_feed
-from coview_stream.viewers.map_source import asked_of_node
 from coview_stream.viewers.scene import PoseTrack, Sink
-from coview_stream.viewers.session_feed import SessionFeed
-from coview_stream.viewers.topics import topics_of_base, topics_of_robots
+from coview_stream.viewers.session_feed import SessionFeed, asked_of_node, topics_of_base, topics_of_robots
 
 VIEW = MapView(np.zeros(3), np.ones((4, 3), dtype=np.float32), np.ones(4, dtype=bool), None, SHA)
 

@@ -19,7 +19,7 @@ from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.transport import http_server, zenoh_transport
 from coview_stream.stream.transport.memory_transport import MemoryTransport
-from coview_stream.viewers import web_hub, web_page, web_sink
+from coview_stream.viewers import web_page, web_sink
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewers.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -50,7 +50,7 @@ def test_documented_program_prints_poses(monkeypatch, capsys):
 def test_documented_figures_are_those_of_the_code():
     for figure in (
         web_page.WEB_ADDRESS,
-        f"At most {web_hub.MAX_PAGES} pages and {http_server._MAX_CONNECTIONS}\nconnections",
+        f"At most {web_sink.MAX_PAGES} pages and {http_server._MAX_CONNECTIONS}\nconnections",
         f"up to {web_sink._TRAIL:,} points",
         f"{POINTS_ON_WIRE:,} points",
         "nothing for four seconds" if http_server._SEND_TIMEOUT == 4.0 else "?",

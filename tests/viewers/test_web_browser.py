@@ -18,8 +18,7 @@ from coview_stream.messages import encode_pose
 from coview_stream.messages.json_messages import encode_hypotheses
 from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.transport.memory_transport import MemoryTransport
-from coview_stream.viewers.session_feed import SessionFeed
-from coview_stream.viewers.topics import topics_of_robots
+from coview_stream.viewers.session_feed import SessionFeed, topics_of_robots
 from coview_stream.viewers.web_page import WebPage
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from coview_stream.viewers.web_hub import MAX_PAGES, WebHub, encode_event
+from coview_stream.viewers.web_sink import MAX_PAGES, WebHub, encode_event
 
 
 def events(taken):

@@ -105,7 +105,7 @@ def test_events_come_as_they_are_published(served):
 
 
 def test_too_many_pages_are_told_so(served, monkeypatch):
-    monkeypatch.setattr("coview_stream.viewers.web_hub.MAX_PAGES", 2)
+    monkeypatch.setattr("coview_stream.viewers.web_sink.MAX_PAGES", 2)
     kept = [get(served, "/events") for _ in range(2)]
     assert get(served, "/events")[0].status == 503
     assert get(served, "/")[0].status == 200

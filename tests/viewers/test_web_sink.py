@@ -15,8 +15,7 @@ from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan
-from coview_stream.viewers.web_hub import WebHub
-from coview_stream.viewers.web_sink import WebSink, packed_map
+from coview_stream.viewers.web_sink import WebHub, WebSink, packed_map
 
 EAST = 593_000.0
 

@@ -31,7 +31,7 @@ def world(folder):
 
 
 def test_recording_holds_survey_truth_scans_and_odometry_at_their_stamps(tmp_path):
-    from coview_stream.viewers.world_recording import record_world
+    from coview_stream.viewers.foxglove_sink import record_world
 
     assert record_world(world(tmp_path / "world"), tmp_path / "a.mcap") == 3
     reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
@@ -56,7 +56,7 @@ def test_recording_holds_survey_truth_scans_and_odometry_at_their_stamps(tmp_pat
 
 
 def test_recording_of_a_world_does_not_overwrite(tmp_path):
-    from coview_stream.viewers.world_recording import record_world
+    from coview_stream.viewers.foxglove_sink import record_world
 
     (tmp_path / "a.mcap").write_bytes(b"mine")
     with pytest.raises(InputError, match="is there already"):

@@ -26,7 +26,6 @@ from coview_stream.stream.transport.zenoh_transport import open_client
 
 _log = logging.getLogger(__name__)
 
-# set by hand
 MAX_UNREAD_POSES = 100  # ten seconds of them
 _MAX_UNREAD_STATUSES = 100
 
@@ -44,7 +43,7 @@ class RobotClient:
     Sending and reading may happen on different threads. Of unread poses the newest 100 are kept.
 
     In an event loop ``async with`` and ``async for`` do the same; ``send_cloud`` and ``send_odometry`` never wait, and
-    what does goes to a thread: ``await asyncio.to_thread(robot.wait_for_node, 10)``.
+    calls that do go to a thread: ``await asyncio.to_thread(robot.wait_for_node, 10)``.
 
     Args:
         robot: its name, as given to ``coview-stream serve --robot``.
@@ -194,7 +193,7 @@ class RobotClient:
             timeout: seconds.
             map: name of the one of several maps in whose frame x and y are.
             within: metres around x and y, 50 or more, outside of which nothing is searched until the place is known;
-                this is trusted, a quarter wider than given, and grows with what the robot drives.
+                this is trusted, a quarter wider than given, and grows with the distance driven.
 
         Returns:
             The reply; ``taken`` is False while the place is known.

@@ -12,7 +12,6 @@ from coview_stream.geometry.transforms import yaw_of
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.messages.types import PoseMessage
 
-# set by hand
 WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown
 SILENT = 5.0  # seconds without any message: a node sends one every second
@@ -197,7 +196,7 @@ def _mapping(status: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _says(status: dict[str, Any]) -> list[str]:
-    """Return what the node says of the robot's sensor and odometry."""
+    """Return the node's remarks on the robot's sensor and odometry."""
     says = _mapping(status, "calibration").get("says")
     return [str(clause) for clause in says] if isinstance(says, list) else []
 

@@ -19,7 +19,7 @@ from coview_stream.messages.types import Encoded
 from coview_stream.recordings.run import Run
 from coview_stream.stream.client.sender import Sender, nanoseconds
 
-_SINGLE_FRAME_PERIOD = 0.1  # seconds, set by hand: between repetitions of a run of one frame
+_SINGLE_FRAME_PERIOD = 0.1  # seconds between repetitions of a run of one frame
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,6 @@ def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[ScheduledS
         yield ScheduledSample(float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None)
 
 
-# set by hand
 _MAX_MEASUREMENTS = 100_000  # of each kind: a replay in a loop may run for days
 _LATE = 0.02  # seconds; a live lidar's own jitter stays below
 

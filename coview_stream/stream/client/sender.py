@@ -22,7 +22,7 @@ CLOUD_ENCODINGS = ("xyz", "xyzi", "foxglove", "cdr", "keelson")
 ODOMETRY_ENCODINGS = ("json", "cdr", "foxglove", "keelson")
 
 _TIMED = {"xyz": "foxglove", "xyzi": "foxglove"}  # raw rows have no place for times
-_SETTLE = 0.3  # seconds, set by hand; see Sender.settle
+_SETTLE = 0.3  # seconds; see Sender.settle
 _MAX_STAMP = 2**63 / 1e9  # seconds; int64 nanoseconds end there
 
 
@@ -136,9 +136,9 @@ def nanoseconds(stamp: float) -> int:
     return whole * 1_000_000_000 + round((float(stamp) - whole) * 1e9)
 
 
-def _checked_encoding(name: str, names: tuple[str, ...], what: str) -> str:
+def _checked_encoding(name: str, names: tuple[str, ...], option: str) -> str:
     if name not in names:
-        raise ConfigError(f"{what} {name!r} is unknown: choose one of {', '.join(names)}")
+        raise ConfigError(f"{option} {name!r} is unknown: choose one of {', '.join(names)}")
     return name
 
 

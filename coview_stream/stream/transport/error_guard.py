@@ -1,4 +1,4 @@
-"""Guarded calls of handlers: what they raise is logged at a limited rate, and never ends a thread."""
+"""Guard of handlers: their errors are logged at a limited rate and never end a thread."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class RateLimitedErrors:
             "%s: %s: %s%s",
             place,
             type(error).__name__,
-            str(error),  # the error itself would keep its frames, and what they hold, alive with the record
+            str(error),  # the error itself would keep its frames alive with the record
             more,
             exc_info=self._logger.isEnabledFor(logging.DEBUG),
         )

@@ -2,7 +2,7 @@
 
 ``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and ``keelson``
 RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no other convention has them. No robot
-may read what another sends, and no pose may come back as input.
+may read another's messages, and no pose may come back as input.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ def check_chunk(text: str, option: str) -> str:
     """Return ``text`` if it can be one chunk of a key, such as a robot's name.
 
     Args:
-        text: what the user gave.
+        text: given by the user.
         option: its name in error messages, for example ``--robot``.
 
     Raises:
-        ConfigError: if it is empty, starts with ``@``, or holds one of ``/*$?#`` or what cannot be printed.
+        ConfigError: if it is empty, starts with ``@``, or holds one of ``/*$?#`` or unprintable characters.
     """
     if not text:
         raise ConfigError(f"{option} is empty: give it a name")
@@ -59,7 +59,7 @@ def check_expression(text: str, option: str, wildcards: bool = True) -> str:
     """Return ``text`` if it is a key expression in zenoh's canonical form.
 
     Args:
-        text: what the user gave.
+        text: given by the user.
         option: its name in error messages.
         wildcards: accept ``*``, ``**`` and ``$*``; False for a key to publish on.
 

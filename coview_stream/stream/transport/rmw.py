@@ -1,4 +1,4 @@
-"""rmw_zenoh (ROS 2 over zenoh) beside the payload: type names, attachments and liveliness tokens.
+"""Conventions of rmw_zenoh (ROS 2 over zenoh): type names, attachments and liveliness tokens.
 
 A ROS 2 subscription drops samples without the attachment, and ``ros2 topic list`` shows only topics whose publisher
 holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs in the type hash alone.
@@ -31,7 +31,7 @@ def dds_type(name: str) -> str:
 
 
 def type_hash(name: str, humble: bool = False) -> str:
-    """Return the RIHS01 hash of a ROS 2 message type, or what Humble writes instead."""
+    """Return the RIHS01 hash of a ROS 2 message type, or Humble's placeholder."""
     if humble:
         return NO_HASH
     typesys = require_library("rosbags.typesys", "rosbags>=0.11", "the preset rmw_zenoh")
@@ -54,7 +54,7 @@ def node_token(domain: int, zid: str, node: str) -> str:
 
 
 def publisher_token(key: str, zid: str, node: str, entity_id: int) -> str:
-    """Return the token of a publisher on ``key``, ``domain/topic.../type/hash``; ``entity_id`` is its alone."""
+    """Return the token of a publisher on ``key``, ``domain/topic.../type/hash``; ``entity_id`` must be unique."""
     domain, *topic, kind, digest = key.split("/")
     name = _ROOT + _ROOT.join(topic)
     return f"@ros2_lv/{domain}/{zid}/{_NODE_ID}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"

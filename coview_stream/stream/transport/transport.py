@@ -52,9 +52,9 @@ class Transport(Protocol):
     """A publish/subscribe session. Handlers are called on a thread of the subscription's own, one call at a time."""
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
-        """Call ``handler`` for what is published on ``key`` (a key expression). Its errors are logged.
+        """Call ``handler`` with samples on ``key`` (a key expression). Its errors are logged.
 
-        Returns what ends the subscription, which may be called from any thread and more than once.
+        Returns a function that ends the subscription; any thread may call it, more than once.
         """
         ...
 

@@ -71,18 +71,18 @@ _PLACE = re.compile(r" at line (\d+) column \d+")
 
 
 @contextmanager
-def zenoh_errors(what: str) -> Iterator[None]:
-    """Turn zenoh's errors, and the panics of its Rust core, into :class:`TransportError` about ``what``."""
+def zenoh_errors(subject: str) -> Iterator[None]:
+    """Turn zenoh's errors, and the panics of its Rust core, into :class:`TransportError` about ``subject``."""
     import zenoh
 
     try:
         yield
     except zenoh.ZError as error:
-        raise TransportError(f"{what}: {reason(error)}") from error
+        raise TransportError(f"{subject}: {reason(error)}") from error
     except BaseException as error:
         if not is_panic(error):
             raise
-        raise TransportError(f"{what}: zenoh failed inside: {reason(error)}") from error
+        raise TransportError(f"{subject}: zenoh failed inside: {reason(error)}") from error
 
 
 def compose(
@@ -147,8 +147,8 @@ def _load(path: Path | None) -> tuple[Any, str]:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        what = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise TransportError(f"zenoh configuration {path}: {what}: give a JSON5 file that can be read") from error
+        cause = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise TransportError(f"zenoh configuration {path}: {cause}: give a JSON5 file that can be read") from error
     with zenoh_errors(f"zenoh configuration {path}"):
         return zenoh.Config.from_file(str(path)), text
 
@@ -156,7 +156,7 @@ def _load(path: Path | None) -> tuple[Any, str]:
 def _is_unset(config: Any, key: str) -> bool:
     import zenoh
 
-    # zenoh does not tell what a file set; what reads as in an empty configuration counts as not set
+    # zenoh does not list a file's settings; a value equal to the default counts as unset
     return bool(_get(config, key) == _get(zenoh.Config(), key))
 
 

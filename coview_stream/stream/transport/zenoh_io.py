@@ -17,8 +17,8 @@ from coview_stream.stream.transport.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
 _JSON = "application/json"
-_MAX_WAITING = 1024  # messages that wait for the link; set by hand
-FLUSH = 0.3  # seconds for them at closing; set by hand
+_MAX_WAITING = 1024  # messages that wait for the link: 5 s of 200 Hz odometry
+FLUSH = 0.3  # seconds for them at closing
 
 Answer = Callable[[dict[str, str]], dict[str, Any]]
 """Handler of a query: from its parameters to the fields of the reply."""
@@ -29,7 +29,7 @@ class ZenohPublisher:
 
     Args:
         key: to publish on.
-        guard: logs what zenoh refuses.
+        guard: logs zenoh's refusals.
         writer: publishes in its own time; None publishes on the thread that calls.
     """
 
@@ -73,7 +73,7 @@ class ZenohPublisher:
 
 
 class Writer:
-    """Queue of what waits for the link rather than being dropped, and the work of the one thread that empties it.
+    """Queue of messages that wait for the link rather than being dropped, and the work of the thread that empties it.
 
     A link that is half-open holds up whoever writes to it, by seconds: the thread, not its callers. Of more than 1024
     messages the oldest are dropped, five seconds of odometry at 200 Hz, and that is logged.
@@ -116,7 +116,7 @@ class Writer:
             return self._changed.wait_for(lambda: not (self._waiting or self._busy), seconds)
 
     def end(self) -> None:
-        """Let :meth:`run` return; what still waits is lost."""
+        """Let :meth:`run` return; waiting messages are lost."""
         with self._changed:
             self._ended = True
             self._waiting.clear()
@@ -229,7 +229,7 @@ def _error_of(payload: bytes) -> str:
 
 
 THREADS = 4
-"""Handlers that run at once, of different subscriptions; set by hand: they decode, and wait for little else."""
+"""Handlers that run at once, of different subscriptions: they decode and rarely wait."""
 
 
 class Inbox:
@@ -254,7 +254,7 @@ class Inbox:
                 self._ready.put(self)
 
     def close(self) -> None:
-        """Handle nothing any more, but for what is being handled now."""
+        """Handle nothing more; a running handler ends."""
         with self._lock:
             self._closed = True
             self._waiting.clear()
@@ -278,7 +278,6 @@ class Inboxes:
     """All inboxes of a transport."""
 
     def __init__(self, guard: RateLimitedErrors) -> None:
-        """Take who logs what goes wrong."""
         self._guard = guard
         self._ready: SimpleQueue[Inbox | None] = SimpleQueue()
 

@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 # zenoh's words for a missing router; any other error at opening is a mistake that waiting does not mend
 _NO_ROUTER = "Unable to connect"
 
-# set by hand; seconds unless they say otherwise
+# seconds
 _POLL = 0.02  # a look at the matching status costs microseconds
 _RETRY = 0.5  # between two attempts to find the first router
 _OPEN_TIMEOUT = 2.0  # of opening, for the first attempt: a host that is off does not even refuse
@@ -109,7 +109,7 @@ class ZenohTransport:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._declared: list[Any] = []  # zenoh undeclares what is not referenced
+        self._declared: list[Any] = []  # zenoh undeclares unreferenced objects
         self._declarations: list[Callable[[Any], None]] = []  # for a session that opens later
         self._answers = Answers(self._guard)
         self._inboxes = Inboxes(self._guard)
@@ -122,7 +122,7 @@ class ZenohTransport:
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
         """Call ``handler`` on one of our threads; ``newest`` keeps one unread sample, ``all`` the newest 1024.
 
-        Samples of a subscription are handled one at a time, in order. Returns what ends the subscription.
+        Samples of a subscription are handled one at a time, in order. Returns a function that ends the subscription.
 
         Raises:
             TransportError: if ``key`` is no key expression or the transport is closed.
@@ -265,7 +265,7 @@ class ZenohTransport:
     def close(self) -> None:
         """Undeclare everything and end the threads; takes well under a second, on a link that is held up up to two.
 
-        What waits for the link is given 0.3 s. Idempotent.
+        Messages that wait for the link are given 0.3 s. Idempotent.
         """
         with self._lock:
             if self._closing.is_set():
