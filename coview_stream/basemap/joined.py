@@ -1,4 +1,4 @@
-"""Several maps as a node serves them: what changes at the source of any of them is taken over."""
+"""Several maps joined into one, named by a small file, and loaded like one map."""
 
 from __future__ import annotations
 
@@ -18,13 +18,11 @@ from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, layers_arrays
 from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.fetch import Mirror
-from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.basemap.site.store import cache_folder, evict, read_record, remember_written, write_record
 from coview_stream.basemap.site.working_file import open_made
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
-from coview_stream.errors import MapError, TransportError
+from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats, Ints
 
 _CODE = 2
@@ -251,56 +249,3 @@ def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
     maps = read_names(path)
     joined, _ = open_made(lambda: joined_file(maps, verify_key))
     return BaseMap.load(joined, check=False)
-
-
-class ServedMaps:
-    """Maps by name, of which some are mirrors of sites elsewhere; tiles of parts stay those of their circles.
-
-    Attributes:
-        map_path: what they are opened from, as one.
-        route: None: no robot is followed.
-    """
-
-    route = None
-
-    def __init__(self, maps: Sequence[tuple[str, Path]], mirrors: Sequence[Mirror]) -> None:
-        """Take the maps' names and paths, and the mirrors among them, which have been opened."""
-        self.map_path = write_names(maps)
-        self._mirrors = mirrors
-
-    @property
-    def name(self) -> str:
-        """Where those are that come from elsewhere, for messages."""
-        return ", ".join(each.source.name for each in self._mirrors)
-
-    @property
-    def offline(self) -> str:
-        """Why a source could not be asked the last time; empty where all could."""
-        return "; ".join(each.offline for each in self._mirrors if each.offline)
-
-    def refresh(self) -> bool:
-        """Ask all sources, fetch what is missing, and return whether anything has changed.
-
-        Raises:
-            TransportError: one cannot be asked, and none has changed. MapError: what one gave is not what it should be.
-        """
-        changed, failed = False, None
-        for mirror in self._mirrors:
-            try:
-                if mirror.refresh():
-                    changed = True
-                    _ = mirror.map_path  # a part's tiles may be others now
-            except TransportError as error:
-                mirror.offline, failed = str(error), error
-        if failed is not None and not changed:
-            raise failed
-        return changed
-
-    def follow(self, robots: Mapping[str, Whereabouts | None]) -> bool:
-        """Return False: tiles do not follow robots here."""
-        return False
-
-    def close(self) -> None:
-        """End connections."""
-        for mirror in self._mirrors:
-            mirror.source.close()

@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     directory = site_directory(args.map)
     if directory is not None:
         facts["site"] = _site(directory)
-    if source.mirror is not None:
-        facts["fetched from"] = source.mirror.source.name + (", not reached now" if source.mirror.offline else "")
+    for mirror in source.mirrors:
+        facts["fetched from"] = mirror.source.name + (", not reached now" if mirror.offline else "")
     facts["signature"] = _signature(directory or args.map, args.verify_key is not None)
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)

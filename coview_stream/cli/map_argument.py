@@ -8,24 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.joined import ServedMaps
     from coview_stream.basemap.signature import VerifyKey
     from coview_stream.basemap.site.fetch import Mirror
-    from coview_stream.basemap.site.served_site import ServedSite
 
 
 class LocalMap(NamedTuple):
     """A map on this machine.
 
     Attributes:
-        path: what :meth:`BaseMap.load` takes.
-        mirror: of a site elsewhere, None of a map that is here.
-        site: whose changes or robots can be followed; None where that was not asked for, and of one file.
+        path: argument of :meth:`BaseMap.load`.
+        mirrors: of the sites elsewhere that it is made of; none of a map that is here.
     """
 
     path: Path
-    mirror: Mirror | None = None
-    site: ServedSite | ServedMaps | None = None
+    mirrors: tuple[Mirror, ...] = ()
 
 
 def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bool = False) -> None:
@@ -38,9 +34,7 @@ def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bo
         + ("; several (storeys, sites) are searched together, by name: FLOOR=SITE.coview" if several else ""),
     )
     parser.add_argument(
-        "--around",
-        metavar="X,Y,RADIUS",
-        help="of a directory or an address only the tiles that this circle meets; of `serve` it moves with the robots",
+        "--around", metavar="X,Y,RADIUS", help="load only the tiles within RADIUS of X,Y, of a directory or an address"
     )
 
 
@@ -51,9 +45,8 @@ def local_map(
     base: str = "coview",
     connect: Sequence[str] = (),
     config: Path | None = None,
-    follows: bool = False,
 ) -> LocalMap:
-    """Return the map on this machine that a command was given; of an address, what has been fetched and checked.
+    """Return the map that a command was given; a site elsewhere is fetched and checked.
 
     Args:
         name: path or address.
@@ -62,18 +55,16 @@ def local_map(
         base: first part of zenoh keys.
         connect: zenoh endpoints, for ``zenoh://SITE``.
         config: a zenoh configuration, likewise.
-        follows: whether the site's changes, and with ``around`` its robots, are to be followed.
 
     Raises:
         ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.
-        MapError: what came is not what it should be, or nothing is in the circle.
+        MapError: a damaged or unsigned site, or no tile in the circle.
     """
     if around is None and "://" not in name:
         return LocalMap(Path(name))  # without the modules below: most maps are files
 
     from coview_stream.basemap.site.fetch import is_site_address
     from coview_stream.basemap.site.manifest import Around, Manifest, is_site, part_file, tiles_around
-    from coview_stream.basemap.site.served_site import ServedSite
     from coview_stream.errors import ConfigError
 
     circle = None if around is None else Around.parse(around)
@@ -81,10 +72,7 @@ def local_map(
         from coview_stream.stream.maps.fetch_map import open_mirror
 
         mirror = open_mirror(name, circle, verify_key, base, connect, config)
-        if not follows:
-            return LocalMap(mirror.map_path, mirror)
-        served = ServedSite(mirror.directory, mirror, circle)
-        return LocalMap(served.map_path, mirror, served)
+        return LocalMap(mirror.map_path, (mirror,))
     path = Path(name)
     if circle is None:
         return LocalMap(path)
@@ -93,18 +81,11 @@ def local_map(
             f"--around: {name} is no directory of tiles; `coview-stream build CLOUDS -o DIRECTORY/` makes one, "
             "`convert` one of a .coview file"
         )
-    if follows:
-        served = ServedSite(path, None, circle)
-        return LocalMap(served.map_path, None, served)
     return LocalMap(part_file(path, tiles_around(Manifest.load(path), circle), str(circle)))
 
 
-def open_map_argument(args: argparse.Namespace, follows: bool = False) -> LocalMap:
+def open_map_argument(args: argparse.Namespace) -> LocalMap:
     """Return the map that parsed arguments name, and put its path in the place of ``args.map``.
-
-    Args:
-        args: the arguments.
-        follows: as of :func:`local_map`; of several maps only changes are followed, not robots.
 
     Raises:
         As of :func:`local_map`; InputError: the key cannot be read.
@@ -116,32 +97,16 @@ def open_map_argument(args: argparse.Namespace, follows: bool = False) -> LocalM
     base = getattr(args, "base", "coview")
     given = args.map if isinstance(args.map, list) else [args.map]
     if len(given) == 1:
-        found = local_map(str(given[0]), args.around, key, base, connect, config, follows)
+        opened = local_map(str(given[0]), args.around, key, base, connect, config)
     else:
-        found = _several([_named(str(each)) for each in given], args.around, key, base, connect, config, follows)
-    args.map = found.path
-    return found
+        from coview_stream.basemap.joined import write_names
 
-
-def _several(
-    maps: Sequence[tuple[str, str]],
-    around: str | None,
-    verify_key: VerifyKey | None,
-    base: str,
-    connect: Sequence[str],
-    config: Path | None,
-    follows: bool,
-) -> LocalMap:
-    """Return several maps as one, by their names; the arguments are those of :func:`local_map`."""
-    from coview_stream.basemap.joined import ServedMaps
-
-    found = [(name, local_map(path, around, verify_key, base, connect, config)) for name, path in maps]
-    mirrors = [each.mirror for _, each in found if each.mirror is not None]
-    served = ServedMaps([(name, each.path) for name, each in found], mirrors)
-    if follows and mirrors:
-        return LocalMap(served.map_path, None, served)
-    served.close()
-    return LocalMap(served.map_path)
+        named = [_named(str(text)) for text in given]
+        maps = [(name, local_map(path, args.around, key, base, connect, config)) for name, path in named]
+        mirrors = tuple(mirror for _, part in maps for mirror in part.mirrors)
+        opened = LocalMap(write_names([(name, part.path) for name, part in maps]), mirrors)
+    args.map = opened.path
+    return opened
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -196,13 +196,13 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         deskew=not args.no_deskew,
         mount=mount_of(args),
     )
-    source = open_map_argument(args, follows=True)
+    source = open_map_argument(args)
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or default_node(args)), args.metrics, verify_key,
-        args.geo, initial_guesses(args.initial, args.robot, args.within), source.site, fleet_name(args.fleet),
+        args.geo, initial_guesses(args.initial, args.robot, args.within), source.mirrors, fleet_name(args.fleet),
         args.base,
     )  # fmt: skip
     sinks = open_sinks(args)

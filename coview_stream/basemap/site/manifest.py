@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.signature import SigningKey, VerifyKey
-from coview_stream.basemap.site.store import SHA256, cache_folder, read_record, write_record
+from coview_stream.basemap.site.store import SHA256, read_record, write_record
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.config import MapConfig
 from coview_stream.errors import ConfigError, MapError
@@ -406,28 +406,6 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
         return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise MapError(f"{path}: names no part of a site ({error}); use --around again") from error
-
-
-def keep_places(directory: Path, name: str, places: Mapping[str, tuple[float, float]]) -> None:
-    """Write where robots were on a part of a site, for the next start; what goes wrong is left to the log."""
-    try:
-        write_record(_places_record(directory, name), places)
-    except MapError as error:
-        log.warning("%s", error)
-
-
-def kept_places(directory: Path, name: str) -> dict[str, tuple[float, float]]:
-    """Return what :func:`keep_places` has written, nothing where there is no such file, or another one."""
-    try:
-        data = read_record(cache_folder() / "parts" / _places_record(directory, name))
-        found = {str(robot): (float(x), float(y)) for robot, (x, y) in data.items()}
-        return {robot: place for robot, place in found.items() if all(map(math.isfinite, place))}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}
-
-
-def _places_record(directory: Path, name: str) -> str:
-    return hashlib.sha256(f"{directory.resolve()}\n{name}".encode()).hexdigest()[:16] + ".places"
 
 
 def site_directory(path: Path) -> Path | None:

@@ -1,108 +1,105 @@
-"""Follower of a site: has a node take over what has changed at its source, and the tiles that its robots come to."""
+"""Follower of sites elsewhere: fetches their changes and has a node take them over."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from coview_stream.basemap.joined import ServedMaps
-from coview_stream.basemap.site.route import Whereabouts
-from coview_stream.basemap.site.served_site import ServedSite
+from coview_stream.basemap.site.fetch import Mirror
 from coview_stream.errors import CoViewError, TransportError
 
 log = logging.getLogger("coview_stream.maps")
 
 PERIOD = 10.0
-"""Seconds between two questions to the source, and from a change that failed to the next try; set by hand."""
+"""Seconds between two questions to the source, and from a change that failed to the next try."""
 
-_LOOK = 1.0  # seconds between two looks at where the robots are; set by hand
+_LOOK = 1.0  # seconds between two looks at the outcome of a change
 _MOST_DOUBLINGS = 5  # of the time to the next try
-_TAKEN = ("changed", "unchanged")
+_SETTLED = ("changed", "unchanged")
 
 
 class MapFollower:
-    """Asks a site's source now and then, and moves its tiles with the robots, on a thread of its own.
+    """Asks the sources of mirrored sites for changes, on a thread of its own.
 
     Attributes:
-        last: ``address``, ``result`` (``current``, ``fetched``, ``unreachable`` or ``refused``) and ``error``; where
-            tiles follow robots, ``around`` has the x, y and radius of the circles.
+        last: ``address``, ``result`` (``current``, ``fetched``, ``unreachable`` or ``refused``) and ``error``.
     """
 
     def __init__(
         self,
-        site: ServedSite | ServedMaps,
+        mirrors: Sequence[Mirror],
         take_over: Callable[[], object],
-        robots: Callable[[], Mapping[str, Whereabouts | None]] = dict,
         outcome: Callable[[], str] = lambda: "changed",
         period: float = PERIOD,
     ) -> None:
-        """Take a site.
+        """Follow mirrors that have been opened.
 
         Args:
-            site: the site, or several maps as one.
-            take_over: asks for its change to be taken over.
-            robots: returns where robots are or may be, in the frame of the site's sources.
-            outcome: says what became of that: ``changed``, ``unchanged``, that it failed, or ``loading`` until then,
-                while the site is left as it is. A change that failed is asked for again, each time later.
-            period: seconds between two questions to the source.
+            mirrors: of all sites of the node's map.
+            take_over: asks the node to load the map again.
+            outcome: returns the result of that: ``changed``, ``unchanged``, ``loading`` (the mirrors stay as they are
+                meanwhile), or another word for a failure. A change that failed is asked for again, each time later.
+            period: seconds between two questions to the sources.
         """
-        self._site, self._take_over, self._robots, self._outcome = site, take_over, robots, outcome
+        self._mirrors, self._take_over, self._outcome = mirrors, take_over, outcome
         self._period = period
-        self._pending = False  # a change that has not been taken over yet
+        self.name = ", ".join(mirror.source.name for mirror in mirrors)
         self.last: dict[str, Any] = {}
-        self._note("unreachable" if site.offline else "current", site.offline or None)
+        self._note("unreachable" if self._offline else "current", self._offline or None)
+
+    @property
+    def _offline(self) -> str:
+        return "; ".join(mirror.offline for mirror in self._mirrors if mirror.offline)
 
     def run(self, stopping: threading.Event) -> None:
-        """Follow until ``stopping`` is set; what goes wrong is logged once, and the map that is there is kept."""
-        asked, tries, again_at = time.monotonic(), 0, 0.0
+        """Follow until ``stopping`` is set; an error is logged once, and the present map is kept."""
+        asked, tries, again_at, pending = time.monotonic(), 0, 0.0, False
         try:
             while not stopping.wait(min(_LOOK, self._period)):
                 now, outcome = time.monotonic(), self._outcome()
                 if outcome == "loading":
                     continue
-                if outcome in _TAKEN:
-                    self._pending, tries = False, 0
-                changed = self._site.route is not None and self._look(self._moved, quiet=True)
-                if not changed and now - asked >= self._period:
+                if outcome in _SETTLED:
+                    pending, tries = False, 0
+                changed = False
+                if now - asked >= self._period:
                     asked = now
-                    changed = self._look(self._site.refresh)
+                    changed = self._refresh()
                 if changed:
                     tries = 0
-                elif not self._pending or now < again_at:
+                elif not pending or now < again_at:
                     continue
-                log.info(
-                    "%s: %s", self._site.name, "other tiles are wanted, or it has changed" if changed else "once more"
-                )
-                self._pending, again_at = True, now + self._period * 2 ** min(tries, _MOST_DOUBLINGS)
+                log.info("%s: %s", self.name, "it has changed" if changed else "once more")
+                pending, again_at = True, now + self._period * 2 ** min(tries, _MOST_DOUBLINGS)
                 tries += 1
                 self._take_over()
         finally:
-            self._site.close()
+            for mirror in self._mirrors:
+                mirror.source.close()
 
-    def _moved(self) -> bool:
-        return self._site.follow(self._robots())
-
-    def _look(self, ask: Callable[[], bool], quiet: bool = False) -> bool:
-        """Ask for changes and return whether there are any; ``quiet``: that there are none is no news."""
-        try:
-            changed = ask()
-        except (CoViewError, OSError) as error:
-            text = " ".join(str(error).split())
+    def _refresh(self) -> bool:
+        """Fetch changes and return whether there are any."""
+        changed, failure = False, None
+        for mirror in self._mirrors:
+            try:
+                if mirror.refresh():
+                    changed = True
+                    _ = mirror.map_path  # chooses the tiles of a part again
+            except (CoViewError, OSError) as error:
+                mirror.offline, failure = str(error), error
+        if failure is not None and not changed:
+            text = " ".join(str(failure).split())
             if text != self.last["error"]:
                 log.error("%s; the map that is there is kept", text)
-            self._note("unreachable" if isinstance(error, OSError | TransportError) else "refused", text)
+            self._note("unreachable" if isinstance(failure, OSError | TransportError) else "refused", text)
             return False
-        if quiet and not changed:
-            return False
-        if self.last["error"] and not self._site.offline:
-            log.info("%s answers again", self._site.name)
-        self._note("fetched" if changed else "current", self._site.offline or None)
+        if self.last["error"] and not self._offline:
+            log.info("%s answers again", self.name)
+        self._note("fetched" if changed else "current", self._offline or None)
         return changed
 
     def _note(self, result: str, error: str | None = None) -> None:
-        self.last = {"address": self._site.name, "result": result, "error": error}
-        if self._site.route is not None:
-            self.last["around"] = [[each.x, each.y, each.radius] for each in self._site.route.circles()]
+        self.last = {"address": self.name, "result": result, "error": error}

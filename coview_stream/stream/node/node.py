@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from coview_stream.config.node import NodeConfig
+from coview_stream.stream.maps.map_follower import MapFollower
 from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.engine_feed import EngineFeed
@@ -33,15 +34,6 @@ log = logging.getLogger("coview_stream.node")
 _MAX_POSE_TICKS = 200.0  # of the pose clock, per second; set by hand, as are those below
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish what they are at
-
-
-class Follower(Protocol):
-    """Follows the source of a map: :class:`~coview_stream.stream.maps.map_follower.MapFollower`."""
-
-    @property
-    def last(self) -> dict[str, Any]:
-        """What became of the newest question to the source."""
-        ...
 
 
 class Reloader(Protocol):
@@ -113,7 +105,7 @@ class Node:
         self._ending: threading.Thread | None = None
         self.started = self.beat = time.monotonic()
         self.reloader: Reloader | None = None
-        self.map_follower: Follower | None = None
+        self.map_follower: MapFollower | None = None
         self.map_files: Mapping[str, Path] = {}
 
     # ---- life

@@ -23,9 +23,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.joined import ServedMaps
-    from coview_stream.basemap.site.route import Whereabouts
-    from coview_stream.basemap.site.served_site import ServedSite
+    from coview_stream.basemap.site.fetch import Mirror
     from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.reload import OpenedMap
@@ -58,7 +56,7 @@ class ServeOptions:
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
         geo: encoding in which poses go out as places on Earth as well; None: they do not.
         guesses: of the places of robots, by name: tried, never trusted.
-        site: that the map is of, if its changes or its robots are followed; None otherwise.
+        mirrors: of the sites elsewhere that the map is made of, whose changes are followed.
         fleet: name of the fleet of nodes that share the robots; None: this one serves all, or stands by for all.
         base: first part of the fleet's keys.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
@@ -83,7 +81,7 @@ class ServeOptions:
     verify_key: VerifyKey | None = None
     geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
-    site: ServedSite | ServedMaps | None = None
+    mirrors: Sequence[Mirror] = ()
     fleet: str | None = None
     base: str = "coview"
 
@@ -125,7 +123,6 @@ def open_node(
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.locations import LocationPublisher, MapReference
         from coview_stream.stream.node.map_view import MapViewAnswer
-        from coview_stream.stream.node.memory import MemoryRelease
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.node.reload import MapReloader
         from coview_stream.stream.node.systemd import Notifier
@@ -167,12 +164,9 @@ def open_node(
             lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
         )
         node.run_beside("reload", reloader.run)
-        if options.site is not None:
-            node.map_follower = follower = MapFollower(
-                options.site, node.reload, lambda: whereabouts(node.sessions), lambda: reloader.outcome
-            )
+        if options.mirrors:
+            node.map_follower = follower = MapFollower(options.mirrors, node.reload, lambda: reloader.outcome)
             node.run_beside("map source", follower.run)
-        node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
         if isinstance(elections, FleetShares):
             for endpoints in node.endpoints.values():
@@ -196,7 +190,7 @@ def open_node(
         if isinstance(error, DiedError):
             raise MapError(f"{options.map_path}: {error} while it opened the map") from error
         raise
-    where = options.map_path if options.site is None else options.site.name
+    where = node.map_follower.name if node.map_follower is not None else options.map_path
     log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, where, ", ".join(names))
     notifier.ready(f"serves {', '.join(names)}")
     return node
@@ -318,8 +312,3 @@ def make_sessions(options: ServeOptions, base_map: BaseMap) -> list[Session]:
     for session in made:
         session.site_sha256 = base_map.site_sha256
     return made
-
-
-def whereabouts(sessions: Sequence[Session]) -> dict[str, Whereabouts | None]:
-    """Return where robots are, or may be, in the map's frame, by name; None where nothing is known of it."""
-    return {session.keys.robot: session.whereabouts() for session in sessions}

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from coview_stream.basemap.map_parts import MapParts
-from coview_stream.basemap.site.route import Whereabouts
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
 from coview_stream.geometry.protection import ProtectionLevel
@@ -380,27 +379,6 @@ class Session:
         part = self.parts.at(pose.T_map_body[:3, 3])
         T_map_odom = None if pose.T_map_odom is None else part.own(pose.T_map_odom)
         return replace(pose, T_map_body=part.own(pose.T_map_body), T_map_odom=T_map_odom, frame_id=part.name)
-
-    def whereabouts(self) -> Whereabouts | None:
-        """Return where the robot is or, if that is not known, may be, in the map's frame.
-
-        It may be where somebody says that it is, else where it was, else at the most probable place that the search
-        considers, if that is more probable than none; None where there is nothing of that.
-        """
-        with self._lock:
-            correction = self.robot_state.correction
-            if correction is not None:
-                at = correction.T_map_body[:2, 3]
-            elif self._said is not None:
-                at = np.array([self._said.x, self._said.y])
-            elif self._hint.known is not None:
-                at = self._hint.known[:2, 3]
-            else:
-                seen = self.queue.considered
-                if seen is None or not len(seen.places) or seen.places[0, 4] <= seen.none:
-                    return None
-                at = seen.places[0, :2]
-            return Whereabouts((float(at[0]), float(at[1])), correction is not None)
 
     def map_name(self) -> str | None:
         """Return which of several maps the robot is on; None while that is not known, and where there is one map."""

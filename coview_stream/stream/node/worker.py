@@ -32,7 +32,6 @@ def main(argv: list[str]) -> int:
     from coview_stream.errors import CoViewError
     from coview_stream.stream.node.engine_process import attempt
     from coview_stream.stream.node.engines import kernels_of, open_engine
-    from coview_stream.stream.node.memory import MemoryRelease
 
     first, later = kernels_of(kind)
     for name in first:
@@ -68,11 +67,9 @@ def main(argv: list[str]) -> int:
         pipe.send(("prepared", None))
         _set_group_nice(nice)
         steps.append(engine.prepare_later)
-        memory = MemoryRelease()
         while True:
             use_pause()
             pipe.send(attempt(engine, pipe.recv()))
-            memory.when_due()
     return 0
 
 

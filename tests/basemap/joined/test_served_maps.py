@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.joined import ServedMaps, load_map, read_names, write_names
+from coview_stream.basemap.joined import load_map, read_names, write_names
 from coview_stream.basemap.map_parts import MapParts
 from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
-from coview_stream.errors import MapError, TransportError
+from coview_stream.errors import MapError
 
 pytestmark = pytest.mark.slow
 
@@ -17,28 +17,6 @@ pytestmark = pytest.mark.slow
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
-
-
-class Mirror:
-    """Of a site elsewhere."""
-
-    def __init__(self, *answers):
-        self.source = self
-        self.name = "zenoh://yard"
-        self.offline = ""
-        self.answers = list(answers)
-        self.map_path = None
-        self.closed = 0
-
-    def refresh(self):
-        answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
-            raise answer
-        self.offline = ""
-        return answer
-
-    def close(self):
-        self.closed += 1
 
 
 def test_names_are_loaded_as_one_map(world_file):
@@ -70,18 +48,3 @@ def test_two_maps_of_one_name_and_other_files_are_refused(world_file, tmp_path):
         other.write_text(content)
         with pytest.raises(MapError, match="names no maps"):
             load_map(other)
-
-
-def test_change_of_any_is_a_change_and_an_outage_of_one_hides_no_change_of_another(world_file):
-    gone = TransportError("nobody answers")
-    one, other = Mirror(False, True, gone, gone), Mirror(False, False, True, False)
-    served = ServedMaps([("a", world_file), ("b", world_file)], [one, other])
-    assert not served.refresh()
-    assert served.refresh()
-    assert served.refresh()
-    assert served.offline == "nobody answers"
-    with pytest.raises(TransportError):
-        served.refresh()
-    assert not served.follow({"r1": (0.0, 0.0)})
-    served.close()
-    assert (one.closed, other.closed) == (1, 1)

@@ -15,10 +15,8 @@ import zenoh
 from sockets import free_endpoint, until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.site.fetch import Mirror
+from coview_stream.basemap.site.fetch import DirectorySource, Mirror
 from coview_stream.basemap.site.manifest import Around, Manifest, part_file, read_part
-from coview_stream.basemap.site.route import Whereabouts
-from coview_stream.basemap.site.served_site import ServedSite
 from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import working_path
@@ -118,7 +116,7 @@ def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, si
     mirror = Mirror(source)
     mirror.open()
     calls, stopping = [], threading.Event()
-    follower = MapFollower(ServedSite(mirror.directory, mirror), lambda: calls.append(1), period=0.05)
+    follower = MapFollower([mirror], lambda: calls.append(1), period=0.05)
     thread = threading.Thread(target=follower.run, args=(stopping,))
     thread.start()
     try:
@@ -137,30 +135,74 @@ def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, si
         thread.join()
 
 
-def test_tiles_are_fetched_as_robots_come_to_them(source, server, site):
-    start = Around(511_950.0, 5_120_050.0, 30.0)
-    mirror = Mirror(source, None, start)
+class Gone(DirectorySource):
+    """A site whose source answers only sometimes."""
+
+    gone = False
+
+    def manifest(self):
+        if self.gone:
+            raise TransportError("yard: nobody answers")
+        return super().manifest()
+
+
+def test_change_that_is_not_taken_over_is_asked_for_again(site):
+    mirror = Mirror(DirectorySource(site))
     mirror.open()
-    served = ServedSite(mirror.directory, mirror, start)
-    place, outcomes, calls, stopping = {"r1": None}, ["loading"], [], threading.Event()
-    follower = MapFollower(served, lambda: calls.append(1), lambda: place, lambda: outcomes[-1], period=0.05)
+    outcomes, calls, stopping = ["loading"], [], threading.Event()
+    follower = MapFollower([mirror], lambda: calls.append(1), lambda: outcomes[-1], period=0.05)
     thread = threading.Thread(target=follower.run, args=(stopping,))
     thread.start()
     try:
-        place["r1"] = Whereabouts((512_050.0, 5_120_050.0), True)
+        whole = Manifest.load(site)
+        replace(whole, tiles=whole.tiles[1:]).save(site)
         assert not stopping.wait(0.3)
         assert not calls  # a change is being taken over
         outcomes.append("refused")
-        until(lambda: len(calls) > 2)  # asked for again
+        until(lambda: len(calls) > 2)
         outcomes.append("changed")
         assert not stopping.wait(0.3)
         made = len(calls)
         assert not stopping.wait(0.5)
         assert len(calls) == made
-        assert follower.last["around"] == [[*place["r1"].place, 30.0]]
-        directory, keys = read_part(served.map_path)
-        assert (directory, len(keys)) == (mirror.directory.resolve(), 1)
-        assert len(mirror.fetched(Manifest.load(mirror.directory))) == 2
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
+    other = shutil.copytree(site, tmp_path / "other")
+    gone = Gone(site)
+    mirrors = [Mirror(gone), Mirror(DirectorySource(other))]
+    for mirror in mirrors:
+        mirror.open()
+    calls, stopping = [], threading.Event()
+    follower = MapFollower(mirrors, lambda: calls.append(1), period=0.05)
+    thread = threading.Thread(target=follower.run, args=(stopping,))
+    gone.gone = True
+    thread.start()
+    try:
+        until(lambda: follower.last["result"] == "unreachable")
+        whole = Manifest.load(other)
+        replace(whole, tiles=whole.tiles[1:]).save(other)
+        until(lambda: calls)
+        assert mirrors[0].offline == "yard: nobody answers"
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):
+    mirror = Mirror(DirectorySource(site), None, Around(512_000.0, 5_120_000.0, 30.0))
+    mirror.open()
+    calls, stopping = [], threading.Event()
+    thread = threading.Thread(target=MapFollower([mirror], lambda: calls.append(1), period=0.05).run, args=(stopping,))
+    thread.start()
+    try:
+        whole = Manifest.load(site)
+        replace(whole, tiles=whole.tiles[1:]).save(site)
+        until(lambda: calls)
+        assert read_part(mirror.map_path)[1] == {(tile.column, tile.row) for tile in whole.tiles[1:]}
     finally:
         stopping.set()
         thread.join()

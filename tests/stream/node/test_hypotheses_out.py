@@ -13,10 +13,8 @@ from fake_robot import SHA, search_request, search_result, tracking, unknown
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import TransportError
 from coview_stream.localization.search.considered import Considered
-from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.stream.node.map_view import MapViewAnswer
-from coview_stream.stream.node.session import Session
 
 PLACES = Considered(1.5, np.array([[1.0, 2.0, 3.0, 0.5, 0.7, 9.0], [4.0, 5.0, 6.0, -0.5, 0.1, 2.0]]), 0.2)
 
@@ -53,29 +51,6 @@ def test_of_a_robot_with_a_place_nothing_goes_out(site, searched):
     site.frame("r1", 0.1)
     assert searched.state()[0].has_place
     assert published(site) == []
-
-
-def test_robot_may_be_at_the_most_probable_place_until_more_is_known(site, searched):
-    assert searched.whereabouts() == ((1.0, 2.0), False)
-    assert searched.guess_place(PlaceGuess(7.0, 8.0))
-    site.frame("r1", 0.05)  # which takes it to the engine
-    assert searched.whereabouts() == ((7.0, 8.0), False)
-    beside = Session(searched.keys, SHA)
-    beside.begin_beside(searched)
-    assert beside.whereabouts() == ((7.0, 8.0), False)
-    site.engine.answer = tracking
-    site.frame("r1", 0.1)
-    correction = searched.robot_state.correction
-    assert searched.whereabouts() == (tuple(correction.T_map_body[:2, 3]), True)
-    searched.relocalize()
-    assert searched.whereabouts() is None
-
-
-def test_robot_that_is_more_probably_nowhere_is_nowhere(site, searched):
-    assert site.sessions["r1"].whereabouts() is not None
-    nowhere = replace(PLACES, none=0.75)
-    searched.queue.considered = nowhere
-    assert searched.whereabouts() is None
 
 
 def test_a_new_odometry_frame_forgets_them(site, searched):
