@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.accuracy.accuracy import evaluated
 from bench.accuracy.stages import WINDOW, Bank, Variant, places
-from bench.accuracy.world_runs import evaluated
-from bench.harness.files import code_line, fingerprint, folder, isolated, remembered
-from bench.harness.rows import Row, informs
-from bench.harness.tables import number, table
+from bench.harness.files import fingerprint, folder, isolated, remembered
+from bench.harness.rows import Row, informs, number, table
 from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
 from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.localization.offline import locate
@@ -138,4 +137,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     shown = table(_HEAD, [[row.details["variant"], *row.details["cells"]] for row in rows])
     seeds, votes = rows[0].details["seeds"], rows[0].details["keyframes"]
     named = ", ".join(f"{seed} (tuned on)" if seed in TUNED_SEEDS else str(seed) for seed in seeds)
-    return {"": f"Worlds of the seeds {named}; {votes} keyframes vote.\n\n{shown}\n\n{code_line()}"}
+    return {"": f"Worlds of the seeds {named}; {votes} keyframes vote.\n\n{shown}"}

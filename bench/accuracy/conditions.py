@@ -1,30 +1,43 @@
-"""Real runs under the conditions of real robots: a leaning sensor, bad odometry, fewer beams, gaps, another direction.
+"""Real runs under the conditions of real robots, and on airborne-like maps of the same places.
 
-Each set of ``--data`` (``base.laz``, ``run/``, ``truth.tum``; these are no part of the repository) is spoilt as
+Each set of ``--data`` (``base.laz``, ``run/``, ``truth.tum``; not part of the repository) is spoilt as
 ``bench/accuracy/spoil.py`` says and localized by ``coview-stream locate``, one process per run, on the map that
-``coview-stream build`` makes of ``base.laz``. ``--before COMMIT`` has an earlier commit do the same, with its own map,
-and puts its figures before ours in every cell. What is done stays in ``--work``: an interrupted benchmark resumes.
+``coview-stream build`` makes of ``base.laz``. ``--densities`` adds maps of what an aircraft might have seen of the same
+place, without facades, made as ``coview-stream airborne`` does. ``--before COMMIT`` has an earlier commit do the same,
+with its own map, and puts its figures before ours in every cell. Results stay in ``--work``.
 
-A frame is false if its pose is more than 1 m or 5 degrees off; *share* is how many of the frames get a pose, per cent
-of how many of the unspoilt run's do.
+A frame is false if its pose is more than 1 m or 5 degrees off; *share* is the share of frames with a pose, per cent of
+the unspoilt run's.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import subprocess
+import time
+import zlib
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.accuracy.real_runs import RealSet, located
-from bench.harness.files import code_line, fingerprint, folder
-from bench.harness.pinned import Code, pinned, today
-from bench.harness.rows import Row, informs, judged
-from bench.harness.suite import ROOT
-from bench.harness.tables import NOTHING, number, table
+import numpy as np
+
+from bench.accuracy.scores import Track, errors, score
+from bench.accuracy.spoil import Variant, spoilt
+from bench.harness.files import ROOT, Code, fingerprint, folder, pinned, remembered, today
+from bench.harness.rows import NOTHING, Row, informs, judged, number, table
+from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Poses
+from coview_stream.recordings.open_run import open_run
+from coview_stream.report.evaluation import MAX_STAMP_GAP, driven
+from coview_stream.sim.airborne_survey import Survey, airborne_survey, surface_of
 
 SETS = ("riverside_a", "kitti04", "handheld_livox")
 CONDITIONS = (
@@ -36,102 +49,209 @@ LEAST_SHARE = 85.0  # per cent of the unspoilt run's poses
 MOST_METRES, MOST_DEGREES = 0.3, 1.0  # of every first fix
 _ASKED = ("pitch", "roll", "odo", "drift")  # conditions that LEAST_SHARE is asked of
 _ARROW = " > "
+_SPOILING = ("bench/accuracy/spoil.py", "bench/accuracy/conditions.py")
+_AIRBORNE = ("coview_stream/sim/airborne_survey.py", "coview_stream/clouds")
+_NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 Runs = dict[str, dict[str, Any]]  # scores by code, "before" and "now"
 
 
-def add_sets(parser: ArgumentParser, sets: Sequence[str]) -> None:
-    """Add where the sets are, and which."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the sets (COVIEW_DATA)")
-    parser.add_argument("--sets", nargs="+", default=list(sets), metavar="NAME", help=f"folders ({', '.join(sets)})")
+@dataclass(frozen=True)
+class RealSet:
+    """One set on disk: ``base.laz``, ``run/``, ``truth.tum`` (map <- body, a pose for each frame)."""
+
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Name of its directory."""
+        return self.folder.name
+
+    @property
+    def survey(self) -> Path:
+        """Point cloud that maps are built of."""
+        return self.folder / "base.laz"
+
+    def checked(self) -> RealSet:
+        """Return itself; InputError names a missing file."""
+        for path in (self.survey, self.folder / "run", self.folder / "truth.tum"):
+            if not path.exists():
+                raise InputError(f"{path}: not there; a set has base.laz, run/ and truth.tum (--data, --sets)")
+        return self
+
+    def airborne(self, density: float) -> tuple[Path, dict[str, Any]]:
+        """Return the airborne-like cloud of so many pulses per m2, made unless it is there, and counts of points."""
+        file = folder() / "conditions" / "airborne" / f"{self.name}-{density:g}.laz"
+
+        def make() -> dict[str, Any]:
+            cloud = read_cloud(self.survey)
+            flown = airborne_survey(cloud.points, Survey(density=density))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_cloud(file, flown, origin=cloud.origin)
+            walls = [100.0 * float(surface_of(points).wall.mean()) for points in (cloud.points.astype(float), flown)]
+            return {"points": len(cloud), "kept": len(flown), "walls_before": walls[0], "walls": walls[1]}
+
+        spec = {"set": self.name, "bytes": self.survey.stat().st_size, "density": density}
+        return file, remembered(file.with_suffix(".json"), spec | {"code": fingerprint(*_AIRBORNE)}, make)
+
+    def variant(self, condition: str, out: Path) -> Path:
+        """Write run and truth.tum of a condition below ``out``, unless they are there; return the run."""
+        seed = zlib.crc32(f"{self.name} {condition}".encode())
+        spec = {"set": self.name, "seed": seed, "condition": condition, "code": fingerprint(*_SPOILING)}
+        made = remembered(out / "spoilt.json", spec, lambda: self._write(condition, seed, out))
+        return out / str(made["run"])
+
+    def _write(self, condition: str, seed: int, out: Path) -> dict[str, str]:
+        run = open_run(self.folder / "run")
+        stamps, truth = read_tum(self.folder / "truth.tum")
+        if len(stamps) != len(run):
+            raise InputError(f"{self.folder}: {len(run)} frames and {len(stamps)} true poses; give one for each")
+        variant = spoilt(condition, Variant(np.arange(len(run)), stamps, run.poses, truth), seed)
+        shutil.rmtree(out, ignore_errors=True)
+        frames = out / "run" / "frames"
+        frames.mkdir(parents=True)
+        write_tum(out / "truth.tum", variant.stamps, variant.truth)
+        files = [out / "run.pcd"] if variant.alone else [frames / f"{k:06d}.pcd" for k in range(len(variant.frames))]
+        for file, k in zip(files, variant.frames, strict=True):
+            write_cloud(file, variant.cloud(run.read(int(k)).points))
+        if not variant.alone:
+            write_tum(out / "run" / "odometry.tum", variant.stamps, variant.odometry)
+        return {"run": "run.pcd" if variant.alone else "run"}
+
+
+def located(code: Code, version: str, site: Path, run: Path, out: Path) -> dict[str, Any]:
+    """Localize a run with the code's own command, unless ``out`` holds the result; return its scores."""
+    truth = read_tum(run.parent / "truth.tum")
+    spec = {"run": json.loads((run.parent / "spoilt.json").read_text())["spec"], "code": version}
+
+    def make() -> dict[str, Any]:
+        words = ("-m", "coview_stream", "locate", str(site), str(run), "-o", str(out), "--no-pictures")
+        begin = time.perf_counter()
+        done = subprocess.run(
+            code.command(*words), env=code.environment(), cwd=site.parent, capture_output=True, text=True
+        )
+        if done.returncode not in (0, _NO_POSE):
+            raise InputError(f"{run.parent.name}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+        scores = scored(read_tum(out / "trajectory.tum"), truth)
+        return {**scores, "locate_s": round(time.perf_counter() - begin, 1)}
+
+    return remembered(out / "scores.json", spec, make)
+
+
+def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[str, Any]:
+    """Score a trajectory: frames, posed, first fix and its errors, root mean squares, greatest, false frames."""
+    stamps, true = truth
+    poses = np.full((len(stamps), 4, 4), np.nan)
+    for stamp, T in zip(*estimate, strict=True):
+        nearest = int(np.abs(stamps - stamp).argmin())
+        if abs(stamps[nearest] - stamp) < MAX_STAMP_GAP:
+            poses[nearest] = T
+    none, count = np.full((len(stamps), 6, 6), np.nan), len(stamps)
+    states = np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
+    track = Track(stamps, states, [""] * count, poses, none, np.zeros(count), np.full((count, 2), np.nan))
+    error, known = errors(track, true), track.tracking
+    first = int(known.argmax()) if known.any() else None
+    kept = ("first_fix_m", "rmse_m", "rmse_deg", "max_m", "max_deg", "false_frames")
+    figures = score(track, true, driven(true), ())
+    return {
+        "frames": count,
+        "posed": int(known.sum()),
+        "first_m": None if first is None else float(error.metres[first]),
+        "first_deg": None if first is None else float(error.degrees[first]),
+        **{key: figures[key] for key in kept},
+    }
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add the sets, the conditions and the code that is compared with."""
-    add_sets(parser, SETS)
+    """Add the sets, the conditions, the maps and the code that is compared with."""
+    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the sets (COVIEW_DATA)")
+    parser.add_argument("--sets", nargs="+", default=list(SETS), metavar="NAME", help=f"folders ({', '.join(SETS)})")
     parser.add_argument("--conditions", nargs="+", default=list(CONDITIONS), metavar="NAME")
+    parser.add_argument(
+        "--densities", nargs="+", type=float, default=[], metavar="PER_M2", help="also on airborne-like maps: 4 8 20"
+    )
     parser.add_argument("--before", metavar="COMMIT", help="an earlier commit, measured on the same runs")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs at a time (1)")
 
 
 def codes(asked: Namespace) -> dict[str, tuple[Code, str]]:
-    """Return what is measured: the code with what its results depend on, the earlier one first."""
+    """Return the measured code with the version that its results depend on, the earlier one first."""
     now = {"now": (today(), fingerprint())}
-    before = getattr(asked, "before", None)
-    return {"before": (pinned(before), before), **now} if before else now
-
-
-def map_of(code: Code, name: str) -> Path:
-    """Return where a code's map of that name is kept."""
-    return folder() / "conditions" / f"maps-{code.version[:10]}" / f"{name}.coview"
-
-
-def measured(real: RealSet, condition: str, asked: Namespace) -> Runs:
-    """Localize a set under a condition with each code."""
-    name = condition.replace(":", "_")
-    run = real.variant(condition, folder() / "conditions" / "runs" / real.name / name)
-    found: Runs = {}
-    for label, (code, version) in codes(asked).items():
-        out = folder() / "conditions" / f"runs-{version[:10]}" / real.name / name
-        found[label] = located(code, version, map_of(code, real.name), run, out)
-    return found
+    return {"before": (pinned(asked.before), asked.before), **now} if asked.before else now
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield a row per set and condition, then the targets."""
+    """Yield a row per set, map and condition, then the targets."""
     sets = [RealSet(asked.data / name).checked() for name in (asked.sets[-1:] if asked.quick else asked.sets)]
     conditions = list(dict.fromkeys(("base", *(asked.conditions[:2] if asked.quick else asked.conditions))))
+    below = folder() / "conditions"
+    jobs = []
     for real in sets:
-        for code, _ in codes(asked).values():
-            code.built([real.survey], map_of(code, real.name))
-    every = [(real, condition) for real in sets for condition in conditions]
-    unspoilt: dict[str, Runs] = {}
-    yielded = []
+        for density in (None, *(asked.densities[:1] if asked.quick else asked.densities)):
+            cloud, facts = (real.survey, {}) if density is None else real.airborne(density)
+            name = real.name if density is None else f"{real.name}-{density:g}"
+            sites = {
+                label: code.built([cloud], below / f"maps-{code.version[:10]}" / f"{name}.coview")
+                for label, (code, _) in codes(asked).items()
+            }
+            jobs += [(real, density, facts, name, sites, condition) for condition in conditions]
+
+    def run(real: RealSet, density: float | None, facts: Any, name: str, sites: Any, condition: str) -> dict[str, Any]:
+        place = condition.replace(":", "_")
+        variant, scores = real.variant(condition, below / "runs" / real.name / place), {}
+        for label, (code, version) in codes(asked).items():
+            out = below / f"runs-{version[:10]}" / name / place
+            scores[label] = located(code, version, sites[label], variant, out)
+        return {"set": real.name, "density": density, "condition": condition, **facts, "runs": scores}
+
+    unspoilt: dict[tuple[str, float | None], Runs] = {}
+    results = []
     with ThreadPoolExecutor(max(asked.jobs, 1)) as pool:
-        waiting = [pool.submit(measured, real, condition, asked) for real, condition in every]
+        for real, condition in ((real, condition) for real in sets for condition in conditions):
+            real.variant(condition, below / "runs" / real.name / condition.replace(":", "_"))  # before threads use it
         try:
-            for (real, condition), each in zip(every, waiting, strict=True):
-                found = each.result()
-                base = unspoilt.setdefault(real.name, found)
-                for label, scores in found.items():
+            for result in pool.map(lambda job: run(*job), jobs):
+                base = unspoilt.setdefault((result["set"], result["density"]), result["runs"])
+                for label, scores in result["runs"].items():
                     scores["share"] = share(scores, base[label])
-                details = {"set": real.name, "condition": condition, "runs": found}
-                yielded.append(details)
-                percent = 100.0 * found["now"]["posed"] / found["now"]["frames"]
-                yield informs(f"conditions/{real.name}, {condition}: posed", percent, "%", details)
+                results.append(result)
+                now = result["runs"]["now"]
+                on = "" if result["density"] is None else f", {result['density']:g} per m2"
+                name = f"conditions/{result['set']}{on}, {result['condition']}: posed"
+                yield informs(name, 100.0 * now["posed"] / now["frames"], "%", result)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    yield from verdicts(yielded)
+    yield from verdicts(results)
 
 
 def share(scores: dict[str, Any], base: dict[str, Any]) -> float | None:
-    """Return how many of the frames have a pose, per cent of how many the unspoilt run gave one."""
+    """Return the share of frames with a pose, per cent of the unspoilt run's."""
     if not base["posed"]:
         return None
     return float(100.0 * (scores["posed"] / scores["frames"]) / (base["posed"] / base["frames"]))
 
 
-def verdicts(found: Sequence[dict[str, Any]]) -> Iterator[Row]:
-    """Judge the code of today on all runs together."""
-    now = [(each["set"], each["condition"], each["runs"]["now"]) for each in found]
-    asked = [(f"{name}, {what}", scores["share"]) for name, what, scores in now if what.startswith(_ASKED)]
+def verdicts(results: Sequence[dict[str, Any]]) -> Iterator[Row]:
+    """Judge the code of today: all runs for false frames, those on ground surveys for the rest."""
+    now = [(f"{r['set']}, {r['condition']}", r["runs"]["now"]) for r in results if r["density"] is None]
+    asked = [(name, scores["share"]) for name, scores in now if name.split(", ")[1].startswith(_ASKED)]
     if asked:
-        name, least = min(asked, key=lambda each: -1.0 if each[1] is None else each[1])
+        name, least = min(asked, key=lambda entry: -1.0 if entry[1] is None else entry[1])
         holds = least is not None and least >= LEAST_SHARE
-        said = f"{number(least, 1)} ({name})"
-        yield judged("conditions/least share, tilt and odometry, %", said, f">= {LEAST_SHARE:g}", holds)
+        text = f"{number(least, 1)} ({name})"
+        yield judged("conditions/least share, tilt and odometry, %", text, f">= {LEAST_SHARE:g}", holds)
     for key, most, unit in (("first_m", MOST_METRES, "m"), ("first_deg", MOST_DEGREES, "deg")):
-        first = [(scores[key], f"{name}, {what}") for name, what, scores in now if scores[key] is not None]
+        first = [(scores[key], name) for name, scores in now if scores[key] is not None]
         worst, where = max(first, default=(float("nan"), "none"))
-        said = f"{number(worst, 2)} ({where})"
-        yield judged(f"conditions/worst first fix, {unit}", said, f"<= {most:g}", bool(worst <= most), worst)
-    false = sum(scores["false_frames"] for _, _, scores in now)
+        text = f"{number(worst, 2)} ({where})"
+        yield judged(f"conditions/worst first fix, {unit}", text, f"<= {most:g}", bool(worst <= most), worst)
+    false = sum(result["runs"]["now"]["false_frames"] for result in results)
     yield judged("conditions/false frames", str(false), "0", false == 0, false)
 
 
 _HEAD = (
-    *("set", "condition", "frames", "posed", "share %", "first fix m", "its error m", "deg", "rmse m", "deg"),
+    *("set", "map", "condition", "frames", "posed", "share %", "first fix m", "its error m", "deg", "rmse m", "deg"),
     *("max m", "deg", "false"),
 )
 _COLUMNS = (
@@ -142,8 +262,9 @@ _COLUMNS = (
 
 def cells(details: dict[str, Any]) -> list[str]:
     """One line of the table: in each cell the earlier code's figure, if there is one, and ours."""
-    runs = list(details["runs"].values())
-    shown = [details["set"], details["condition"], str(runs[-1]["frames"])]
+    runs, density = list(details["runs"].values()), details["density"]
+    site = "ground survey" if density is None else f"{density:g} per m2, {details['walls']:.1f} % walls"
+    shown = [details["set"], site, details["condition"], str(runs[-1]["frames"])]
     for key, digits in _COLUMNS:
         figures = [number(scores[key], digits) for scores in runs]
         shown.append(NOTHING if set(figures) == {NOTHING} else _ARROW.join(figures))
@@ -151,15 +272,6 @@ def cells(details: dict[str, Any]) -> list[str]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs, what was asked of them, and the code that was measured."""
-    shown = [cells(row.details) for row in rows if row.details]
-    if not shown:
-        raise InputError("no run was measured")
-    targets = [
-        [row.name.removeprefix("conditions/"), row.target, row.said, "met" if row.holds else "missed"]
-        for row in rows
-        if row.target
-    ]
-    judged_now = table(("target", "asked", "measured", "verdict"), targets)
-    before = f"Before the arrow: commit {asked.before[:7]}. " if asked.before else ""
-    return {"": f"{table(_HEAD, shown)}\n\n{judged_now}\n\n{before}{code_line()}"}
+    """All runs."""
+    before = f"\n\nBefore the arrow: commit {asked.before[:7]}." if asked.before else ""
+    return {"": f"{table(_HEAD, [cells(row.details) for row in rows if row.details])}{before}"}

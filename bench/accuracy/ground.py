@@ -10,8 +10,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bench.harness.rows import Row, informs
-from bench.harness.tables import number, table
+from bench.harness.rows import Row, informs, number, table
 from coview_stream.basemap.ground import GroundConfig, ground_mask
 from coview_stream.clouds import read_cloud
 from coview_stream.errors import InputError

@@ -30,8 +30,7 @@ from bench.forest.methods import METHODS as MAP_METHODS
 from bench.forest.methods import Methods
 from bench.forest.places import Site, Submap, read_sites
 from bench.forest.worlds import Drive, noted, say
-from bench.harness.rows import Row, informs
-from bench.harness.tables import number, table
+from bench.harness.rows import Row, informs, number, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import DescriptorConfig, LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view

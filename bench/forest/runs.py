@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.forest.tables import NEAR_DEGREES, NEAR_METRES
+from bench.accuracy.scores import Track, errors, rms
+from bench.forest.forest import NEAR_DEGREES, NEAR_METRES
 from bench.forest.worlds import WORLDS, base_of, code, noted, on_disk, place, say, weights
 from bench.harness.files import fingerprint, remembered
-from bench.harness.rows import Row, failed, informs
-from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Told, errors, rms
+from bench.harness.rows import Row, failed, informs, number, table
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.config import LocalizerConfig, Reloc
@@ -133,15 +132,15 @@ def _map_of(world: Path) -> Path:
     return out
 
 
-def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Told, Floats]:
+def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Track, Floats]:
     """Localize the run of a world on a map: what was said of each frame, and the true poses (N, 4, 4)."""
     stamps, truth = read_tum(world / "truth.tum")
     located = locate(BaseMap.load(site), open_run(world / "run"), LocalizerConfig(reloc=reloc))
-    told = Told.of(located.fixes, np.array([fix.stamp for fix in located.fixes]), np.array(located.seconds))
+    told = Track.of(located.fixes, np.array([fix.stamp for fix in located.fixes]), np.array(located.seconds))
     return told, truth[np.abs(stamps[:, None] - told.stamps[None]).argmin(axis=0)]
 
 
-def scored(told: Told, truth: Floats, outside: bool) -> Run:
+def scored(told: Track, truth: Floats, outside: bool) -> Run:
     """Figures of one run; outside the map every pose is a false one."""
     error, known, way = errors(told, truth), told.tracking, driven(truth)
     wrong = known & ((error.metres > NEAR_METRES) | (error.degrees > NEAR_DEGREES) | outside)
@@ -196,7 +195,7 @@ def _run(label: str, reloc: Reloc, world: Job, site: Job) -> Run:
         "reloc": reloc,
         "weights": weights(),
         "code": fingerprint(),
-        "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/harness/trajectory_scores.py"),
+        "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/accuracy/scores.py"),
     }
     kept = place() / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
     return {"run": label, "reloc": reloc, **remembered(kept, wanted, make)}

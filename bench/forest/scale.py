@@ -18,12 +18,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.forest.methods import on_ground
-from bench.forest.query import BEST, Chain, query_of
+from bench.forest.methods import BEST, Chain, on_ground, query_of
 from bench.forest.worlds import drawn, noted, place
-from bench.harness.clock import Clock
-from bench.harness.rows import Row, bounded
-from bench.harness.tables import number, table
+from bench.harness.files import Clock
+from bench.harness.rows import Row, bounded, number, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import LocalizerConfig

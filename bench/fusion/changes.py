@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from bench.harness.files import folder
-from bench.harness.rows import Row
-from bench.harness.tables import table
+from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.filters import open3d
 from coview_stream.fusion.fuse import FuseConfig, Fused, fuse
@@ -55,7 +54,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         config = SimulationConfig(scene, sensor, seed, size=160.0, length=60.0, changed=0.4, dirt=parse_dirt(_DIRT, 0))
         figures = measure(config, folder() / f"changes-{scene}-{sensor}-{seed}")
         said = f"new {_pair(figures['new'])}, gone {_pair(figures['gone'])}"
-        yield Row(f"changes/{scene}, {sensor}", said=said, details={"world": f"{scene}, {sensor}", **figures})
+        yield Row(f"changes/{scene}, {sensor}", text=said, details={"world": f"{scene}, {sensor}", **figures})
 
 
 def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from bench.harness.files import folder
-from bench.harness.rows import Row
-from bench.harness.tables import table
+from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds import read_cloud
 from coview_stream.clouds.trajectory import read_tum
@@ -55,7 +54,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             figures = measure(configured(plain, condition), "hole" in condition)
             said = ", ".join(f"{way} {figures[way]['rmse']}" for way in _WAYS) if figures else "not localised"
             details = {"world": f"{scene}, {sensor}", "condition": condition, **figures}
-            yield Row(f"joint/{condition}, {scene}", said=said, details=details)
+            yield Row(f"joint/{condition}, {scene}", text=said, details=details)
 
 
 def configured(config: SimulationConfig, condition: str) -> SimulationConfig:

@@ -22,9 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bench.fuzz.targets import TARGETS
-from bench.harness.rows import Row
-from bench.harness.suite import ROOT
-from bench.harness.tables import table
+from bench.harness.files import ROOT
+from bench.harness.rows import Row, table
 from coview_stream.errors import InputError
 
 CORPUS = ROOT / "tests" / "corpus"

@@ -1,9 +1,8 @@
-"""A figure with what it is compared with and its verdict: what every benchmark yields.
+"""A figure with its comparison and verdict, as every benchmark yields it; tables for a terminal and for Markdown.
 
 A benchmark is a module with ``rows(asked) -> Iterator[Row]``, where ``asked`` are its parsed options (``quick`` always
-among them), and, where it needs them, ``options(parser)``, which adds its own, and ``tables(rows, asked)``, which lays
-out its rows more widely: Markdown by name. Times are medians of wall time of at least :data:`REPEAT` runs; the sides
-of a comparison take turns in one process, so that both meet the same load.
+among them). It may have ``options(parser)``, which adds options, and ``tables(rows, asked)``, which returns wider
+Markdown tables by name. Times are medians of wall time; the sides of a comparison take turns in one process.
 """
 
 from __future__ import annotations
@@ -11,50 +10,59 @@ from __future__ import annotations
 import gc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
-RUNS = "runs"
-"""Target of a benchmark that came to no figure."""
+REPEAT = 31  # runs behind every median; odd, so the median is one of them
+NOTHING = "-"
 
-REPEAT = 31  # runs behind every median; an odd number, so that the median is one of them
+HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
+WIDTHS = (60, 9, 9, 7, 7, 12, 13)
+_VERDICTS = {True: "holds", False: "DOES NOT HOLD", None: "informs"}
 
 
 @dataclass(frozen=True)
 class Row:
     """One figure of ours, the baseline's if there is one, and whether the target holds."""
 
-    name: str  # what was measured, after the benchmark's name: ``match/top-k, 9527 stations``
-    ours: float = math.nan  # our figure; NaN where there is none
+    name: str  # the benchmark's name, then the figure: ``match/top-k, 9527 stations``
+    ours: float = math.nan  # NaN where there is no figure
     baseline: float | None = None
     unit: str = ""  # ``ms``, ``s``, ``MB``, ``%``
-    ratio: float | None = None  # how many times better ours is; None where there is no baseline
-    target: str = ""  # in words: ``>= 3`` (a ratio), ``<= 8 ms`` or ``>= 95 %``; empty where the row only informs
+    ratio: float | None = None  # how many times better ours is
+    target: str = ""  # ``>= 3`` (a ratio), ``<= 8 ms``; empty where the row only informs
     holds: bool | None = None  # None where the row only informs
-    said: str = ""  # shown in place of ``ours`` where one number does not say it
-    details: dict[str, Any] = field(default_factory=dict)  # everything measured, for own tables and ``--json``
+    text: str = ""  # shown in place of ``ours`` where one number is not enough
+    details: dict[str, Any] = field(default_factory=dict)  # everything measured, for tables and ``--json``
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, which knows no NaN: None stands for a figure that is none."""
+        """Return the fields for JSON; NaN becomes None."""
         return dict(_plain(asdict(self)))
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Row:
         """Undo :meth:`to_dict`; ``ValueError`` where the keys are not those of a row."""
-        names = [each.name for each in fields(Row)]
+        names = [entry.name for entry in fields(Row)]
         if list(values) != names:
             raise ValueError(f"a row has {', '.join(names)}, not {', '.join(values)}")
         return Row(**(values | {"ours": math.nan if values["ours"] is None else values["ours"]}))
 
+    def cells(self) -> list[str]:
+        """Return the cells of the table that every benchmark has."""
+        return [
+            self.name, self.text or _figure(self.ours), _figure(self.baseline), self.unit, _figure(self.ratio),
+            self.target, _VERDICTS[self.holds],
+        ]  # fmt: skip
+
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
+        return [_plain(item) for item in value]
     if isinstance(value, (np.generic, np.ndarray)):
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
@@ -63,10 +71,10 @@ def _plain(value: Any) -> Any:
 
 
 def medians(*sides: Callable[[], object], repeat: int = REPEAT, warm_up: int = 1) -> list[float]:
-    """Median milliseconds of each side, taken in turns; each runs ``warm_up`` times before.
+    """Median milliseconds of each side, taken in turns after ``warm_up`` runs each.
 
-    Every other round goes backwards: a side that leaves the caches hot or cold does so for either neighbour.
-    The garbage collector rests meanwhile, as it would hit the side whose turn it is.
+    Every other round goes backwards, so both neighbours of a side get its hot or cold caches. The garbage collector is
+    off meanwhile.
     """
     if not sides or repeat < 1:
         raise ValueError(f"medians of {len(sides)} sides and {repeat} rounds: at least one of each is needed")
@@ -91,7 +99,7 @@ def medians(*sides: Callable[[], object], repeat: int = REPEAT, warm_up: int = 1
 
 
 def against(name: str, ours: float, baseline: float, unit: str, least: float | None) -> Row:
-    """Row of two known figures of which the smaller is the better; ours ``least`` times better (None: informs)."""
+    """Row of two figures, the smaller the better; the target is ``least`` times better (None: informs)."""
     ratio = baseline / ours if ours > 0 else math.nan
     target, holds = ("", None) if least is None else (f">= {least:g}", bool(ratio >= least))
     return Row(name, ours, baseline, unit, ratio, target, holds)
@@ -107,9 +115,9 @@ def reached(name: str, value: float, unit: str, least: float) -> Row:
     return Row(name, float(value), None, unit, None, f">= {least:g} {unit}".rstrip(), bool(value >= least))
 
 
-def judged(name: str, said: str, target: str, holds: bool | None, value: float = math.nan) -> Row:
+def judged(name: str, text: str, target: str, holds: bool | None, value: float = math.nan) -> Row:
     """Row of a finding in words, with the number behind it if there is one."""
-    return Row(name, float(value), target=target, holds=holds, said=said)
+    return Row(name, float(value), target=target, holds=holds, text=text)
 
 
 def informs(name: str, value: float, unit: str, details: dict[str, Any] | None = None) -> Row:
@@ -118,5 +126,33 @@ def informs(name: str, value: float, unit: str, details: dict[str, Any] | None =
 
 
 def failed(name: str, why: str) -> Row:
-    """Row of a benchmark that came to no figure: it does not hold."""
-    return Row(f"{name}: {why}", target=RUNS, holds=False)
+    """Row of a benchmark without a figure; it does not hold."""
+    return Row(f"{name}: {why}", target="runs", holds=False)
+
+
+def line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """One table row; the first column to the left, the others to the right."""
+    first, *rest = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
+    return "| " + " | ".join([first.strip().ljust(widths[0]), *rest]) + " |"
+
+
+def rule(widths: Sequence[int]) -> str:
+    """Line between a table's head and its body."""
+    return "|" + "|".join(["-" * (widths[0] + 2), *("-" * (w + 1) + ":" for w in widths[1:])]) + "|"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Whole table, its columns as wide as they need to be."""
+    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
+    return "\n".join([line(head, widths), rule(widths), *(line(row, widths) for row in rows)])
+
+
+def number(value: float | None, digits: int) -> str:
+    """Write a number, or a dash for none."""
+    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _figure(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -1,32 +1,77 @@
 """Whether stated errors hold where every place is wrong: recorded drives on the maps of all other calibration sites.
 
-``python -m bench.integrity.calibrate DIR [KEYFRAMES]`` reads what ``python -m bench.integrity.record DIR`` wrote,
-searches each map for each drive through another site and prints, for errors e, the share of the searches in which some
-keyframe stated an error below e: the prior odds being even, it should stay below e. So the one factor of
-:mod:`coview_stream.localization.evidence.background` is chosen; nothing else was fitted.
+``python -m bench.integrity.calibrate DIR`` first records the missing ones of ``--runs`` runs of the calibration plan
+below DIR (maps in ``worlds/``, the search requests of each drive's first keyframes in ``rec/``). Then it searches each
+map for each drive through another site and prints, for errors e, the share of searches in which some keyframe stated
+an error below e: the prior odds being even, it should stay below e. The one factor of
+:mod:`coview_stream.localization.evidence.background` was chosen so; nothing else was fitted.
 """
 
 from __future__ import annotations
 
 import pickle
-import sys
+import time
+from argparse import ArgumentParser
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.integrity.bounds import upper
-from coview_stream import BaseMap
+from bench.harness.rows import table
+from bench.integrity.plan import Site, plan
+from bench.integrity.run import Drive, drive_of
+from bench.integrity.tables import upper
+from bench.integrity.work import map_of
+from coview_stream import BaseMap, Localizer
 from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, to_local
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
 
-KEYFRAMES = 5
+RECORDED = 15  # keyframes of a recording: thirty metres
 ERRORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 
 
-def smallest_errors(site: Path, drives: list[dict[str, Any]], keyframes: int) -> list[tuple[str, float]]:
-    """Return, for drives through other sites than the map's, the smallest error that a keyframe stated."""
+def record(out: Path, site: Site) -> None:
+    """Record the runs on one map that are not there: the run, its map, and its requests with the truth."""
+    base: BaseMap | None = None
+    for run in site:
+        file = out / "rec" / f"{run.family.replace(' ', '-').replace(',', '')}-{run.kind}-{run.seed}-{run.number}.pkl"
+        if file.is_file():
+            continue
+        begin, drive = time.perf_counter(), drive_of(run)
+        if drive is None:
+            continue
+        base = base or map_of(run, out / "worlds")
+        recording = {
+            "name": file.stem,
+            "map": str(out / "worlds" / f"{run.kind}-{run.seed}.coview"),
+            "case": asdict(run),
+            "keyframes": keyframes(base, drive),
+        }
+        file.write_bytes(pickle.dumps(recording))
+        print(f"{file} {len(recording['keyframes'])} keyframes, {time.perf_counter() - begin:.1f} s", flush=True)
+
+
+def keyframes(base: BaseMap, drive: Drive) -> list[dict[str, Any]]:
+    """Return requests of a drive's first keyframes, with frame, metres driven, and the true map <- odometry or None."""
+    localizer, out = Localizer(base), list[dict[str, Any]]()
+    for k, stamp in enumerate(drive.stamps):
+        request = localizer.add_frame(drive.frame(k), drive.odometry[k], float(stamp))
+        if request is None:
+            continue
+        truth = None
+        if drive.truth is not None:
+            truth = to_local(drive.truth[k], base.origin) @ inverse(request.T_odom_body)
+        out.append({"request": request, "truth": truth, "frame": k, "driven": float(drive.driven[k])})
+        if len(out) == RECORDED:
+            break
+    return out
+
+
+def smallest_errors(site: Path, drives: list[dict[str, Any]], count: int) -> list[tuple[str, float]]:
+    """Return the smallest stated error of each drive through another site than the map's."""
     base, config = BaseMap.load(site), LocalizerConfig()
     search = GlobalSearch(base, config, LocalMaps(base, config.registration.source_range))
     search.prepare()
@@ -36,29 +81,37 @@ def smallest_errors(site: Path, drives: list[dict[str, Any]], keyframes: int) ->
             continue
         search.reset()
         stated = 1.0
-        for each in drive["keyframes"][:keyframes]:
-            said = search.update(each["request"]).evidence
-            stated = min(stated, 1.0 - (said.confidence or 0.0))
+        for keyframe in drive["keyframes"][:count]:
+            evidence = search.update(keyframe["request"]).evidence
+            stated = min(stated, 1.0 - (evidence.confidence or 0.0))
         out.append((drive["name"], stated))
     return out
 
 
-def main(place: Path, keyframes: int) -> None:
-    """Print the table."""
-    drives = [pickle.loads(file.read_bytes()) for file in sorted((place / "rec").glob("*.pkl"))]
-    found: list[float] = []
-    for site in sorted((place / "worlds").glob("*.coview")):
-        for name, stated in smallest_errors(site, drives, keyframes):
-            found.append(stated)
-            if stated < ERRORS[0]:
-                print(f"{site.stem}: {name}: {stated:.1e}", flush=True)
-    errors = np.array(found)
-    print(f"{len(errors)} searches of {keyframes} keyframes where every place is wrong\n")
-    print("| stated error below | searches | share | 95 % bound |\n|---:|---:|---:|---:|")
+def main() -> None:
+    """Record and print the table."""
+    parser = ArgumentParser(prog="python -m bench.integrity.calibrate", description=__doc__)
+    parser.add_argument("place", type=Path, metavar="DIR")
+    parser.add_argument("--runs", type=int, default=60, help="of the calibration plan (60)")
+    parser.add_argument("--keyframes", type=int, default=5, help="of each search (5)")
+    asked = parser.parse_args()
+    (asked.place / "rec").mkdir(parents=True, exist_ok=True)
+    for site in plan("calibration", asked.runs):
+        record(asked.place, site)
+    drives = [pickle.loads(file.read_bytes()) for file in sorted((asked.place / "rec").glob("*.pkl"))]
+    stated: list[float] = []
+    for file in sorted((asked.place / "worlds").glob("*.coview")):
+        for name, error in smallest_errors(file, drives, asked.keyframes):
+            stated.append(error)
+            if error < ERRORS[0]:
+                print(f"{file.stem}: {name}: {error:.1e}", flush=True)
+    print(f"{len(stated)} searches of {asked.keyframes} keyframes where every place is wrong\n")
+    lines = []
     for error in ERRORS:
-        count = int((errors < error).sum())
-        print(f"| {error:g} | {count} | {count / len(errors):.4f} | {upper(count, len(errors)):.4f} |")
+        count = int((np.array(stated) < error).sum())
+        lines.append([f"{error:g}", str(count), f"{count / len(stated):.4f}", f"{upper(count, len(stated)):.4f}"])
+    print(table(("stated error below", "searches", "share", "95 % bound"), lines))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else KEYFRAMES)
+    main()

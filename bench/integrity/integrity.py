@@ -1,12 +1,11 @@
 """Share of false first fixes, over families of sites that nothing was fitted on, with exact bounds.
 
-A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. It
-counts once. Each is noted as it ends, so that an interrupted benchmark goes on where it was; ``--shard 1/3``, ``2/3``
-and ``3/3`` divide it among machines, whose files (``integrity/*.jsonl`` in ``--work``) are then put together in one
-folder. Runs share sites, at most eight of them one map, but never map and drive; so beside the share of runs that are
-false stands that of sites with a false run. Bounds are Clopper-Pearson's, at 95 %, and hold for these families and this
-simulator. A search states larger errors on its way to the fix: where it first states one below 0.1, 0.01 and 0.001 is
-noted as well, and whether its most probable place was right, for the table of reliability.
+A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. Each
+result is noted as it ends, so an interrupted benchmark resumes; ``--shard 1/3``, ``2/3`` and ``3/3`` divide the runs
+among machines, whose files (``integrity/*.jsonl`` in ``--work``) are then put together in one folder. Runs share sites,
+at most eight of them one map, but never map and drive; beside the share of false runs stands that of sites with a false
+run. Bounds are Clopper-Pearson's, at 95 %, and hold for these families and this simulator. Where a search first states
+an error below 0.1, 0.01 and 0.001 is noted as well, and whether its most probable place was right (reliability).
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import numpy as np
 from bench.harness.files import fingerprint, folder
 from bench.harness.rows import Row, informs, judged
 from bench.integrity.plan import FAMILIES, Site, plan
-from bench.integrity.store import ANY, Result, read
 from bench.integrity.tables import (
     Tally,
     class_table,
@@ -33,7 +31,7 @@ from bench.integrity.tables import (
     plain,
     reliability_table,
 )
-from bench.integrity.work import Task, everywhere
+from bench.integrity.work import Result, Task, everywhere, read
 from coview_stream.errors import InputError
 
 RUNS, QUICK = 1080, 60
@@ -47,50 +45,37 @@ LEAST_FOUND, MEDIAN_METRES = 0.97, 10.0
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add what is run, and where."""
+    """Add the runs and where they are made."""
     parser.add_argument("--group", choices=("reported", "calibration"), default="reported", help="kinds of sites")
     parser.add_argument("--count", type=int, metavar="N", help=f"runs planned ({RUNS}; {QUICK} with --quick)")
     parser.add_argument("--families", metavar="A,B", help="parts of families' names: only these of the runs planned")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (all cores)")
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help="every Nth site, from the Ith on")
-    parser.add_argument(
-        "--risk", type=float, metavar="P", help="integrity risk, if not the product's own; has results of its own"
-    )
+    parser.add_argument("--risk", type=float, metavar="P", help="another integrity risk, with results of its own")
     parser.add_argument("--keep", action="store_true", help="keep the sites' maps, 50 MB each")
-    parser.add_argument("--fingerprint", default="", metavar="CODE", help=f"use results of other code; {ANY}: of all")
-    parser.add_argument("--only-read", action="store_true", help="run nothing, show what is there")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Make the runs that are missing, then yield the counts and their verdicts."""
-    code = code_of_runs()
+    """Make the missing runs, then yield the counts and their verdicts."""
+    code = f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
     place = folder() / "integrity"
-    task = Task(place / f"{asked.group}-{asked.shard[0]}of{asked.shard[1]}.jsonl", code, asked.risk, None)
-    if asked.keep:
-        task = Task(task.results, code, asked.risk, place / "maps")
+    results_file = place / f"{asked.group}-{asked.shard[0]}of{asked.shard[1]}.jsonl"
+    task = Task(results_file, code, asked.risk, place / "maps" if asked.keep else None)
     wanted = chosen(plan(asked.group, asked.count or (QUICK if asked.quick else RUNS)), asked.families)
-    known = read(sorted(place.glob(f"{asked.group}-*.jsonl")), asked.fingerprint or code)
-    if not asked.only_read:
-        mine = [site for k, site in enumerate(wanted) if k % asked.shard[1] == asked.shard[0] - 1]
-        known |= _make(mine, task, asked.jobs, known)
+    known = read(sorted(place.glob(f"{asked.group}-*.jsonl")), code)
+    mine = [site for k, site in enumerate(wanted) if k % asked.shard[1] == asked.shard[0] - 1]
+    known |= _make(mine, task, asked.jobs, known)
     keys = {task.key(run) for site in wanted for run in site}
     results = [result for key, result in known.items() if key in keys]
-    if not results:
-        raise InputError(f"{place}: no result of this code; run without --only-read")
     yield from verdicts(results, asked.group)
     yield informs("integrity/runs", len(results), "", {"results": results})
 
 
-def code_of_runs() -> str:
-    """Fingerprint of all that decides a run's outcome."""
-    return f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
-
-
 def chosen(sites: Sequence[Site], families: str | None) -> list[Site]:
-    """Return the sites with those runs only whose families' names have one of the parts ``A,B`` in them."""
+    """Return the sites with only the runs whose families' names contain one of the parts ``A,B``."""
     if not families:
         return list(sites)
-    parts = [each.strip() for each in families.split(",")]
+    parts = [part.strip() for part in families.split(",")]
     picked = (tuple(run for run in site if any(part in run.family for part in parts)) for site in sites)
     out = [site for site in picked if site]
     if not out:
@@ -99,14 +84,12 @@ def chosen(sites: Sequence[Site], families: str | None) -> list[Site]:
 
 
 def _make(sites: Sequence[Site], task: Task, jobs: int, known: dict[str, Result]) -> dict[str, Result]:
-    """Make the runs that are not known, or have failed; say on stderr how it goes."""
+    """Make the runs that are not known or have failed; report progress on stderr."""
     done = {key for key, result in known.items() if result["outcome"] != "failed"}
     missing = [tuple(run for run in site if task.key(run) not in done) for site in sites]
     missing = [site for site in missing if site]
     total, begin = sum(map(len, missing)), time.monotonic()
-    print(
-        f"... {total} runs on {len(missing)} sites, {sum(map(len, sites)) - total} known", file=sys.stderr, flush=True
-    )
+    print(f"... {total} runs on {len(missing)} sites to make", file=sys.stderr, flush=True)
     made: dict[str, Result] = {}
     for result in everywhere(missing, task, jobs) if missing else ():
         made[result["key"]] = result
@@ -115,54 +98,49 @@ def _make(sites: Sequence[Site], task: Task, jobs: int, known: dict[str, Result]
         if "error_m" in result:
             more = f"{result['metres']:.0f} m driven, {result['error_m']:.2f} m off"
         left = spent / len(made) * (total - len(made)) / 60
-        print(
-            f"{len(made)}/{total} {left:4.0f} min left: {result['key']}: {outcome} {more}", file=sys.stderr, flush=True
-        )
+        progress = f"{len(made)}/{total} {left:4.0f} min left"
+        print(f"{progress}: {result['key']}: {outcome} {more}", file=sys.stderr, flush=True)
     return made
 
 
 def verdicts(results: Sequence[Result], group: str) -> Iterator[Row]:
-    """Judge false first fixes by class, and how many of the ordinary runs are found, how soon."""
+    """Judge false first fixes by class; of ordinary runs, the share found and the metres until then."""
     name = "integrity" if group == "reported" else f"integrity, {group}"
     for part, t in classes(results).items():
-        said = f"{t.false} of {t.runs}: below {percent(t.bound)}"
+        text = f"{t.false} of {t.runs}: below {percent(t.bound)}"
         most = MOST.get(part)
         enough = most is not None and 1.0 - 0.05 ** (1.0 / t.runs) <= most
-        target, holds = ("0", t.false == 0) if not enough else (f"0, below {percent(most or 1.0)}", t.false == 0)
-        yield judged(f"{name}/false first fixes, {part}", said, target, holds, t.false)
-    ordinary = Tally.of(each for each in results if each["class"] == "ordinary")
+        target = f"0, below {percent(most or 1.0)}" if enough else "0"
+        yield judged(f"{name}/false first fixes, {part}", text, target, t.false == 0, t.false)
+    ordinary = Tally.of(result for result in results if result["class"] == "ordinary")
     if ordinary.runs:
-        said = f"{ordinary.right} of {ordinary.runs}: {percent(ordinary.found, 1)}"
+        text = f"{ordinary.right} of {ordinary.runs}: {percent(ordinary.found, 1)}"
         holds = ordinary.found >= LEAST_FOUND
-        yield judged(f"{name}/found, ordinary", said, f">= {percent(LEAST_FOUND, 0)}", holds, ordinary.found)
-        said, holds = (
-            f"{ordinary.median_m:.1f} m, 90 % within {ordinary.most_m:.1f} m",
-            ordinary.median_m <= MEDIAN_METRES,
-        )
-        yield judged(f"{name}/median first fix, ordinary", said, f"<= {MEDIAN_METRES:g} m", holds, ordinary.median_m)
-    costs = [each["cost_s"] + each["site_s"] for each in results if "site_s" in each]
+        yield judged(f"{name}/found, ordinary", text, f">= {percent(LEAST_FOUND, 0)}", holds, ordinary.found)
+        text = f"{ordinary.median_m:.1f} m, 90 % within {ordinary.most_m:.1f} m"
+        holds = ordinary.median_m <= MEDIAN_METRES
+        yield judged(f"{name}/median first fix, ordinary", text, f"<= {MEDIAN_METRES:g} m", holds, ordinary.median_m)
+    costs = [result["cost_s"] + result["site_s"] for result in results if "site_s" in result]
     yield informs(f"{name}/seconds of one core, a run with its share of the map", float(np.mean(costs)), "s")
-    if failed := [each["key"] for each in results if each["outcome"] == "failed"]:
+    if failed := [result["key"] for result in results if result["outcome"] == "failed"]:
         yield judged(f"{name}/runs that failed", f"{len(failed)}: {failed[0]}", "0", False, len(failed))
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Classes, families, and reliability."""
     results = next(row.details["results"] for row in rows if "results" in row.details)
-    code = " and ".join(sorted({each["code"] for each in results}))
-    made = f"{len(results)} runs of the {asked.group} kinds, code {code}, {time.strftime('%Y-%m-%d')}."
     parts = {
-        "": "\n\n".join(filter(None, (class_table(results), false_list(results), made))),
+        "": "\n\n".join(filter(None, (class_table(results), false_list(results)))),
         "families": family_table(results),
         "reliability": reliability_table(results),
     }
-    before = "" if asked.group == "reported" else f"{asked.group} "  # the page's places are for what is reported
-    return {f"{before}{part}".strip(): text for part, text in parts.items()}
+    group = "" if asked.group == "reported" else f"{asked.group} "
+    return {f"{group}{part}".strip(): text for part, text in parts.items()}
 
 
 def _shard(text: str) -> tuple[int, int]:
     try:
-        mine, of = (int(each) for each in text.split("/"))
+        mine, of = (int(part) for part in text.split("/"))
     except ValueError:
         raise ArgumentTypeError(f"{text!r} is no share like 1/3") from None
     if not 1 <= mine <= of:

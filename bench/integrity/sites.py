@@ -7,11 +7,13 @@ are set by hand.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from coview_stream.geometry.arrays import Floats
+from bench.tracking.worlds import earlier, owners
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim import furniture, vegetation
 from coview_stream.sim.layout import Layout, Site, resample
 from coview_stream.sim.mesh import Mesh, join, placed
@@ -132,3 +134,61 @@ def furnished(things: Movables, site: Site, rng: np.random.Generator | None, cha
     ground = site.z(trees[:, 0], trees[:, 1])
     solid = [furniture.cars(cars, site), furniture.poles(poles, site), vegetation.trunks(trees, ground)]
     return Contents(solid, [vegetation.crowns(trees, ground)])
+
+
+NEAR, FAR = 10.0, 40.0  # metres from the border
+_SHORTEST = 24.0  # metres, of a stretch that is worth driving to and fro
+
+
+def beside_border(scene: Scene, seed: int, outside: bool | None = None) -> Floats | None:
+    """Return a closed way (N, 2) on a street, 10 to 40 m from the map's border; None where there is no such street.
+
+    ``outside`` asks for a way beyond the border or within it; None takes either.
+    """
+    stretches = []
+    for line in (*scene.site.layout.streets, scene.route[::4]):
+        depth = scene.size / 2 - np.abs(line).max(axis=1)  # positive inside
+        for sign in (1.0, -1.0):
+            if outside is not None and (sign < 0) != outside:
+                continue
+            fits = (sign * depth >= NEAR) & (sign * depth <= FAR) & (np.abs(line).max(axis=1) < scene.size / 2 + 42.0)
+            stretches += [line[run] for run in _runs(fits) if _length(line[run]) >= _SHORTEST]
+    if not stretches:
+        return None
+    weights = np.array([_length(each) for each in stretches])
+    rng = np.random.default_rng([seed, 220])
+    return there_and_back(stretches[int(rng.choice(len(stretches), p=weights / weights.sum()))])
+
+
+def lane(scene: Scene, seed: int, across: bool) -> Floats:
+    """Return a closed way (N, 2) to and fro in a street along the scene's first one, or in one ``across``."""
+    streets = scene.site.layout.streets
+    headings = [(line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0]) for line in streets]
+    chosen = [k for k, heading in enumerate(headings) if (abs(heading @ headings[0]) < 0.5) == across]
+    return there_and_back(streets[int(np.random.default_rng([seed, 221]).choice(chosen))], 0.6)
+
+
+def _runs(inside: Bools) -> list[slice]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 3]
+
+
+def _length(line: Floats) -> float:
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+def rebuilt(scene: Scene, seed: int, share: float) -> Scene:
+    """Return the scene with a ``share`` of its buildings others now: gone, smaller, or turned round and shifted.
+
+    It is :func:`bench.tracking.worlds.earlier` the other way round: the survey stays as it was.
+    """
+    other = earlier(replace(scene, mapped=scene.now, now=scene.now), seed, share)
+    return replace(scene, now=other.mapped)
+
+
+def shifted(scene: Scene, shift: Floats) -> Scene:
+    """Return the scene with all buildings moved by (2,) metres now; ground, trees, cars and poles stay."""
+    solid = scene.now.solid
+    vertices = solid.vertices.copy()
+    vertices[owners(scene) >= 0, :2] += np.asarray(shift)
+    return replace(scene, now=replace(scene.now, solid=solid._replace(vertices=vertices)))

@@ -2,23 +2,54 @@
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from bench.harness.files import fingerprint, remembered
-from bench.harness.suite import thread_settings
+from bench.harness.files import fingerprint, remembered, thread_settings
 from bench.integrity.plan import Run, Site
-from bench.integrity.store import Result, append
 from coview_stream import BaseMap
 
 if TYPE_CHECKING:
     from bench.integrity.run import Robot
+
+
+Result = dict[str, Any]
+
+
+def append(file: Path, result: Result) -> None:
+    """Add a line; others may do so at the same time."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    line = json.dumps(result, allow_nan=False) + "\n"
+    with file.open("a") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        stream.write(line)
+        stream.flush()
+
+
+def read(files: Iterable[Path], code: str) -> dict[str, Result]:
+    """Return the newest result of each key that the code with this fingerprint made.
+
+    A line that a killed process has left half-written is passed over.
+    """
+    found: dict[str, Result] = {}
+    for file in files:
+        for line in file.read_text().splitlines() if file.is_file() else ():
+            try:
+                result = json.loads(line)
+            except ValueError:
+                continue
+            if code == result["code"]:
+                found[result["key"]] = result
+    return found
+
 
 SITE_CODE = ("coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/descriptors")
 """What makes a map, besides this benchmark."""
@@ -92,8 +123,7 @@ def _one(run: Run, robot: Robot) -> Result:
 
 def map_of(run: Run, kept: Path | None = None) -> BaseMap:
     """Return the map that a run is made on, built now unless it is ``kept`` in a folder."""
-    from bench.integrity.kinds import draw
-    from bench.integrity.maps import built, size_of, surveyed
+    from bench.integrity.kinds import built, draw, size_of, surveyed
 
     def build() -> BaseMap:
         return built(surveyed(draw(run.kind, run.seed, size_of(run.kind), 0.0), run.seed))  # changes come later

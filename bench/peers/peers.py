@@ -23,9 +23,8 @@ import numpy as np
 
 import coview_kernels
 from bench.harness.files import folder, isolated
-from bench.harness.rows import Row, bounded, failed, informs
-from bench.harness.suite import run
-from bench.harness.tables import number, table
+from bench.harness.rows import Row, bounded, failed, informs, number, table
+from bench.harness.run import run
 from bench.harness.worlds import WORLDS, map_of, places
 from bench.peers.libraries import Features, KissMatcher, MapClosures, NearbyGicp
 from bench.peers.methods import Keyframes, Method, OneScan, Tracking

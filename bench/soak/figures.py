@@ -36,16 +36,16 @@ def held(robots: Sequence[Robot], hours: float, faults: list[tuple[float, float]
         details = {"frames": robot.frames, "poses": robot.poses, "odometries": robot.odometries, "site": site}
         details |= {"states": dict(robot.states), "worst": robot.worst, "false": robot.false[:100]}
         details |= {"counters": robot.status.get("counters"), "unreadable": robot.unreadable}
-        out.append(Row(f"soak/{name}: frames in / poses out", said=rates, details=details))
+        out.append(Row(f"soak/{name}: frames in / poses out", text=rates, details=details))
         wrong = len(robot.false) + robot.unreadable
         said = f"{wrong} of {robot.poses}"
         out.append(judged(f"soak/{name}: false or unreadable poses", said, "0", wrong == 0, wrong))
         if robot.garbled:
             out.append(Row(f"soak/{name}: false or unreadable while the nodes' link flips bits", robot.garbled))
-        out.append(Row(f"soak/{name}: worst pose, m / degrees", said=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}"))
+        out.append(Row(f"soak/{name}: worst pose, m / degrees", text=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}"))
         for label, without in (("all", []), ("15 s after recovery and later", faults)):
             found = percentiles(robot.latencies, without)
-            out.append(Row(f"soak/{name}: cloud to pose p50 / p95 / p99, ms, {label}", said=_three(found)))
+            out.append(Row(f"soak/{name}: cloud to pose p50 / p95 / p99, ms, {label}", text=_three(found)))
     return out
 
 
@@ -55,16 +55,16 @@ def survived(events: Sequence[Event]) -> list[Row]:
     times = [each for event in made for each in event.recoveries.values() if each is not None]
     stuck, unfed = (sum(len(getattr(event, what)) for event in made) for what in ("stuck", "unfed"))
     said = f"{len(made)} of {len({event.fault for event in made})} kinds"
-    out = [Row("soak/faults", said=said)]
+    out = [Row("soak/faults", text=said)]
     if times:
-        out.append(Row("soak/back after, median / worst s", said=f"{np.median(times):.1f} / {max(times):.1f}"))
+        out.append(Row("soak/back after, median / worst s", text=f"{np.median(times):.1f} / {max(times):.1f}"))
     out.append(
         judged("soak/stuck for 60 s while frames came", f"{stuck} of {len(times) + stuck}", "0", stuck == 0, stuck)
     )
     out.append(Row("soak/robots of the bench that did not reach the router again", float(unfed)))
     skipped = sorted({f"{event.fault} ({event.skipped})" for event in events if event.skipped})
     if skipped:
-        out.append(Row("soak/skipped", said="; ".join(skipped)))
+        out.append(Row("soak/skipped", text="; ".join(skipped)))
     return out
 
 

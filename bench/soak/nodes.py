@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from bench.harness.suite import ROOT, environment
+from bench.harness.files import ROOT, environment
 from bench.soak.sites import Site
 
 MAIN, TRACK, SEARCH = "main", "track", "search"

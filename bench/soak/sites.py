@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 from bench.harness import worlds
 from bench.harness.files import fingerprint, remembered
-from bench.integrity.drives import through
-from bench.integrity.kinds import draw
-from bench.integrity.maps import built, size_of, surveyed
+from bench.integrity.kinds import built, draw, size_of, surveyed
+from bench.integrity.run import through
 from bench.integrity.work import SITE_CODE
 from coview_stream.clouds import write_cloud, write_tum
 from coview_stream.sim import SimulationConfig

@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import code_line, fingerprint, folder
-from bench.harness.rows import Row
-from bench.harness.tables import table
+from bench.harness.files import fingerprint, folder
+from bench.harness.rows import Row, table
 from bench.soak import figures
 from bench.soak.faults import FAULTS, SkippedError
 from bench.soak.sites import KINDS, prepare
@@ -131,7 +130,7 @@ class Soak:
         stage.wait(min(10.0, self.asked.every / 3))
         row = Row(
             "soak/first fix, s",
-            said="; ".join(f"{name} {fix and round(fix, 1)}" for name, fix in fixes.items()),
+            text="; ".join(f"{name} {fix and round(fix, 1)}" for name, fix in fixes.items()),
             details=fixes,
         )
         self.rows.append(row)
@@ -171,7 +170,7 @@ class Soak:
         event.false, event.crashes = self.false() - false, self.crashes() - crashes
         event.zombies = sum(node.zombies() for node in stage.nodes)
         self.events.append(event)
-        row = Row(f"soak/{len(self.events)}: {name}", said=self._said(event), details=asdict(event))
+        row = Row(f"soak/{len(self.events)}: {name}", text=self._said(event), details=asdict(event))
         self.rows.append(row)
         return row
 
@@ -202,9 +201,9 @@ class Soak:
         yield from figures.held(self.stage.robots, hours, faults)
         yield from figures.survived(self.events)
         yield from figures.processes(self.stage.nodes, hours, ended)
-        details: dict[str, Any] = {"code": fingerprint(), "bench": fingerprint("bench/soak"), "line": code_line()}
+        details: dict[str, Any] = {"code": fingerprint(), "bench": fingerprint("bench/soak")}
         details |= {"minutes": 60 * hours, "robots": len(self.stage.robots), "seed": self.asked.seed}
-        yield Row("soak/code", said=fingerprint(), details=details)
+        yield Row("soak/code", text=fingerprint(), details=details)
 
     def keep(self) -> None:
         """Write what there is so far where --json will be written at the end."""
@@ -236,7 +235,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     facts = [row for row in rows if "recoveries" not in row.details]
     verdict = {True: "holds", False: "**does not hold**", None: ""}
     said = [
-        [row.name.removeprefix("soak/"), row.said or f"{row.ours:.3g} {row.unit}", row.target, verdict[row.holds]]
+        [row.name.removeprefix("soak/"), row.text or f"{row.ours:.3g} {row.unit}", row.target, verdict[row.holds]]
         for row in facts
     ]
     head = ["fault", "times", "survived", "back after, median s", "worst s", "false poses"]

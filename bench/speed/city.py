@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered
-from bench.harness.pinned import today
+from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered, today
 from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.worlds import MAPPER, prepared_run, world_name
 from bench.speed import city_votes

@@ -8,35 +8,22 @@ A raster cell counts at its centre, so points within 0.35 m of an edge may move 
 context's bins and 4.9 % of the co-view's (2.5 and 3.6 with ``--quick``) that is more than 0.5 m; the means are 0.14 and
 0.21 m. With a raster one cell off it is 4.9 and 7.6 % (3.9 and 5.3); with heights 0.3 m off (``--quick``) the means are
 0.28 and 0.31 m. The bounds lie between.
-
-``--whole`` builds a map instead, reading and ground included, and takes its seconds and memory: of the files that are
-named, or of a cloud of its own: hills, boxes and round crowns, 10 M points on as much ground as 10,000 stations need.
 """
 
 from __future__ import annotations
 
-import sys
-import tempfile
 import time
-from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from types import FunctionType
-from typing import Any
+from argparse import Namespace
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 import coview_kernels
-from bench.harness.clock import Clock
-from bench.harness.files import isolated, peak_megabytes
 from bench.harness.rows import Row, against, bounded, informs
 from coview_kernels import reference
-from coview_stream import BaseMap
-from coview_stream.basemap import build as building
 from coview_stream.basemap.stations import RASTER_CELL, aligned_corner, describe_stations, rasterise
-from coview_stream.clouds import write_cloud
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices
 
@@ -131,12 +118,12 @@ def _terrain(xy: Floats) -> Floats:
     return np.asarray(2.0 * np.sin(xy[:, 0] / 37.0) + 1.5 * np.cos(xy[:, 1] / 51.0))
 
 
-def _described(quick: bool) -> Iterator[Row]:
-    """Seconds of both, and the differences of what they describe."""
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield the seconds of both and the differences of their descriptors."""
     coview_kernels.warm_up()
-    points, count = (1_000_000, 1_000) if quick else (10_000_000, 10_000)
+    points, count = (1_000_000, 1_000) if asked.quick else (10_000_000, 10_000)
     cloud, stations = site(points, count)
-    chosen = np.linspace(0, count - 1, 10 if quick else _SAMPLE).astype(np.intp)
+    chosen = np.linspace(0, count - 1, 10 if asked.quick else _SAMPLE).astype(np.intp)
     seconds, described = ours(cloud, stations)
     once, each, expected = baseline(cloud, stations, chosen)
     name = f"map_build, {count} stations, {points / 1e6:.0f} M points"
@@ -152,64 +139,3 @@ def _described(quick: bool) -> Iterator[Row]:
         lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
         cosine = (a * b).sum(axis=1) / np.maximum(lengths, 1e-9)
         yield informs(f"{name}, {channel}: cosine distance, mean", float(1 - cosine.mean()), "")
-
-
-def _write(path: Path, *sizes: Any) -> None:
-    write_cloud(path, synthetic(*sizes))
-
-
-def _build(files: Sequence[Path], out: Path, block: float) -> dict[str, Any]:
-    """Build and save a map; seconds of every stage and all, sizes, peak memory. Meant for a fresh process."""
-    functions = {name: f for name, f in vars(building).items() if isinstance(f, FunctionType)}
-    called = [name for name, f in functions.items() if f.__module__.startswith("coview_stream.")]
-    stages = [(name, building, name) for name in called if functions[name].__module__ != building.__name__]
-    clock, begin = Clock(), time.perf_counter()
-    with clock.around(stages):
-        base_map = BaseMap.build(files, block=block)
-    with clock("save"):
-        base_map.save(out)
-    seconds, peak, opening = time.perf_counter() - begin, peak_megabytes(), time.perf_counter()
-    BaseMap.load(out)
-    return {
-        "stages": dict(clock.seconds) | {"other": seconds - sum(clock.seconds.values())},
-        "seconds": seconds,
-        "megabytes": peak,
-        "sizes": {
-            "points": (base_map.parameters["source_points"] / 1e6, "M"),
-            "points after cleaning": (len(base_map.points) / 1e6, "M"),
-            "stations": (len(base_map), ""),
-            "size of the file": (out.stat().st_size / 1e6, "MB"),
-            "opening it": (time.perf_counter() - opening, "s"),
-        },
-    }
-
-
-def _whole(asked: Namespace) -> Iterator[Row]:
-    """Build a map once; a row per stage, and the whole with its targets."""
-    points, stations = (1_000_000, 1_000) if asked.quick else (10_000_000, 10_000)
-    with tempfile.TemporaryDirectory() as scratch:
-        files = asked.files or [Path(scratch) / "synthetic.laz"]
-        if not asked.files:
-            print(f"making {points / 1e6:.0f} M points ...", file=sys.stderr, flush=True)
-            # in a process of its own: a child starts with its parent's peak memory
-            isolated(_write, files[0], points, stations, asked.block)
-        print("building ...", file=sys.stderr, flush=True)
-        found = isolated(_build, files, Path(scratch) / "site.coview", asked.block)
-    for stage, seconds in found["stages"].items():
-        yield informs(f"build_map/{stage}", seconds, "s")
-    yield bounded("build_map/total", found["seconds"], "s", 180.0)
-    yield bounded("build_map/peak memory", found["megabytes"], "MB", 4096.0)
-    for what, (value, unit) in found["sizes"].items():
-        yield informs(f"build_map/{what}", value, unit)
-
-
-def options(parser: ArgumentParser) -> None:
-    """Add the clouds, or how large a synthetic one is."""
-    parser.add_argument("--whole", action="store_true", help="build a whole map instead: its seconds and memory")
-    parser.add_argument("files", nargs="*", type=Path, help="clouds to build the whole from, not a synthetic one")
-    parser.add_argument("--block", type=float, default=2.0, help="metres between stations (2)")
-
-
-def rows(asked: Namespace) -> Iterator[Row]:
-    """Describe stations, or build the whole."""
-    yield from _whole(asked) if asked.whole or asked.files else _described(asked.quick)

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import folder
-from bench.harness.pinned import COMMIT, Code, pinned, today
+from bench.harness.files import COMMIT, Code, folder, pinned, today
 from bench.harness.rows import Row, against, bounded, informs, reached
 from bench.harness.worlds import prepare
 from coview_stream.errors import InputError

@@ -1,14 +1,12 @@
-"""What a robot would send, and when: a recorded run played forth and back as one endless drive.
+"""A robot's messages and their times: a recorded run played forth and back as one endless drive.
 
-Three clocks: *due* is seconds since the start of the stream, *content* is the moment of the drive that a message shows
-(seconds since its start), and its *stamp* is what the robot's sensor clock claims. All agree unless a phase spoils it.
+Times are seconds since the start of the drive; stamps are nanoseconds of the robot's sensor clock.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -24,61 +22,40 @@ from coview_stream.report.evaluation import driven
 EPOCH_NS = 1_700_000_000 * 10**9
 """Where the robots' sensor clocks begin: no clock of the machine, as a robot's is none of the node's."""
 
-RESTARTED = 1000.0  # seconds by which a robot's clock jumps back in phase ``restart``
-FAR_FUTURE = 86400.0
 _APART = 31  # frames between the starts of neighbouring robots
 
-Phase = Literal["no_cloud", "no_odometry", "late", "twice", "reversed", "future", "restart"]
 Kind = Literal["odometry", "cloud"]
 
 
 @dataclass(frozen=True)
 class RobotPlan:
-    """What one robot streams from ``begin`` to ``seconds``: clouds and odometry, one each period (0: none).
-
-    ``phases`` are begin and end of something odd. ``late``: each message is followed by one from 0.5 s before;
-    ``twice``: each comes twice; ``reversed``: time runs backwards; ``future``: begins with one message of each kind
-    that claims to be of tomorrow; ``restart``: the stamps are RESTARTED seconds older.
-    """
+    """Stream of one robot until ``seconds``: clouds and odometry, one each period (0: none)."""
 
     robot: str
     seconds: float
-    begin: float = 0.0
     cloud: str = "xyz"  # codec
     odometry: str = "json"
     cloud_period: float = 0.1
     odometry_period: float = 0.02
     frame_seconds: float = 0.1  # how long one frame of the run lasts (recorded: 0.1)
     points: int | None = None  # to which every cloud is resampled
-    phases: Mapping[Phase, tuple[float, float]] = field(default_factory=dict)
 
 
-def schedule(plan: RobotPlan) -> Iterator[tuple[float, Kind, float, float]]:
-    """Everything the robot sends as (due, kind, content, claimed stamp), in order; at equal times odometry first."""
+def schedule(plan: RobotPlan) -> list[tuple[float, Kind]]:
+    """Everything the robot sends as (time, kind), in order; at equal times odometry first."""
     periods: dict[Kind, float] = {"odometry": plan.odometry_period, "cloud": plan.cloud_period}
-    dues = [
-        (round(plan.begin + k * period, 6), kind)
+    times = [
+        (round(k * period, 6), kind)
         for kind, period in periods.items()
         if period > 0
-        for k in range(round((plan.seconds - plan.begin) / period))
+        for k in range(round(plan.seconds / period))
     ]
-    sent_ahead = set()
-    for due, kind in sorted(dues, key=lambda item: item[0]):
-        active = {phase for phase, (begin, end) in plan.phases.items() if begin <= due < end}
-        if f"no_{kind}" in active:
-            continue
-        content = 2 * plan.phases["reversed"][0] - due if "reversed" in active else due
-        if "future" in active and kind not in sent_ahead:
-            sent_ahead.add(kind)
-            yield due, kind, content, content + FAR_FUTURE
-        shift = -RESTARTED if "restart" in active else 0.0
-        for back in (0.0, *([0.5] if "late" in active else []), *([0.0] if "twice" in active else [])):
-            yield due, kind, content - back, content - back + shift
+    return sorted(times, key=lambda item: item[0])
 
 
-def stamp_of(claimed: float) -> int:
+def stamp_of(content: float) -> int:
     """Sensor stamp, rounded to the microsecond."""
-    return EPOCH_NS + round(claimed * 1e6) * 1000
+    return EPOCH_NS + round(content * 1e6) * 1000
 
 
 class Drive:
@@ -115,9 +92,7 @@ class Drive:
 
 
 def _content(stamp_ns: int) -> float:
-    """Moment of the drive that a published stamp means, a restarted clock included."""
-    seconds = (stamp_ns - EPOCH_NS) / 1e9
-    return seconds + RESTARTED if seconds < -RESTARTED / 2 else seconds
+    return (stamp_ns - EPOCH_NS) / 1e9
 
 
 def _between(poses: Floats, at: float) -> Pose:

@@ -21,13 +21,12 @@ import numpy as np
 import psutil
 
 from bench.harness import worlds
-from bench.harness.files import folder
+from bench.harness.files import ROOT, environment, folder
 from bench.harness.rows import Row, bounded, informs, judged, reached
-from bench.harness.suite import ROOT, environment
 from bench.stream import scores
 from bench.stream.drive import Drive, RobotPlan
-from bench.stream.many_robots import processor_seconds
 from bench.stream.processes import Helper, Recorder, free_port, route, send, wait_until
+from bench.stream.stage import processor_seconds
 from coview_stream.sim import SimulationConfig
 
 ROBOTS, WITH_CLOUDS = 300, 30
@@ -151,7 +150,7 @@ def _play(
     rate = clouds * asked.cloud_rate
     each = "a robot"
     said = " and ".join(map(str, sorted(shares.values())))
-    yield Row(f"{title}: those with clouds, on each node", said=said)
+    yield Row(f"{title}: those with clouds, on each node", text=said)
     yield informs(f"{title}: silent, {each} and node", 1e6 * silent / count / asked.nodes, "us/s")
     yield informs(
         f"{title}: odometry {asked.odometry_rate:g} Hz, {each}", 1e3 * (driving - silent) / (count - clouds), "ms/s"
@@ -166,7 +165,7 @@ def _play(
     yield informs(f"{wait}, median", _median(found), "s")
     yield informs(f"{wait}, longest", max(found, default=np.inf), "s")
     yield judged(f"{title}: false poses", f"{wrong} of {total}", "none", wrong == 0)
-    yield Row(f"{title}: all numbers", said=f"{len(orphans)} robots moved", details={
+    yield Row(f"{title}: all numbers", text=f"{len(orphans)} robots moved", details={
         "gaps": gaps, "taken": taken, "shares": shares,
         "statuses": {name: recorder.told(name)[-1].fields for name in names[:clouds]},
     })  # fmt: skip

@@ -113,7 +113,7 @@ def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan
 
     drives = {plan.robot: Drive(world, plan) for plan in plans}
     todo = sorted(((due, plan) for plan in plans for due in schedule(plan)), key=lambda item: item[0][0])
-    for (_, kind, content, _), plan in todo:
+    for (content, kind), plan in todo:
         if kind == "cloud":
             drives[plan.robot].cloud(content)
     controls = {"cloud": zenoh.CongestionControl.DROP, "odometry": zenoh.CongestionControl.BLOCK}
@@ -122,12 +122,12 @@ def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan
     with open_session("client", connect=[endpoint]) as session:
         conn.send("ready")
         start = float(conn.recv())
-        for (due, kind, content, claimed), plan in todo:
-            while (wait := start + due - time.monotonic()) > 0:
+        for (content, kind), plan in todo:
+            while (wait := start + content - time.monotonic()) > 0:
                 time.sleep(wait)
             if conn.poll():
                 break
-            drive, stamp, key = drives[plan.robot], stamp_of(claimed), f"coview/{plan.robot}/in/"
+            drive, stamp, key = drives[plan.robot], stamp_of(content), f"coview/{plan.robot}/in/"
             if kind == "cloud":
                 message = encode_cloud(CloudMessage(stamp, drive.cloud(content)), plan.cloud)
                 puts[plan.robot].append((stamp, time.monotonic()))

@@ -19,12 +19,6 @@ FALSE_METRES, FALSE_DEGREES = 2.0, 5.0  # a pose further from the truth than eit
 MAX_MISMATCH_NS = 2_000_000
 """A frame is recognised by its stamp; ages come as decimal seconds, so that stamps made of them are rounded."""
 
-FATES = (
-    "processed", "rejected", "dropped", "late", "out_of_order", "duplicate", "no_odometry", "malformed", "oversized",
-    "unknown_encoding", "engine_errors",
-)  # fmt: skip
-"""What may become of a received frame."""
-
 
 class Posed(NamedTuple):
     """One pose as it arrived: (4, 4) map <- body, and the seconds since the frame that corrected it, NaN if untold."""
@@ -107,12 +101,6 @@ def share_posed(arrivals: Sequence[float], begin: float, end: float, bin_s: floa
     return len(held) / count
 
 
-def longest_silence(arrivals: Sequence[float], begin: float, end: float) -> float:
-    """Longest time without an arrival within ``begin`` to ``end``, seconds."""
-    inside = [begin, *(at for at in arrivals if begin < at < end), end]
-    return max(b - a for a, b in itertools.pairwise(inside))
-
-
 def jain(shares: Sequence[float]) -> float:
     """Jain's fairness: 1 if all have the same, 1/n if one has all."""
     squares = sum(share**2 for share in shares)
@@ -152,11 +140,6 @@ def processed(told: Sequence[Told]) -> list[tuple[float, float]]:
     """(arrival, stamp of the newest processed frame) of each status that tells it."""
     seen = ((status.arrival, status.fields.get("last_frame_ns")) for status in told)
     return [(arrival, float(stamp)) for arrival, stamp in seen if isinstance(stamp, int) and stamp > 0]
-
-
-def unaccounted(counters: dict[str, Any] | None) -> int | None:
-    """Received frames that no other counter tells the fate of; None if there are no counters."""
-    return counters["received"] - sum(counters.get(fate, 0) for fate in FATES) if counters else None
 
 
 def counter(told: Sequence[Told], name: str) -> int | None:

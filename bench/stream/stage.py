@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from bench.accuracy.scores import rms
+from bench.harness.files import ROOT, environment
 from bench.harness.rows import Row, judged
-from bench.harness.suite import ROOT, environment
-from bench.harness.trajectory_scores import rms
 from bench.stream import scores
 from bench.stream.drive import Drive, RobotPlan
 from bench.stream.processes import Helper, Recorder, Sent, free_port, route, send, wait_until
@@ -29,7 +29,6 @@ MAX_JITTER, RATE, RATE_SHARE, MIN_POSED, MAX_FIRST_FIX = 15.0, 10.0, 0.02, 0.95,
 
 MAX_LAG = 0.3
 """Seconds; where a sender was later than that, the machine was too busy for any of the figures to mean anything."""
-MAX_LOG = 200  # lines that ill treatment may add to the node's log
 
 
 @dataclass
@@ -233,24 +232,17 @@ class Stage:
             "clouds_sent": len(puts),
         }
 
-    def ill_treated(self, stream: Stream, **options: Any) -> dict[str, Any]:
-        """Measure a stream, and judge what any ill treatment must leave intact."""
-        found, numbers = self.found, self.measure(stream.plan, self.sent(stream.sender), stream.start, **options)
-        found.numbers.update(numbers)
-        found.judge("node alive", self.running(), "True", self.running())
-        found.none("false or unreadable poses", numbers["false"] + numbers["unreadable"], numbers["poses"])
-        lost = scores.unaccounted(numbers["counters"])
-        known = lost is not None and 0 <= lost <= 3
-        found.judge("frames received of unknown fate", lost, "<= 3 underway", known)
-        found.most("lines of log", len(self.log_lines()), MAX_LOG)
-        return numbers
-
-    def returned(self, what: str, moment: float, limit: float, first: int, last: float = float("inf")) -> None:
-        """Judge how soon after ``moment`` poses came again whose stamps are ``first`` or later (to ``last``), ns."""
-        poses = [pose for pose in self.recorder.poses("r1", moment) if first <= pose.stamp_ns <= last]
-        self.found.most(what, poses[0].arrival - moment if poses else None, limit)
-
 
 def until(moment: float) -> None:
     """Sleep until a monotonic time."""
     time.sleep(max(0.0, moment - time.monotonic()))
+
+
+def processor_seconds(family: Sequence[psutil.Process]) -> dict[int, float]:
+    """User and system time of each process so far, by its id."""
+    seconds: dict[int, Any] = {}
+    for member in family:
+        with contextlib.suppress(psutil.Error):  # it ended in the meantime
+            times = member.cpu_times()
+            seconds[member.pid] = times.user + times.system
+    return seconds

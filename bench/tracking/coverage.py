@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Errors, Told
+from bench.accuracy.scores import Errors, Track
+from bench.harness.rows import number, table
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.report.style import TRUTH, draw_notice, figure
 
@@ -34,7 +34,7 @@ Squares = dict[str, dict[str, Floats]]
 """Squared Mahalanobis distances of poses, by part of the time since a fix and by name of the axes."""
 
 
-def since_fix(told: Told) -> Floats:
+def since_fix(told: Track) -> Floats:
     """(N,) seconds since the fix that each pose goes back to, NaN where there is none.
 
     A fix is the first pose after a search (SEARCHING or LOST); a doubt in between does not end it.
@@ -66,7 +66,7 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
     return out
 
 
-def spread(told: Told, error: Errors) -> Squares:
+def spread(told: Track, error: Errors) -> Squares:
     """Squared distances of all poses in the ``first minute`` after a fix and ``later``."""
     age = since_fix(told)
     return {

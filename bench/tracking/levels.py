@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Errors, Told
+from bench.accuracy.scores import Errors, Track
+from bench.harness.rows import number, table
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, RISK, TAILS, axes_of
 from coview_stream.report.style import TRUTH, figure
@@ -47,7 +47,7 @@ class Sample(NamedTuple):
     axes: Floats
 
     @classmethod
-    def of(cls, told: Told, error: Errors, driven: Floats) -> Sample:
+    def of(cls, told: Track, error: Errors, driven: Floats) -> Sample:
         """Pick them from a drive; (N,) metres ``driven`` at each frame."""
         posed = np.flatnonzero(told.tracking)
         rows = posed[np.unique(np.floor(driven[posed] / EVERY), return_index=True)[1]]
@@ -125,7 +125,7 @@ class Beyond(NamedTuple):
         return self.seconds > TO_ALERT[0] or self.metres > TO_ALERT[1]
 
 
-def beyond_alert_limit(told: Told, error: Errors, driven: Floats) -> list[Beyond]:
+def beyond_alert_limit(told: Track, error: Errors, driven: Floats) -> list[Beyond]:
     """Return the times that poses were given beyond the alert limit; (N,) metres ``driven`` at each frame."""
     beyond = told.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
     edges = np.diff(np.r_[False, beyond, False].astype(int))

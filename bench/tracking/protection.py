@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.harness.files import code_line, fingerprint, folder, remembered
-from bench.harness.rows import Row, informs, judged
-from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import errors
+from bench.accuracy.scores import errors
+from bench.harness.files import fingerprint, folder, remembered
+from bench.harness.rows import Row, informs, judged, number, table
 from bench.tracking import drives
 from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, stanford, tail, upper_bound
 from bench.tracking.tracking import follow
@@ -105,12 +104,12 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         by_family.setdefault(each["family"], []).append(sample)
     joined = {f"{name}, all": Sample.joined(some) for name, some in by_family.items()}
     out = {name: Sample.joined(some) for name, some in sorted(groups.items())} | joined
-    return {"": f"{level_table(out)}\n\n{code_line()}", "tails": _tail_table(by_family)}
+    return {"": f"{level_table(out)}", "tails": _tail_table(by_family)}
 
 
 def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
     """Return the sample of a plain drive, as lists, with what it was; kept until the code changes."""
-    bench = fingerprint("bench/tracking/drives.py", "bench/tracking/worlds.py", "bench/harness/trajectory_scores.py")
+    bench = fingerprint("bench/tracking/drives.py", "bench/tracking/worlds.py", "bench/accuracy/scores.py")
     spec = {"code": fingerprint(*_MEASURED), "bench": bench, "world": repr(world), "variant": variant}
 
     def work() -> dict[str, Any]:

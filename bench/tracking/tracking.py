@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import code_line, fingerprint, folder, remembered
-from bench.harness.rows import Row, informs, judged
-from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Told, errors, score
+from bench.accuracy.scores import Track, errors, score
+from bench.harness.files import fingerprint, folder, remembered
+from bench.harness.rows import Row, informs, judged, number, table
 from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw, honest, pooled, shares, spread
 from bench.tracking.drives import Drive, drift_share, seen
 from bench.tracking.levels import TO_ALERT, Sample, beyond_alert_limit, level_table
@@ -92,7 +91,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
         "coverage": coverage_table(together["coverage"]),
         "protection": together["protection"],
-        "events": "\n".join([*_events(drives), code_line()]),
+        "events": "\n".join([*_events(drives)()]),
     }
 
 
@@ -101,7 +100,7 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
 
     They are kept until the code changes.
     """
-    bench = fingerprint("bench/tracking", "bench/harness/trajectory_scores.py")
+    bench = fingerprint("bench/tracking", "bench/accuracy/scores.py")
     spec = {"code": fingerprint(), "bench": bench, "scenario": repr(scenario.world)}
 
     def work() -> dict[str, Any]:
@@ -128,7 +127,7 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
     return kept["figures"], squares, Sample.from_json(kept["sample"])
 
 
-def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
+def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
     """Feed a drive to a new localizer, which is told frames and odometry and nothing else; write down what it says."""
     localizer, seconds = Localizer(BaseMap.load(site)), np.zeros(len(drive))
     fixes: list[Fix | str] = []
@@ -140,7 +139,7 @@ def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
             seconds[k] = time.perf_counter() - begin
         except (CloudError, RunError) as error:
             fixes.append(str(error))
-    return Told.of(fixes, drive.stamps, seconds)
+    return Track.of(fixes, drive.stamps, seconds)
 
 
 def cells(figures: Figures) -> list[str]:

@@ -55,12 +55,10 @@ def test_jitter_is_the_distance_from_the_period_either_way():
     assert stream_scores.jitter_ms(np.array([])) is None
 
 
-def test_steps_back_share_posed_and_longest_silence():
+def test_steps_back_and_share_posed():
     assert stream_scores.steps_back([1, 2, 2, 5, 4, 6, 1]) == 2
     assert stream_scores.share_posed([0.05, 0.1, 0.65], 0.0, 1.0) == pytest.approx(0.4)
     assert stream_scores.share_posed([5.0], 0.0, 1.0) == 0.0
-    assert stream_scores.longest_silence([0.5, 9.0, 9.5], 0.0, 10.0) == pytest.approx(8.5)
-    assert stream_scores.longest_silence([], 2.0, 5.0) == pytest.approx(3.0)
 
 
 def test_fairness():

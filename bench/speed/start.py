@@ -22,9 +22,8 @@ from unittest import mock
 
 import numpy as np
 
-from bench.harness.files import folder
+from bench.harness.files import environment, folder
 from bench.harness.rows import Row, bounded, informs
-from bench.harness.suite import environment
 from bench.harness.worlds import map_of, prepare
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.sim import SimulationConfig

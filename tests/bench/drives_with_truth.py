@@ -1,10 +1,10 @@
-"""A drive and what a localizer told on it, small enough to know the score."""
+"""A drive and a track on it, small enough to know the score."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bench.harness.trajectory_scores import Told
+from bench.accuracy.scores import Track
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 
 
@@ -17,7 +17,7 @@ def way(count=1500, step=0.2):
     return np.stack([pose_from(rot_z(h) @ tilt, p) for h, p in zip(heading, places, strict=True)])
 
 
-def told(states, poses=None, reasons=None, covariance=None, stamps=None, level=(0.2, 1.0)):
+def track(states, poses=None, reasons=None, covariance=None, stamps=None, level=(0.2, 1.0)):
     count = len(states)
     known = np.array([state == "TRACKING" for state in states])
     poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses.copy()
@@ -26,4 +26,4 @@ def told(states, poses=None, reasons=None, covariance=None, stamps=None, level=(
     stamps = 0.1 * np.arange(count) if stamps is None else np.asarray(stamps)
     reasons = [""] * count if reasons is None else reasons
     covariances, levels = np.tile(covariance, (count, 1, 1)), np.tile(level, (count, 1))
-    return Told(stamps, states, reasons, poses, covariances, np.full(count, 0.005), levels)
+    return Track(stamps, states, reasons, poses, covariances, np.full(count, 0.005), levels)

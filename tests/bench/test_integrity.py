@@ -1,13 +1,27 @@
 import json
 import math
+from argparse import ArgumentParser
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
-from bench.integrity.bounds import lower, upper
-from bench.integrity.run import judged
-from bench.integrity.store import ANY, append, read
-from bench.integrity.tables import Tally, class_table, classes, false_list, family_table, plain, reliability_table
+from bench.integrity import integrity
+from bench.integrity.kinds import CALIBRATION, REPORTED, draw
+from bench.integrity.plan import FAMILIES, plan
+from bench.integrity.run import judged, mirrored, scaled, tilted
+from bench.integrity.tables import (
+    Tally,
+    class_table,
+    classes,
+    false_list,
+    family_table,
+    lower,
+    plain,
+    reliability_table,
+    upper,
+)
+from bench.integrity.work import append, read
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 
@@ -66,7 +80,7 @@ def test_results_are_found_again_by_key_and_code_the_newest_of_each(tmp_path):
     with files[1].open("a") as stream:
         stream.write(json.dumps(result("three", "none"))[:30])  # as a killed process leaves it
     assert {key: each["outcome"] for key, each in read(files, "a").items()} == {"one": "right"}
-    assert set(read([*files, tmp_path / "none.jsonl"], ANY)) == {"one", "two"}
+    assert set(read([*files, tmp_path / "none.jsonl"], "b")) == {"two"}
 
 
 def test_failed_runs_and_those_without_a_way_do_not_count():
@@ -128,3 +142,99 @@ def test_reliability_counts_each_run_once_where_it_first_states_an_error():
     assert counts == {
         "< 0.1": (10, "4.4e-02", 1), "< 0.01": (1, "5.0e-03", 0), "< 0.001": (0, "-", 0), "< 0.0001": (9, "1.0e-05", 0)
     }  # fmt: skip
+
+
+def every(group, count=1080):
+    return [run for site in plan(group, count) for run in site]
+
+
+def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_reported():
+    used = {
+        group: {k for run in every(group) for k in (run.kind, run.driven) if k} for group in ("calibration", "reported")
+    }
+    assert (used["calibration"], used["reported"]) == (CALIBRATION, REPORTED)
+    assert not CALIBRATION & REPORTED
+    runs = every("reported")
+    classes = [run.of_class for run in runs]
+    assert len(runs) == len({run.key for run in runs}) == 1080
+    assert len({(run.kind, run.seed, run.drive_seed, run.driven) for run in runs}) == 1080
+    assert min(classes.count("ordinary"), classes.count("outside")) >= 300
+    assert classes.count("near copies") >= 400
+    assert {run.family for run in runs} | {run.family for run in every("calibration")} == set(FAMILIES)
+    assert {run.family for run in every("reported", 60)} == {run.family for run in runs}
+
+
+def in_world(T, points):
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def test_altered_worlds_are_mirrored_scaled_or_tilted():
+    cloud = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    T = pose_from(rot_z(0.6), np.array([5.0, 4.0, 1.5]))
+    mirror, larger, tilt = mirrored(), scaled(1.05), tilted(np.radians(3.0), 0.7)
+    (turned,) = mirror.poses(T[None])
+    np.testing.assert_allclose(in_world(turned, mirror.cloud(cloud)), in_world(T, cloud) * (-1, 1, 1), atol=1e-5)
+    assert not mirror.right
+    (smaller,) = larger.poses(T[None])
+    np.testing.assert_allclose(1.05 * in_world(smaller, larger.cloud(cloud)), in_world(T, cloud), atol=1e-5)
+    R = tilt.poses(np.eye(4)[None])[0, :3, :3]
+    assert np.degrees(np.arccos(R[2, 2])) == pytest.approx(3.0)
+
+
+def test_the_survey_is_the_same_whatever_changes_later():
+    for kind in ("yard", "rows", "storey", "suburb"):
+        before, after = (draw(kind, 6, 200.0, changed) for changed in (0.0, 1.0))
+        np.testing.assert_array_equal(before.mapped.solid.vertices, after.mapped.solid.vertices)
+        assert before.now.solid.vertices.shape != after.now.solid.vertices.shape or kind == "rows"
+
+
+@pytest.fixture
+def asked(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_BENCH", str(tmp_path))
+
+    def parsed(*words):
+        parser = ArgumentParser()
+        parser.add_argument("--quick", action="store_true")
+        integrity.options(parser)
+        return parser.parse_args(["--quick", *words])
+
+    return parsed
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Keys of the runs that were made; those of the family "old" fail."""
+    keys = []
+
+    def everywhere(sites, task, jobs):
+        for run in (run for site in sites for run in site):
+            keys.append(task.key(run))
+            outcome = "failed" if run.family == "old" else "none"
+            result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), "outcome": outcome}
+            result |= {"state": "SEARCHING", "reason": "no place", "cost_s": 1.0, "site_s": 2.0}
+            append(task.results, result)
+            yield result
+
+    monkeypatch.setattr(integrity, "everywhere", everywhere)
+    return keys
+
+
+def test_only_missing_and_failed_runs_are_made_and_shards_share_their_results(asked, made):
+    for share in ("1/3", "2/3", "3/3"):
+        rows = list(integrity.rows(asked("--shard", share)))
+    assert len(made) == len(set(made)) == 60
+    assert len(rows[-1].details["results"]) == 60
+    failed = [key for key in made if key.endswith("-old")]
+    assert [row.holds for row in rows if row.name.endswith("runs that failed")] == [False]
+    made.clear()
+    list(integrity.rows(asked()))
+    assert made == failed
+    list(integrity.rows(asked("--risk", "0.1", "--families", "court")))
+    assert all(key.endswith("@0.1") for key in made[len(failed) :])
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "three", "1/0"])
+def test_a_wrong_shard_is_refused(asked, text, capsys):
+    with pytest.raises(SystemExit):
+        asked("--shard", text)
+    assert text in capsys.readouterr().err

@@ -20,7 +20,7 @@ MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame
 
 
 @dataclass(frozen=True)
-class Told:
+class Track:
     """What the localizer said, frame by frame (N)."""
 
     stamps: Floats  # seconds
@@ -32,7 +32,7 @@ class Told:
     levels: Floats  # (N, 2) protection levels, metres and degrees, likewise
 
     @classmethod
-    def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Told:
+    def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Track:
         """Collect what was said at the ``stamps``; a frame that was refused has the reason in place of its fix."""
         poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
         levels = np.full((len(fixes), 2), np.nan)
@@ -73,7 +73,7 @@ class Errors:
         return np.asarray((self.metres <= FALSE_METRES) & (self.degrees <= FALSE_DEGREES))
 
 
-def errors(told: Told, truth: Floats) -> Errors:
+def errors(told: Track, truth: Floats) -> Errors:
     """Compare with the true poses (N, 4, 4), map <- body."""
     twist = np.full((len(truth), 6), np.nan)
     known = told.tracking
@@ -108,7 +108,7 @@ def losses(states: Sequence[str], reasons: Sequence[str]) -> list[str]:
     return [reason for before, state, reason in pairs if state == "LOST" != before]
 
 
-def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
+def score(told: Track, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
     """All figures of one drive but coverage; metres, degrees, seconds, milliseconds; None where there is no pose.
 
     Args:

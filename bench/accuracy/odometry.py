@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.harness.files import code_line
-from bench.harness.rows import Row, informs
-from bench.harness.tables import number, table
+from bench.harness.rows import Row, informs, number, table
 from coview_stream.clouds import read_tum
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CloudError, InputError
@@ -60,7 +58,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             known = np.abs(stamps[nearest] - run.stamps[frames]) < _NEAR
             scores = scored(poses[known], truth[nearest[known]])
             details = {"run": folder.name, "odometry": name, **asdict(scores)}
-            yield informs(f"lidar_odometry/{folder.name}, {name}: tilt per step", scores.tilt, "deg", details)
+            yield informs(f"odometry/{folder.name}, {name}: tilt per step", scores.tilt, "deg", details)
 
 
 def plain(run: Run) -> tuple[list[int], Poses]:
@@ -123,4 +121,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         [each["run"], each["odometry"], str(each["frames"]), *(number(each[key], digits) for key, digits in _COLUMNS)]
         for each in (row.details for row in rows)
     ]
-    return {"": f"{table(_HEAD, lines)}\n\n{code_line()}"}
+    return {"": f"{table(_HEAD, lines)}"}

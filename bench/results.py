@@ -1,0 +1,127 @@
+"""Run benchmarks and write their tables into docs/results.md: ``python -m bench results [--only NAME...] [--quick]``.
+
+Every table stands below its command, date, machine and the commit of the code (``+``: with uncommitted changes). A run
+replaces only its own tables; the others stay with their commit. Quick runs have tables of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.__main__ import parser_of, tables_of
+from bench.harness.files import ROOT, commit, environment
+from bench.harness.rows import HEAD as COLUMNS
+from bench.harness.rows import Row, table
+from coview_stream.clouds.atomic_file import atomic_path
+from coview_stream.errors import InputError
+
+PAGE = ROOT / "docs" / "results.md"
+
+COMMANDS = {
+    **{name: name for name in ("kernels", "match", "frame", "map_build", "registration", "engine", "stages")},
+    "search": "search",
+    "scale": "scale",
+    "city": "city --side 2 4",
+    "start": "start",
+    "peers": "peers",
+    "accuracy": "accuracy --only worlds",
+    "dirt": "accuracy --only dirt",
+    "conditions": "conditions",
+    "airborne-like maps": "conditions --conditions base --densities 4 8 20",
+    "ablation": "ablation",
+    "tracking": "tracking",
+    "protection": "protection",
+    "integrity": "integrity",
+    **{name: name for name in ("forest", "forest_runs", "forest_scale", "changes", "joint", "stream", "fleet")},
+    "fuzz": "fuzz --seconds 60",
+    "soak": "soak --minutes 600",
+}
+"""Name of each table, and the command that prints it."""
+
+HEAD = """# Results
+
+All figures of the documentation, each below the command that prints it, its date, its machine and the commit of the
+measured code. `python -m bench results --only NAME...` measures again and replaces only the tables of these names.
+"""
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """Return the names of the tables to make; InputError for an unknown one."""
+    if unknown := [name for name in names if name not in COMMANDS]:
+        raise InputError(f"no table {', '.join(unknown)}; there are {', '.join(COMMANDS)}")
+    return list(names) or list(COMMANDS)
+
+
+def block(name: str, command: str, text: str, date: str, version: str, machine: str = "2 shared cores") -> str:
+    """Return a table's part of the page."""
+    about = f"`python -m bench {command}`, {date}, {machine}, commit {version}"
+    return f"\n<!-- results: {name} -->\n## {name}\n\n{about}\n\n{text}\n<!-- end -->\n"
+
+
+def replaced(page: str, name: str, part: str) -> str:
+    """Put a part into its place in the page, or at its end."""
+    place = re.compile(rf"\n<!-- results: {re.escape(name)} -->\n.*?<!-- end -->\n", re.DOTALL)
+    if place.search(page):
+        return place.sub(lambda _: part, page)
+    return f"{page.rstrip()}\n{part}"
+
+
+def measured(command: str) -> str:
+    """Run a benchmark in a process of its own; return its tables, then its targets or all rows. Empty: it failed."""
+    name, *words = command.split()
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rows.json"
+        code = subprocess.run(
+            [sys.executable, "-m", "bench", name, *words, "--json", str(file)], env=environment(), stdout=sys.stderr
+        ).returncode
+        if code not in (0, 1) or not file.is_file():
+            return ""
+        rows = [Row.from_dict(values) for values in json.loads(file.read_text())]
+    own = tables_of(name, rows, parser_of(name).parse_args(words))
+    parts = [f"{title}\n\n{text}".strip() for title, text in own.items()]
+    shown = [row for row in rows if row.target] if own else rows
+    if shown:
+        parts.append(table(COLUMNS, [[_short(row.name, name), *row.cells()[1:]] for row in shown]))
+    return "\n\n".join(parts)
+
+
+def _short(row: str, name: str) -> str:
+    return row.removeprefix(name).lstrip("/,: ")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Make the tables one after the other; each is written as soon as it is there."""
+    parser = ArgumentParser("python -m bench results", description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(COMMANDS))
+    parser.add_argument("--quick", action="store_true", help="smaller sizes, in tables of their own")
+    parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE.relative_to(ROOT)})")
+    parser.add_argument("--machine", default=f"{os.cpu_count()} shared cores", help="in neutral words")
+    asked = parser.parse_args(arguments)
+    missing = []
+    try:
+        names = chosen(asked.only)
+    except InputError as error:
+        print(f"bench results: {error}", file=sys.stderr)
+        return 2
+    for name in names:
+        command = f"{COMMANDS[name]}{' --quick' * asked.quick}"
+        print(f"=== {command}", file=sys.stderr, flush=True)
+        if not (text := measured(command)):
+            missing.append(name)
+            continue
+        title = f"{name}, quick" if asked.quick else name
+        part = block(title, command, text, time.strftime("%Y-%m-%d"), commit(), asked.machine)
+        page = asked.page.read_text() if asked.page.is_file() else HEAD
+        with atomic_path(asked.page) as file:
+            file.write_text(replaced(page, title, part))
+    print(f"{len(names) - len(missing)} tables written; not measured: {', '.join(missing) or 'none'}")
+    return int(bool(missing))

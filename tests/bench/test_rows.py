@@ -1,0 +1,117 @@
+"""Rows judge what they compare; the command prints and writes them; the results page keeps tables that were not run."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from bench import __main__ as bench
+from bench import results
+from bench.harness import rows
+from bench.harness.files import fingerprint, remembered
+from bench.harness.rows import Row, against, bounded, failed, informs, judged, medians, reached
+from bench.harness.run import BENCHMARKS, Benchmark, run
+from coview_stream.errors import InputError
+
+
+def test_rows_judge_what_they_compare():
+    assert against("a", 2.0, 6.0, "ms", 3.0) == Row("a", 2.0, 6.0, "ms", 3.0, ">= 3", True)
+    assert against("a", 2.0, 5.9, "ms", 3.0).holds is False
+    assert against("a", 2.0, 6.0, "ms", None).holds is None
+    assert bounded("b", 8.0, "ms", 8.0) == Row("b", 8.0, None, "ms", None, "<= 8 ms", True)
+    assert reached("r", 95.0, "%", 95.0) == Row("r", 95.0, None, "%", None, ">= 95 %", True)
+    for missed in (bounded("b", 8.1, "ms", 8.0), bounded("b", math.nan, "ms", 8.0), reached("r", 94.9, "%", 95.0)):
+        assert missed.holds is False
+    assert reached("r", math.nan, "%", 95.0).holds is False
+    assert judged("j", "3 of 4", "all", False, 3).text == "3 of 4"
+    assert (informs("c", 1.0, "MB").holds, failed("d", "gone").holds) == (None, False)
+
+
+def test_medians_take_turns_and_warm_up_first(monkeypatch):
+    calls, clock = [], iter(range(10_000))
+    monkeypatch.setattr(rows.time, "perf_counter", lambda: float(next(clock)))
+    sides = [lambda k=k: calls.append(k) for k in range(3)]
+    assert medians(*sides, repeat=4) == [1e3, 1e3, 1e3]
+    assert calls == [0, 1, 2, 0, 1, 2, 2, 1, 0, 0, 1, 2, 2, 1, 0]
+    with pytest.raises(ValueError, match="at least one"):
+        medians(*sides, repeat=0)
+
+
+def test_a_row_survives_json():
+    row = Row("fake/first", math.nan, 3.0, "ms", 3.0, ">= 2", True, details={"all": [1, math.nan]})
+    there = Row.from_dict(json.loads(json.dumps(row.to_dict(), allow_nan=False)))
+    assert repr(there).replace("None]", "nan]") == repr(row)
+    with pytest.raises(ValueError, match="a row has name"):
+        Row.from_dict({"name": "x"})
+
+
+def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
+    file = tmp_path / "deep" / "result.json"
+    assert remembered(file, {"code": "a", "size": (1, 2)}, lambda: {"value": 1}) == {"value": 1}
+    assert remembered(file, {"code": "a", "size": (1, 2)}, lambda: {"value": 2}) == {"value": 1}
+    assert remembered(file, {"code": "b", "size": (1, 2)}, lambda: {"value": 3}) == {"value": 3}
+    parts = ("coview_stream/sim", "coview_stream/descriptors/coview.py", "coview_kernels", "")
+    assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
+
+
+@pytest.fixture
+def planted(monkeypatch):
+    def fake(asked):
+        yield Row("fake/first", 1.0, 3.0, "ms", 3.0, ">= 2", True)
+        yield bounded("fake/quick", 5.0 if asked.quick else 50.0, "s", 10.0)
+
+    module = SimpleNamespace(rows=fake, tables=lambda rows, asked: {"wide": f"{len(rows)} rows"}, __doc__="Made up.")
+    monkeypatch.setattr(Benchmark, "load", lambda self: module)
+    monkeypatch.setitem(BENCHMARKS, "fake", Benchmark("fake", "made up"))
+
+
+def test_rows_are_printed_and_written_and_a_missed_target_is_the_exit_code(planted, tmp_path, capsys):
+    file = tmp_path / "rows.json"
+    assert bench.main(["fake", "--json", str(file), "--quick"]) == 0
+    out = capsys.readouterr().out
+    assert "fake wide\n\n2 rows\n" in out
+    assert "2 of 2 targets hold" in out
+    assert [row["name"] for row in json.loads(file.read_text())] == ["fake/first", "fake/quick"]
+    assert bench.main(["fake"]) == 1
+    assert "DOES NOT HOLD" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["nothing"], "no benchmark 'nothing'"), (["fake", "--json", "no/such/rows.json"], "--json no/such/rows.json")],
+)
+def test_a_wrong_command_is_refused_in_one_line(planted, capsys, arguments, words):
+    assert bench.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert words in err
+
+
+def test_only_tables_that_were_run_change_the_page():
+    page = results.HEAD + results.block("fake", "fake --quick", "old", "2026-01-01", "abc1234")
+    other = results.block("other", "other", "kept", "2026-01-02", "abc1234")
+    again = results.replaced(
+        page + other, "fake", results.block("fake", "fake --quick", "new", "2026-02-01", "def5678")
+    )
+    assert "old" not in again
+    assert "new" in again
+    assert other in again
+    added = results.replaced(again, "third", results.block("third", "third", "more", "2026-02-01", "def5678"))
+    assert added.startswith(again.rstrip())
+    with pytest.raises(InputError, match="no table"):
+        results.chosen(["nothing"])
+
+
+def test_every_benchmark_loads():
+    for entry in BENCHMARKS.values():
+        if not entry.module.startswith(("stream", "soak")):  # they watch processes with psutil: extra bench
+            assert callable(entry.load().rows)
+
+
+@pytest.mark.slow
+def test_a_benchmark_that_fails_is_a_row(capfd):
+    (row,) = run("peers", ["--trial", "nobody", "map", "places"], None)
+    assert (row.name, row.holds) == ("peers: ended with exit code 1", False)
+    (row,) = run("kernels", ["--quick"], 1, limit_s=0.1)
+    assert row.name == "kernels, 1 thread, quick: ran past its 0.1 s"

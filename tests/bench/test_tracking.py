@@ -1,0 +1,187 @@
+"""Scores of a tracked drive: errors, events, coverage of the covariance, protection levels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drives_with_truth import track, way
+
+from bench.accuracy.scores import errors, losses, recovery, score
+from bench.tracking import coverage as tracking_coverage
+from bench.tracking import protection, tracking
+from bench.tracking.coverage import AXES, NOMINAL, coverage, pooled, shares, spread
+from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, tail, upper_bound
+from coview_stream.geometry.protection import protection_level
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
+
+C = np.diag([1e-4, 1e-4, 1e-5, 1e-6, 1e-6, 2e-6])
+
+
+@pytest.fixture(scope="module")
+def covariance():
+    """Correlated, metres beside radians."""
+    mix = np.random.default_rng(1).normal(size=(6, 6))
+    sigma = np.array([0.05, 0.1, 0.02, 0.002, 0.002, 0.004])
+    return (mix @ mix.T + np.eye(6)) / 6 * np.outer(sigma, sigma)
+
+
+def covered(covariance, scale=1.0, count=4000):
+    """Coverage of poses whose errors are drawn from a covariance, reported with ``scale`` times its sigmas."""
+    rng, truth = np.random.default_rng(3), way(count)
+    poses = truth.copy()
+    twist = rng.multivariate_normal(np.zeros(6), covariance, count)
+    poses[:, :3, 3] += twist[:, :3]
+    poses[:, :3, :3] = np.stack([exp_so3(t[3:]) @ T[:3, :3] for t, T in zip(twist, truth, strict=True)])
+    driven = track(["TRACKING"] * count, poses, covariance=covariance * scale**2)
+    return shares(pooled([spread(driven, errors(driven, truth))]))
+
+
+@pytest.fixture(scope="module")
+def honest(covariance):
+    return covered(covariance)
+
+
+def test_an_honest_covariance_covers_its_promise_on_every_axis(honest):
+    for name in AXES:
+        np.testing.assert_allclose(honest["all"][name]["inside"], NOMINAL, atol=0.025)
+        assert honest["all"][name]["median_nees"] == pytest.approx(1.0, abs=0.1)
+    assert [honest[part]["yaw"]["frames"] for part in ("first minute", "later")] == [600, 3400]
+
+
+@pytest.mark.parametrize(("scale", "one_sigma", "nees"), [(0.5, 0.383, 4.0), (2.0, 0.954, 0.25)])
+def test_a_covariance_of_wrong_size_is_detected(covariance, scale, one_sigma, nees):
+    parts = covered(covariance, scale)
+    assert parts["all"]["yaw"]["inside"][0] == pytest.approx(one_sigma, abs=0.025)
+    assert parts["all"]["pose"]["median_nees"] == pytest.approx(nees, rel=0.1)
+    assert missed_by([row()], parts) == {"coverage, first minute", "coverage, later"}
+
+
+def test_a_broken_covariance_covers_nothing():
+    broken = np.stack([np.full((6, 6), np.nan), np.diag([1.0, 1, 1, 1, 1, -1]), np.zeros((6, 6)), np.eye(6)])
+    squared = tracking_coverage.squares(np.full((4, 6), 0.1), broken, AXES["pose"])
+    np.testing.assert_allclose(squared, [np.inf, np.inf, np.inf, 0.06])
+    assert coverage(squared, 6)["inside"][2] == 0.25
+    assert coverage(np.zeros(0), 6)["inside"] is None
+
+
+def test_errors_are_in_map_axes():
+    truth = np.stack([pose_from(rot_z(np.pi / 2), [10.0, 0.0, 0.0])])
+    poses = np.stack([pose_from(exp_so3(np.array([0.02, 0.0, 0.0])) @ truth[0, :3, :3], [10.1, -0.2, 0.0])])
+    error = errors(track(["TRACKING"], poses), truth)
+    np.testing.assert_allclose(error.twist, [[0.1, -0.2, 0.0, 0.02, 0.0, 0.0]], atol=1e-12)
+
+
+def test_false_seconds_last_until_the_next_frame_and_no_longer_than_half_a_second():
+    states = ["TRACKING", "TRACKING", "LOST", "TRACKING", "TRACKING"]
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[[1, 3], 0, 3] = 1.2, 40.0
+    poses[4, :3, :3] = rot_z(np.radians(5.1))
+    drive = track(states, poses, ["", "", "gone", "", ""], stamps=[0.0, 0.1, 0.3, 0.4, 5.0])
+    figures = score(drive, np.tile(np.eye(4), (5, 1, 1)), np.arange(5.0), [])
+    assert (figures["false_frames"], figures["doubtful_frames"], figures["losses"]) == (3, 2, 1)
+    assert figures["false_s"] == pytest.approx(0.2 + 0.5 + 0.15)  # the last one lasts a median gap
+    assert figures["right_percent"] == pytest.approx(20.0)
+    silent = score(track(["SEARCHING"] * 3 + ["SKIPPED"]), np.tile(np.eye(4), (4, 1, 1)), np.arange(4.0), [])
+    assert (silent["rmse_m"], silent["first_fix_m"], silent["p50_ms"]) == (None, None, None)
+
+
+def test_recovery_is_counted_from_the_end_of_the_event_to_the_first_right_pose():
+    right = np.array([True, True, False, False, False, True])
+    stamps, driven = 0.1 * np.arange(6), np.array([0.0, 1.0, 1.0, 1.0, 3.0, 6.0])
+    assert recovery(right, stamps, driven, 2) == pytest.approx((0.3, 5.0))
+    assert recovery(right, stamps, driven, 1) == (0.0, 0.0)
+    assert recovery(right[:5], stamps, driven, 2) is None
+    states = ["SEARCHING", "TRACKING", "LOST", "LOST", "TRACKING", "AMBIGUOUS", "LOST"]
+    assert losses(states, list("abcdefg")) == ["c", "g"]
+
+
+def test_a_fix_ends_with_a_search_but_not_with_a_doubt():
+    states = ["SEARCHING", "TRACKING", "AMBIGUOUS", "TRACKING", "LOST", "AMBIGUOUS", "TRACKING"]
+    age = tracking_coverage.since_fix(track(states))
+    np.testing.assert_allclose(age, [np.nan, 0.0, np.nan, 0.2, np.nan, np.nan, 0.0])
+
+
+def missed_by(rows, parts):
+    return {row.name.partition("/")[2] for row in tracking.verdicts(rows, parts) if not row.holds}
+
+
+def row(**changes):
+    out = {
+        "name": "plain/x", "plain": True, "drift_percent": 1.0, "driven_m": 300.0, "right_percent": 98.0,
+        "first_fix_m": 5.0, "rmse_m": 0.05, "max_m": 0.2, "rmse_deg": 0.05, "max_deg": 0.2, "false_frames": 0,
+        "false_s": 0.0, "doubtful_frames": 0, "losses": 0, "reasons": [], "events": [], "p50_ms": 3.0, "p99_ms": 30.0,
+        "misleading": 0, "beyond": 0, "alert_s": None, "alert_m": None,
+    }  # fmt: skip
+    return out | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "missed"),
+    [
+        ({}, set()),
+        ({"rmse_m": 0.13}, {"rmse of plain drives, m"}),
+        ({"rmse_deg": None}, {"rmse of plain drives, deg"}),
+        ({"false_frames": 1, "false_s": 0.1}, {"false frames"}),
+        ({"misleading": 2}, {"beyond the alert limit, to the alert"}),
+        ({"events": [{"recovery_m": 20.1, "recovery_s": 9.0}]}, {"recovery, m driven"}),
+        ({"events": [{"recovery_m": None, "recovery_s": None}]}, {"recovery, m driven"}),
+    ],
+)
+def test_targets_are_judged(honest, changes, missed):
+    assert missed_by([row(**changes)], honest) == missed
+
+
+def drawn(count, factor, freedom):
+    """A sample whose errors have a known tail."""
+    rng = np.random.default_rng(5)
+    scale = factor * np.sqrt(freedom / rng.chisquare(freedom, (count, 2)))
+    twist = rng.multivariate_normal(np.zeros(6), C, count)
+    metres = scale[:, 0] * np.linalg.norm(twist[:, :3], axis=1)
+    degrees = np.degrees(scale[:, 1] * np.linalg.norm(twist[:, 3:], axis=1))
+    one = track(["TRACKING"], covariance=C)
+    one = Sample.of(one, errors(one, way(1)), np.zeros(1))
+    ones = np.ones((count, 2))
+    return Sample(np.column_stack([metres, degrees]), ones, ones * one.trace, ones * one.axes)
+
+
+def test_one_pose_counts_of_each_ten_metres_with_its_reported_level():
+    level = protection_level(C, doubt=1.2)
+    states = ["SEARCHING"] * 30 + ["TRACKING"] * 170
+    drive = track(states, way(200), covariance=C, level=(level.metres, level.degrees))
+    sample = Sample.of(drive, errors(drive, way(200)), 0.2 * np.arange(200))  # 40 m, the first six without a pose
+    assert len(sample.error) == 4
+    np.testing.assert_allclose(sample.doubt, 1.2)
+    np.testing.assert_allclose(sample.level(PRODUCT), [[level.metres, level.degrees]] * 4)
+    np.testing.assert_array_equal(Sample.from_json(sample.to_json()).trace, sample.trace)
+
+
+@pytest.mark.parametrize(("hits", "of", "bound"), [(0, 2995, 0.001), (0, 299, 0.01), (1, 4742, 0.001), (3, 3, 1.0)])
+def test_bound_is_the_exact_binomial_one(hits, of, bound):
+    assert upper_bound(hits, of) == pytest.approx(bound, rel=0.01)
+
+
+@pytest.mark.parametrize(("factor", "freedom"), [(1.0, 4.0), (0.7, 3.0), (1.5, 12.0)])
+def test_the_tail_of_drawn_errors_is_recovered(factor, freedom):
+    sample = drawn(20_000, factor, freedom)
+    for part in (0, 1):
+        assert tail(sample, part) == (pytest.approx(factor, rel=0.05), pytest.approx(freedom, rel=0.2))
+    assert max(sample.above([(factor, freedom)] * 2)) < 2e-3 * 20_000
+
+
+def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time():
+    truth, poses = np.tile(np.eye(4), (60, 1, 1)), np.tile(np.eye(4), (60, 1, 1))
+    poses[10:18, 0, 3] = 1.1  # 0.8 s
+    poses[30:, 0, 3] = 1.1  # 2.9 s, to the end
+    drive = track(["TRACKING"] * 60, poses)
+    error = errors(drive, truth)
+    assert sum(each.misleading for each in beyond_alert_limit(drive, error, np.zeros(60))) == 1
+    far = beyond_alert_limit(drive, error, 0.3 * np.arange(60))
+    assert [each.misleading for each in far] == [True, True]
+    withdrawn = track(["TRACKING"] * 45 + ["LOST"] * 15, poses)
+    assert not any(each.misleading for each in beyond_alert_limit(withdrawn, errors(withdrawn, truth), np.zeros(60)))
+
+
+def test_families_share_no_kind_and_no_seed():
+    fitted, reported = (protection.FAMILIES[name] for name in ("fitted", "reported"))
+    assert not set(fitted.kinds) & set(reported.kinds)
+    assert not {w.seed for w, _ in fitted.worlds(100)} & {w.seed for w, _ in reported.worlds(100)}
