@@ -160,7 +160,7 @@ def acceptance_config(risk: str | float) -> AcceptanceConfig:
     Raises:
         ConfigError: it is no number from 1e-6 to below a half.
     """
-    from coview_stream.config.acceptance import LEAST_RISK, AcceptanceConfig
+    from coview_stream.config.localizer import LEAST_RISK, AcceptanceConfig
     from coview_stream.errors import ConfigError
 
     try:

@@ -6,13 +6,21 @@ the map and read back from it, so that the two can never drift apart; the rest b
 
 from __future__ import annotations
 
-from coview_stream.config.acceptance import AcceptanceConfig
-from coview_stream.config.localizer import LocalizerConfig
+from coview_stream.config.localizer import (
+    AcceptanceConfig,
+    ConsensusConfig,
+    GraphConfig,
+    KeyframeConfig,
+    LearnedConfig,
+    LocalizerConfig,
+    RegistrationConfig,
+    RegistrationMethod,
+    Reloc,
+    RetrievalConfig,
+    TrackingConfig,
+)
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, config_of_map, map_preset
 from coview_stream.config.mount import Mount
-from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
-from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
-from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 __all__ = [
     "AcceptanceConfig",

@@ -2,33 +2,331 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import get_args
+from typing import Literal, get_args
 
-from coview_stream.config.acceptance import AcceptanceConfig
-from coview_stream.config.checks import check_types, require
-from coview_stream.config.registration import RegistrationConfig
-from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
-from coview_stream.config.tracking import GraphConfig, TrackingConfig
+from coview_stream.config.checks import all_positive, check_types, counts, fraction, positive, require
+
+LEAST_RISK = 1e-6
+"""Smallest risk: the model of the evidence does not tell smaller errors apart."""
+
+
+@dataclass(frozen=True)
+class AcceptanceConfig:
+    """Evidence that makes, keeps and loses a fix; docs/integrity.md has the equations.
+
+    A place is given while the probability that it is wrong is below ``risk``, and given up once it is more probably
+    wrong than right. The other limits are set by hand.
+
+    Attributes:
+        risk: integrity risk, the probability of a wrong place above which no pose is given.
+        max_tilt: radians by which a pose may lean against gravity.
+        max_innovation: squared Mahalanobis distance to odometry's prediction, 6 degrees of freedom, above which the pose
+            is withheld. Exact covariances exceed 22 once in a thousand; ours have heavier tails.
+        max_doubt_s: seconds of doubt after which the map is searched again.
+        max_blind_s: the same while the sensor is blind: odometry goes on, and nothing contradicts the place.
+    """
+
+    risk: float = 1e-4
+    max_tilt: float = math.radians(15)
+    max_innovation: float = 40.0
+    max_doubt_s: float = 5.0
+    max_blind_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        require(LEAST_RISK <= self.risk < 0.5, self, "risk", "in [1e-6, 0.5)")
+        positive(self, "max_tilt", "max_innovation", "max_doubt_s", "max_blind_s")
+
+
+RegistrationMethod = Literal["trimmed-icp", "gicp"]
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
+
+    Points above the ground and points on it are trimmed apart, else the ground, which fits anywhere, pushes out the
+    facades that fix the position (seen once on KITTI 04, no command prints it: 0.25 m median error against 0.05 m).
+
+    ``inflation``, the floors and the ``shared`` sigmas are calibrated on the simulated drives of
+    ``python -m bench tracking --seeds 5100``, which prints how often the truth lies within 1, 2 and 3 sigma; a real
+    map's own error, against the ground truth that matters to you, comes on top. The rest is set by hand.
+
+    Attributes:
+        method: ``trimmed-icp``, or ``gicp``, which needs the extra of that name and is for tracking only: the search
+            registers its hypotheses by trimmed ICP (see :mod:`coview_stream.localization.registration.gicp`).
+        keep: overlap, the share of the pairs that is kept; the paper keeps 0.6, 0.7 converges faster and as well.
+        search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
+        track: likewise while tracking.
+        iterations: at most, on each scale. Half as many leave headings one degree off where odometry is three degrees
+            off (``python -m bench conditions --conditions drift`` on three real runs).
+        source_voxel: metres; one point of the scan is kept in each cube of this size.
+        source_points: at most so many of them, chosen at random.
+        source_range: metres from the sensor within which the scan's points are used.
+        residual_scale: width of the Cauchy weights on the last scale, metres; of trimmed ICP alone.
+        inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
+        sigma_floor: metres, added to what registration claims of each position.
+        sigma_floor_angle: radians, likewise of each angle.
+        shared: times the clustered sigma of the error that neighbouring registrations have in common, as a scanned
+            map's points lie off its surfaces
+            (:class:`coview_stream.localization.tracking.shared_error.SharedErrorModel`).
+        shared_position: metres of x and of y of that error which the pairs do not show.
+        shared_height: metres of z, likewise.
+        shared_tilt: radians of roll and of pitch, likewise.
+        shared_yaw: radians of the heading, likewise.
+        gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
+        weak_lever: metres; an angle is compared with a shift by what it moves at this distance.
+        weak_from: metres; a direction that is known less well is one that the map hardly shows, and its sigma is
+            widened (:func:`coview_stream.localization.registration.covariance.registration_covariance`).
+        weak_sigma: metres, the largest sigma that this gives.
+    """
+
+    method: RegistrationMethod = "trimmed-icp"
+    keep: float = 0.7
+    search: tuple[float, ...] = (3.0, 1.5, 0.8, 0.4)
+    track: tuple[float, ...] = (0.8, 0.4)
+    iterations: int = 30
+    source_voxel: float = 0.5
+    source_points: int = 5000
+    source_range: float = 50.0
+    residual_scale: float = 0.1
+    inflation: float = 3.0
+    sigma_floor: float = 0.002
+    sigma_floor_angle: float = math.radians(0.004)
+    shared: float = 1.3
+    shared_position: float = 0.001
+    shared_height: float = 0.001
+    shared_tilt: float = math.radians(0.03)
+    shared_yaw: float = math.radians(0.001)
+    gravity_sigma: float = math.radians(1.0)
+    weak_lever: float = 10.0
+    weak_from: float = 0.05
+    weak_sigma: float = 10.0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        methods = get_args(RegistrationMethod)
+        require(self.method in methods, self, "method", f"one of {', '.join(methods)}")
+        fraction(self, "keep")
+        counts(self, "iterations", "source_points")
+        all_positive(self, "method", "search", "track")
+        for name in ("search", "track"):
+            scales = getattr(self, name)
+            falling = bool(scales) and all(a >= b > 0 for a, b in zip(scales, (*scales[1:], scales[-1]), strict=True))
+            require(falling, self, name, "one or more positive distances, coarse to fine")
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """Keyframes: when the robot's frames become a virtual local scan, VLS (paper, section 3.3); set by hand.
+
+    Attributes:
+        distance: metres driven from keyframe to keyframe, the paper's sigma_d.
+        capacity: keyframes held, so that memory is fixed.
+        voxel: metres; one point of a frame is kept in each cube of this size.
+        range_min: metres; nearer points are the robot itself.
+        min_points: points, after that, which a VLS needs before it may vote.
+    """
+
+    distance: float = 2.0
+    capacity: int = 30
+    voxel: float = 0.25
+    range_min: float = 0.5
+    min_points: int = 300
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        positive(self, "distance", "voxel")
+        counts(self, "capacity", "min_points")
+        require(self.range_min >= 0, self, "range_min", "zero or more")
+
+
+@dataclass(frozen=True)
+class RetrievalConfig:
+    """Retrieval: which stations are scored (paper, section 3.4); ``python -m bench ablation`` compares the two modes.
+
+    Attributes:
+        mode: ``exhaustive`` scores all stations at all shifts. ``ring_key`` is the paper's way, kept for comparison:
+            only the stations nearest in ring key are scored, all others count as worst.
+        candidates: how many those are.
+    """
+
+    mode: Literal["exhaustive", "ring_key"] = "exhaustive"
+    candidates: int = 200
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        require(self.mode in ("exhaustive", "ring_key"), self, "mode", "exhaustive or ring_key")
+        counts(self, "candidates")
+
+
+@dataclass(frozen=True)
+class ConsensusConfig:
+    """Consensus: the votes of keyframes for one ``T_map_odom``.
+
+    Attributes:
+        mode: ``consensus``; or ``single``, the paper's rule: the one smallest distance of all keyframes.
+            ``python -m bench ablation`` compares them.
+        window: newest keyframes that vote; set by hand.
+        peaks: best hypotheses that are scored by the likelihood field; more of the co-view descriptors on maps of
+            more than 20,000 stations, by the fourth root. Set by hand.
+        distinct_distance: metres; a hypothesis farther than this from every better one is one of its own; set by hand.
+        distinct_yaw: radians; so is one turned by more than this; set by hand.
+    """
+
+    mode: Literal["consensus", "single"] = "consensus"
+    window: int = 10
+    peaks: int = 184
+    distinct_distance: float = 6.0
+    distinct_yaw: float = math.radians(20)
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        require(self.mode in ("consensus", "single"), self, "mode", "consensus or single")
+        counts(self, "window", "peaks")
+        positive(self, "distinct_distance", "distinct_yaw")
+
+
+Reloc = Literal["auto", "coview", "learned"]
+"""Place recognition: the descriptors of the paper, learned features, or (auto) both where map and installation can."""
+
+
+@dataclass(frozen=True)
+class LearnedConfig:
+    """Search of a scan's learned features among the map's (:mod:`coview_stream.localization.search.learned`).
+
+    Set by hand; ``python -m bench forest`` prints what comes of it, ``bench learned_match`` what it costs.
+
+    Attributes:
+        reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
+        cell: metres from place to place at which their features are compared with the map's.
+        yaws: headings at each, an even number.
+        dense_area: square metres up to which a map is searched all over.
+        shortlist: tiles of a larger one, those that look most alike, around which it is searched.
+        peaks: best places that are scored by the likelihood field.
+    """
+
+    reach: float = 30.0
+    cell: float = 2.0
+    yaws: int = 36
+    dense_area: float = 2.0e6
+    shortlist: int = 50
+    peaks: int = 64
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        positive(self, "dense_area")
+        require(5.0 <= self.reach <= 32.0, self, "reach", "5 to 32 m, half a query's image")
+        require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")
+        counts(self, "yaws", minimum=4)
+        require(self.yaws <= 360, self, "yaws", "360 at most: memory and time grow with it")
+        require(self.yaws % 2 == 0, self, "yaws", "an even number")
+        counts(self, "shortlist", "peaks")
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Registrations while tracking: when, with which frames; and the drift that odometry is believed to have.
+
+    A registration is due after ``distance``, ``turn`` or ``seconds``. ``seconds`` counts regardless of odometry, for
+    wheels slip, drivers hang and robots are carried. Where odometry is so bad that the pose has become uncertain, it is
+    due sooner.
+
+    The newest frame is registered, with as many earlier ones as it takes to reach ``min_points``. Drift smears older
+    frames: with odometry that drifts by 3 % the heading came out nearly ten times as well from one frame as from those
+    of the last two metres (seen once on worlds 5103 and 5106, no command prints it).
+
+    Drifts are sigmas of a random walk per square root of a metre driven, with which
+    :class:`coview_stream.localization.tracking.motion.DriftEstimator` begins before it measures them. All are set by
+    hand.
+
+    Attributes:
+        distance: metres driven.
+        seconds: of sensor time.
+        min_distance: metres; no uncertainty makes a registration due before.
+        max_position_sigma: metres by which odometry may have drifted, each of x and y.
+        max_yaw_sigma: radians, likewise.
+        window: metres; no frame older than this is added once there are ``min_points``.
+        min_points: see above.
+        max_points: no frame is added once there are so many.
+        turn: radians turned.
+        position_drift: metres, each of x and y.
+        height_drift: metres.
+        tilt_drift: radians, each of roll and pitch.
+        yaw_drift: radians.
+        turn_drift: radians of yaw per radian turned.
+        drift_prior: metres of driving that these rates count like beside the measured ones.
+        drift_memory: metres over which measured drift is forgotten.
+    """
+
+    distance: float = 1.0
+    seconds: float = 1.0
+    min_distance: float = 0.3
+    max_position_sigma: float = 0.03
+    max_yaw_sigma: float = math.radians(0.2)
+    window: float = 0.01
+    min_points: int = 2500
+    max_points: int = 50_000
+    turn: float = math.radians(10)
+    position_drift: float = 0.015
+    height_drift: float = 0.004
+    tilt_drift: float = math.radians(0.05)
+    yaw_drift: float = math.radians(0.15)
+    turn_drift: float = 0.02
+    drift_prior: float = 6.0
+    drift_memory: float = 40.0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        all_positive(self)
+        counts(self, "min_points", "max_points")
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Smoothing of poses (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
+
+    Attributes:
+        window: newest keyframes with which the graph begins anew. What it drops lives on in the belief that it left
+            behind, so a longer window only lets older registrations be weighed and linearised again in the light of
+            later ones.
+        restart: keyframes at which the graph begins anew.
+        huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
+            once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
+            kernel that lets go altogether would, with an optimistic covariance, lock the map out for good
+            (``tests/localization/tracking/test_pose_graph_robust_kernel.py``).
+    """
+
+    window: int = 40
+    restart: int = 120
+    huber: float = 3.5
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        counts(self, "window", "restart", minimum=2)
+        require(self.restart > self.window, self, "restart", f"greater than window ({self.window})")
+        positive(self, "huber")
 
 
 @dataclass(frozen=True)
 class LocalizerConfig:
-    """Everything that the localizer decides by; the defaults need no change.
+    """Settings of the localizer; the defaults need no change.
 
     Attributes:
-        keyframe: when frames become keyframes.
-        retrieval: which stations a keyframe is compared with.
-        consensus: how keyframes vote.
-        registration: how scans are registered to the map, and its covariance.
-        acceptance: what makes, keeps and loses a fix.
-        tracking: when to register while tracking.
-        graph: how poses are smoothed.
-        learned: how learned features are looked up.
-        reloc: which place recognition names places, see :data:`coview_stream.config.Reloc`; ``auto`` goes without
-            learned features where map or installation lack them.
-        sensor_leans: whether the sensor may lean against odometry's gravity, which is then estimated; no where odometry
-            is made of the sensor's own clouds: what leans is odometry's frame then.
+        keyframe: selection of keyframes.
+        retrieval: comparison of a keyframe with the map's stations.
+        consensus: votes of keyframes.
+        registration: registration of scans to the map, and its covariance.
+        acceptance: limits of a fix.
+        tracking: registrations while tracking.
+        graph: smoothing of poses.
+        learned: look-up of learned features.
+        reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where map
+            or installation lack them.
+        sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry made of the sensor's
+            own clouds, whose frame leans with the sensor.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

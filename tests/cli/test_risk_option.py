@@ -11,7 +11,7 @@ from any_risk import NEVER
 from coview_stream.cli import build_parser, main, serve
 from coview_stream.cli.options import acceptance_config
 from coview_stream.config import AcceptanceConfig
-from coview_stream.config.acceptance import LEAST_RISK
+from coview_stream.config.localizer import LEAST_RISK
 from coview_stream.errors import CoViewError
 from coview_stream.localization import offline
 from coview_stream.localization.evidence.words import LEAST
