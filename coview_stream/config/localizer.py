@@ -22,8 +22,8 @@ class AcceptanceConfig:
     Attributes:
         risk: integrity risk, the probability of a wrong place above which no pose is given.
         max_tilt: radians by which a pose may lean against gravity.
-        max_innovation: squared Mahalanobis distance to odometry's prediction, 6 degrees of freedom, above which the pose
-            is withheld. Exact covariances exceed 22 once in a thousand; ours have heavier tails.
+        max_innovation: squared Mahalanobis distance to odometry's prediction, 6 degrees of freedom, above which the
+            pose is withheld. Exact covariances exceed 22 once in a thousand; ours have heavier tails.
         max_doubt_s: seconds of doubt after which the map is searched again.
         max_blind_s: the same while the sensor is blind: odometry goes on, and nothing contradicts the place.
     """
@@ -323,8 +323,8 @@ class LocalizerConfig:
         tracking: registrations while tracking.
         graph: smoothing of poses.
         learned: look-up of learned features.
-        reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where map
-            or installation lack them.
+        reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where
+            map or installation lack them.
         sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry made of the sensor's
             own clouds, whose frame leans with the sensor.
     """
