@@ -13,7 +13,7 @@ import numpy as np
 from coview_stream.config.node import NodeConfig
 from coview_stream.doctor.capture import CapturedMessage, RobotCapture
 from coview_stream.doctor.finding import Finding
-from coview_stream.doctor.frame_geometry import SeenFrame
+from coview_stream.doctor.frame_checks import SeenFrame
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters

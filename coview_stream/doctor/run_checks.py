@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coview_stream.doctor.finding import Finding, from_error
-from coview_stream.doctor.frame_checks import frame_findings
-from coview_stream.doctor.frame_geometry import SeenFrame
+from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.errors import CloudError, CoViewError
 
 if TYPE_CHECKING:
