@@ -1,32 +1,60 @@
-"""Checks of the machine: Python, processor, memory, and the libraries that do the work."""
+"""Checks of the machine: Python, processor, memory, and the native libraries.
+
+Each library is tried in a process of its own, because one that crashes or hangs must not end the doctor:
+``python -m coview_stream.doctor.machine_checks NAME`` prints one line of JSON.
+"""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import json
 import os
 import platform
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from coview_kernels.runtime import cores
+from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.doctor.finding import Finding
-from coview_stream.doctor.probes import probe
 
 GB = 1e9
 MIN_MEMORY = 0.6 * GB
-"""Bytes, set by hand: a node is three processes of 0.17 GB each before any search, and some to spare."""
+"""Bytes: a node is three processes of 0.17 GB each before any search, and some to spare."""
 
+_TIMEOUT = 120.0  # seconds; compiling all kernels takes 3 to 10 on two cores
 _MIN_ZENOH = (1, 10)
+_CODECS = {
+    "rosbags.typesys": "rosbags",
+    "foxglove_schemas_protobuf.PointCloud_pb2": "foxglove-schemas-protobuf",
+    "google.protobuf": "protobuf",
+}
+"""Modules that decode a robot's messages, and the package of each."""
+
+_PARTS = {
+    "node": (("scipy", "gtsam", "onnxruntime"), "serve, locate, replay"),
+    "build": (("open3d", "laspy", "pyproj"), "build, simulate, demo"),
+    "plot": (("matplotlib",), "pictures"),
+}
+"""Modules of each extra, the first of which tells whether it is installed, and the commands that need it."""
 
 
-def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterator[Finding]:
-    """Judge the machine; takes some seconds: the kernels are compiled."""
+def machine_findings(probed: Callable[[str], dict[str, Any]] | None = None) -> Iterator[Finding]:
+    """Judge the machine; takes some seconds, to compile the kernels.
+
+    ``probed`` tries a library, by default with :func:`probe`.
+    """
+    probed = probed or probe
     yield python_finding(sys.version_info[:3])
     yield processor_finding(_model(), cores(), _quota())
-    total, available = memory()
-    yield memory_finding(total, available)
+    yield memory_finding(*memory())
     yield blas_finding(os.environ.get("OPENBLAS_NUM_THREADS", ""))
     lacking = lacking_modules()
     yield parts_finding(lacking)
@@ -40,32 +68,24 @@ def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterato
         yield matplotlib_finding(probed("matplotlib"))
 
 
-_PARTS = {
-    "node": (("scipy", "gtsam", "onnxruntime"), "serve, locate, replay"),
-    "build": (("open3d", "laspy", "pyproj"), "build, simulate, demo"),
-    "plot": (("matplotlib",), "pictures"),
-}
-"""Modules of each part, of which the first tells whether it is installed, and what the part does."""
-
-
-def lacking_modules(found: Callable[[str], object] = importlib.util.find_spec) -> dict[str, list[str] | None]:
-    """Return, for each part, which of its modules are not there; None where the part is not installed."""
+def lacking_modules(find: Callable[[str], object] = importlib.util.find_spec) -> dict[str, list[str] | None]:
+    """Return the missing modules of each extra; None for an extra that is not installed."""
     return {
-        part: [name for name in names if found(name) is None] if found(names[0]) is not None else None
+        part: [name for name in names if find(name) is None] if find(names[0]) is not None else None
         for part, (names, _) in _PARTS.items()
     }
 
 
 def parts_finding(lacking: dict[str, list[str] | None]) -> Finding:
-    """Judge which parts of the package are installed: a robot's side needs none of them."""
+    """Judge which extras are installed: a robot's side needs none of them."""
     installed = {part: names for part, names in lacking.items() if names is not None}
     text = "; ".join(["client, watch, info, doctor", *(_PARTS[part][1] for part in installed)])
-    broken = [f"{part} lacks {', '.join(names)}" for part, names in installed.items() if names]
+    broken = {part: names for part, names in installed.items() if names}
     if broken:
-        remedy = f"pip install 'coview-stream[{','.join(part for part, names in installed.items() if names)}]'"
-        return Finding("warn", "parts", f"{text}; {'; '.join(broken)}", remedy)
+        reasons = "; ".join(f"{part} lacks {', '.join(names)}" for part, names in broken.items())
+        return Finding("warn", "parts", f"{text}; {reasons}", f"pip install 'coview-stream[{','.join(broken)}]'")
     absent = [part for part in lacking if part not in installed]
-    more = "" if not absent else f" (more: pip install 'coview-stream[{','.join(absent)}]')"
+    more = f" (more: pip install 'coview-stream[{','.join(absent)}]')" if absent else ""
     return Finding("ok", "parts", text + more)
 
 
@@ -78,12 +98,11 @@ def python_finding(version: tuple[int, ...]) -> Finding:
 
 
 def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
-    """Judge ``cores`` that we may run on, ``quota`` of which a container grants at a time (None: all)."""
+    """Judge the ``cores`` we may run on, of which a container grants ``quota`` at a time (None: all)."""
     text = f"{model}, {cores} core{'s' if cores != 1 else ''} to use"
     if quota is not None and quota < cores:
         text += f", {quota:g} of them at a time (container limit)"
-    usable = cores if quota is None else min(cores, quota)
-    if usable < 2:
+    if min(cores, cores if quota is None else quota) < 2:
         return Finding("warn", "processor", text, "poses may come late during a search: give a node 2 or more")
     return Finding("ok", "processor", text)
 
@@ -103,65 +122,65 @@ def blas_finding(threads: str) -> Finding:
     text = f"OPENBLAS_NUM_THREADS={threads}" if threads else "OPENBLAS_NUM_THREADS is not set"
     if threads == "1":
         return Finding("ok", "BLAS threads", text)
-    remedy = "for small matrices threads cost more than they bring: leave it unset for coview-stream, or at 1"
+    remedy = "threads slow small matrices down: leave it unset for coview-stream, or at 1"
     return Finding("warn", "BLAS threads", text, remedy)
 
 
-def kernels_finding(found: dict[str, Any], forced: bool) -> Finding:
+def kernels_finding(result: dict[str, Any], forced: bool) -> Finding:
     """Judge the backend of the kernels; ``forced``: ``COVIEW_KERNELS`` is set."""
-    if "error" in found:
+    if "error" in result:
         remedy = "COVIEW_KERNELS=numpy does without, but is slower; reinstall taichi"
         if forced:
             remedy = "unset COVIEW_KERNELS, or set it to numpy"
-        return Finding("FAIL", "kernels", str(found["error"]), remedy)
-    text = f"{found['backend']}, ready after {found['seconds']:.1f} s"
-    if found["differing"]:
-        text += f"; wrong results from {', '.join(found['differing'])}"
+        return Finding("FAIL", "kernels", str(result["error"]), remedy)
+    text = f"{result['backend']}, ready after {result['seconds']:.1f} s"
+    if result["differing"]:
+        text += f"; wrong results from {', '.join(result['differing'])}"
         return Finding("FAIL", "kernels", text, "set COVIEW_KERNELS=numpy, and report it with this output")
-    text += "; results as from their NumPy twins" if found["backend"] != "numpy" else ""
-    if found["backend"] == "numpy":
+    if result["backend"] == "numpy":
         remedy = "unset COVIEW_KERNELS" if forced else "`pip install taichi` (on aarch64: quadrants)"
         return Finding("warn", "kernels", text, f"slower than need be: {remedy}")
-    return Finding("ok", "kernels", text)
+    return Finding("ok", "kernels", f"{text}; results as from their NumPy twins")
 
 
-def zenoh_finding(found: dict[str, Any]) -> Finding:
+def zenoh_finding(result: dict[str, Any]) -> Finding:
     """Judge zenoh, which all live commands need."""
-    if "error" in found:
-        return Finding("FAIL", "zenoh", str(found["error"]), "`pip install 'eclipse-zenoh>=1.10'`")
-    parts = str(found["version"]).split(".")[:2]
-    if all(p.isdigit() for p in parts) and tuple(map(int, parts)) < _MIN_ZENOH:
-        return Finding("warn", "zenoh", str(found["version"]), "tested with 1.10 and newer: upgrade eclipse-zenoh")
-    return Finding("ok", "zenoh", str(found["version"]))
+    if "error" in result:
+        return Finding("FAIL", "zenoh", str(result["error"]), "`pip install 'eclipse-zenoh>=1.10'`")
+    version = str(result["version"])
+    parts = version.split(".")[:2]
+    if all(part.isdigit() for part in parts) and tuple(map(int, parts)) < _MIN_ZENOH:
+        return Finding("warn", "zenoh", version, "tested with 1.10 and newer: upgrade eclipse-zenoh")
+    return Finding("ok", "zenoh", version)
 
 
-def codecs_finding(found: dict[str, Any]) -> Finding:
-    """Judge what reading ROS 2, Foxglove and keelson messages needs."""
-    missing = [found["error"]] if "error" in found else found["missing"]
+def codecs_finding(result: dict[str, Any]) -> Finding:
+    """Judge the decoders of ROS 2, Foxglove and keelson messages."""
+    missing = [result["error"]] if "error" in result else result["missing"]
     if missing:
         text = f"raw and JSON; ROS 2 CDR or Foxglove cannot be read: {', '.join(missing)}"
         return Finding("warn", "message formats", text, "pip install 'coview-stream[messages]'")
     return Finding("ok", "message formats", "raw, JSON, ROS 2 CDR, Foxglove, keelson")
 
 
-def open3d_finding(found: dict[str, Any]) -> Finding:
-    """Judge Open3D: normals and outliers of maps to be built, and ray casting in simulated worlds."""
-    if "error" in found:
-        text, _, remedy = str(found["error"]).removeprefix("DependencyError: ").partition("; ")
+def open3d_finding(result: dict[str, Any]) -> Finding:
+    """Judge Open3D: normals and outliers of new maps, and ray casting in simulated worlds."""
+    if "error" in result:
+        text, _, remedy = str(result["error"]).removeprefix("DependencyError: ").partition("; ")
         return Finding("warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy)
-    return Finding("ok", "open3d", str(found["version"]))
+    return Finding("ok", "open3d", str(result["version"]))
 
 
-def matplotlib_finding(found: dict[str, Any]) -> Finding:
-    """Judge Matplotlib: pictures only."""
-    if "error" in found:
-        text = f"{found['error']}: no pictures from locate, demo, info and eval"
+def matplotlib_finding(result: dict[str, Any]) -> Finding:
+    """Judge Matplotlib, which only draws pictures."""
+    if "error" in result:
+        text = f"{result['error']}: no pictures from locate, demo, info and eval"
         return Finding("warn", "matplotlib", text, "pip install 'coview-stream[plot]'")
-    return Finding("ok", "matplotlib", str(found["version"]))
+    return Finding("ok", "matplotlib", str(result["version"]))
 
 
 def memory() -> tuple[int | None, int | None]:
-    """Return bytes in total and available, a container's limit included; None where the system does not say."""
+    """Return total and available bytes, within a container's limit; None where the system does not say."""
     fields: dict[str, int] = {}
     for line in _read("/proc/meminfo").splitlines():
         name, _, rest = line.partition(":")
@@ -196,3 +215,124 @@ def _read(path: str) -> str:
         return Path(path).read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
+
+
+def probe(name: str) -> dict[str, Any]:
+    """Run one of :data:`PROBES` in a process of its own; ``{"error": ...}`` if it fails, crashes or hangs."""
+    try:
+        done = subprocess.run(
+            python_command("coview_stream.doctor.machine_checks", name),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            env=python_environment(),
+            timeout=_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return {"error": f"no answer within {_TIMEOUT:g} s"}
+    return read_answer(done.returncode, done.stdout, done.stderr)
+
+
+def read_answer(code: int, out: str, err: str) -> dict[str, Any]:
+    """Return the result that a probe's process printed, or the error that ended it."""
+    try:
+        result = json.loads(out.strip().splitlines()[-1])  # libraries print banners before it
+    except (ValueError, IndexError):
+        result = None
+    if code == 0 and isinstance(result, dict):
+        return result
+    if code < 0:
+        names = {s.value: s.name for s in signal.Signals}
+        return {"error": f"the process was ended by {names.get(-code, f'signal {-code}')}"}
+    last = (err.strip().splitlines() or ["it said nothing"])[-1]
+    return {"error": f"the process ended with code {code}: {last[:200]}"}
+
+
+def _probe_kernels() -> dict[str, Any]:
+    import coview_kernels as kernels
+    from coview_kernels import reference
+
+    begin = time.perf_counter()
+    backend = kernels.backend()
+    kernels.warm_up()
+    seconds = time.perf_counter() - begin
+    return {"backend": backend, "seconds": round(seconds, 2), "differing": differing(kernels, reference)}
+
+
+def differing(native: Any, twin: Any) -> list[str]:
+    """Return the names of the kernels whose results differ from their twins' on a small cloud."""
+    cloud = np.random.default_rng(0).uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
+    T = np.eye(4)
+    T[:3, 3] = 1.0, -2.0, 0.5
+    cases: dict[str, tuple[Any, ...]] = {
+        "transform_unique": (cloud, T, 0.5, 1.0, 20.0),
+        "polar_bin": (cloud, np.zeros(3), 20, 60, 50.0),
+        "describe_points": (cloud, np.zeros(3), 20, 60, 50.0),
+    }
+    return [
+        name for name, args in cases.items() if not _close(getattr(native, name)(*args), getattr(twin, name)(*args))
+    ]
+
+
+def _close(one: Any, other: Any) -> bool:
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(_close(a, b) for a, b in zip(one, other, strict=True))
+    a, b = np.asarray(one), np.asarray(other)
+    # the backends add up in different orders: float32 has 7 digits
+    return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-5, atol=1e-5))
+
+
+def _probe_open3d() -> dict[str, Any]:
+    from coview_stream.clouds.open3d_loader import open3d
+
+    return {"version": str(open3d().__version__)}
+
+
+def _probe_matplotlib() -> dict[str, Any]:
+    import matplotlib as mpl
+    from matplotlib.backends import backend_agg  # the one that draws our pictures
+
+    return {"version": str(mpl.__version__), "backend": backend_agg.__name__}
+
+
+def _probe_zenoh() -> dict[str, Any]:
+    from importlib.metadata import version
+
+    import zenoh
+
+    zenoh.Config()
+    return {"version": version("eclipse-zenoh")}
+
+
+def _probe_codecs() -> dict[str, Any]:
+    missing = []
+    for module, package in _CODECS.items():
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # an incompatible protobuf raises an error of its own
+            missing.append(f"{package} ({type(error).__name__})")
+    return {"missing": missing}
+
+
+PROBES: dict[str, Callable[[], dict[str, Any]]] = {
+    "kernels": _probe_kernels,
+    "open3d": _probe_open3d,
+    "matplotlib": _probe_matplotlib,
+    "zenoh": _probe_zenoh,
+    "codecs": _probe_codecs,
+}
+
+
+def main(name: str) -> None:
+    """Run a probe in this process and print its result."""
+    try:
+        result = PROBES[name]()
+    except Exception as error:
+        result = {"error": " ".join(f"{type(error).__name__}: {error}".split())[:400]}
+    sys.stdout.write(f"\n{json.dumps(result)}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -9,7 +9,7 @@ import sys
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.doctor.probes import probe
+from coview_stream.doctor.machine_checks import probe
 
 MARK = "print('EXECUTED', flush=True)\nopen('executed', 'a').write('x')\n"
 SHADOWED = ("numpy.py", "json.py", "zenoh.py", "coview_kernels.py", "logging.py")

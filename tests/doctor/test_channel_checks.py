@@ -7,7 +7,7 @@ import pytest
 from captured_robot import KEYS, SWEEP, capture, cloud, ns, odometry, steps, usual
 from scipy.spatial.transform import Rotation
 
-from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
+from coview_stream.doctor.robot_checks import cloud_findings, odometry_findings
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.messages.types import Sample
 

@@ -7,7 +7,7 @@ import pytest
 from captured_robot import SWEEP, capture, cloud, ns, odometry, steps, usual
 
 from coview_stream import __version__
-from coview_stream.doctor.cross_checks import cross_findings, node_finding
+from coview_stream.doctor.robot_checks import cross_findings, node_finding
 from coview_stream.geometry.transforms import pose_from
 
 SHA = "ab" * 32

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.doctor.discovery import Candidate, candidates_text, discover, from_key, from_token
+from coview_stream.doctor.network_checks import Candidate, candidates_text, discover, from_key, from_token
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport

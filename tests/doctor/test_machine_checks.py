@@ -11,7 +11,6 @@ import pytest
 import coview_kernels as kernels
 from coview_kernels import reference
 from coview_stream.doctor import machine_checks as machine
-from coview_stream.doctor import probes
 from coview_stream.doctor.finding import Finding, failed, from_error
 from coview_stream.doctor.map_checks import map_findings, node_memory, open_map
 from coview_stream.errors import MapError
@@ -73,7 +72,7 @@ def test_available_memory_is_read():
 
 @pytest.mark.slow
 def test_kernel_probe_runs_in_a_process():
-    found = probes.probe("kernels")
+    found = machine.probe("kernels")
     assert found["differing"] == []
     assert found["backend"] in ("taichi", "quadrants", "numpy")
     assert found["seconds"] >= 0
@@ -85,9 +84,9 @@ def test_wrong_kernel_result_is_named():
         return tuple(np.asarray(part) // 2 for part in grid), dropped
 
     wrong = SimpleNamespace(**{name: getattr(reference, name) for name in kernels.__all__ if hasattr(reference, name)})
-    assert probes.differing(wrong, reference) == []
+    assert machine.differing(wrong, reference) == []
     wrong.polar_bin = half
-    assert probes.differing(wrong, reference) == ["polar_bin"]
+    assert machine.differing(wrong, reference) == ["polar_bin"]
 
 
 @pytest.mark.parametrize(
@@ -99,17 +98,17 @@ def test_wrong_kernel_result_is_named():
     ],
 )
 def test_failing_probe_process_is_reported(code, out, err, part):
-    assert part in probes._answer(code, out, err)["error"]
+    assert part in machine.read_answer(code, out, err)["error"]
 
 
 def test_probe_output_skips_library_banners():
-    assert probes._answer(0, 'hello\n{"a": 1}\n', "") == {"a": 1}
+    assert machine.read_answer(0, 'hello\n{"a": 1}\n', "") == {"a": 1}
 
 
 def test_probe_exception_is_reported(monkeypatch, capsys):
-    monkeypatch.setitem(probes.PROBES, "open3d", lambda: Path("/no/such/file").stat())
-    probes.main("open3d")
-    assert "FileNotFoundError" in probes._answer(0, capsys.readouterr().out, "")["error"]
+    monkeypatch.setitem(machine.PROBES, "open3d", lambda: Path("/no/such/file").stat())
+    machine.main("open3d")
+    assert "FileNotFoundError" in machine.read_answer(0, capsys.readouterr().out, "")["error"]
 
 
 def test_finding_lines_are_formatted():
