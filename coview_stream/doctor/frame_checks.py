@@ -185,20 +185,19 @@ def _ground(frames: Sequence[SeenFrame]) -> _Ground | None:
     by_axis = []
     for axis in _AXES:
         R = _turning(axis, _UP)
-        planes = [(ground_plane(frame.points @ R.T), frame) for frame in chosen]
-        normals = [(plane, R.T @ plane.up, frame) for plane, frame in planes if not isinstance(plane, str)]
-        by_axis.append(normals)
+        tried = [(ground_plane(frame.points @ R.T), frame) for frame in chosen]
+        by_axis.append([(plane, R.T @ plane.up, frame) for plane, frame in tried if not isinstance(plane, str)])
     shares = [sum(plane.share for plane, _, _ in normals) for normals in by_axis]
-    axis = int(np.argmax(shares))
-    if 2 * len(by_axis[axis]) < len(chosen):
+    best = int(np.argmax(shares))
+    if 2 * len(by_axis[best]) < len(chosen):
         return None
-    planes = by_axis[axis]
+    planes = by_axis[best]
     ups = np.array([up for _, up, _ in planes])
     level = np.array([_levelling(frame.T_odom_body) @ up for _, up, frame in planes])
     odom = np.array([frame.T_odom_body[:3, :3] @ up for _, up, frame in planes])
     sway = min(_middle(level)[1], _middle(odom)[1])
     height = float(np.median([plane.height for plane, _, _ in planes]))
-    return _Ground(axis, _middle(ups)[0], _middle(level)[0], sway, height)
+    return _Ground(best, _middle(ups)[0], _middle(level)[0], sway, height)
 
 
 def _middle(directions: Floats) -> tuple[Floats, float]:

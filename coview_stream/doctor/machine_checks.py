@@ -285,7 +285,7 @@ def _close(one: Any, other: Any) -> bool:
 
 
 def _probe_open3d() -> dict[str, Any]:
-    from coview_stream.clouds.open3d_loader import open3d
+    from coview_stream.clouds.filters import open3d
 
     return {"version": str(open3d().__version__)}
 
