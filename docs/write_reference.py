@@ -1,8 +1,8 @@
-"""Write docs/options.md and docs/api.md: options and configuration as the code has them, and the public names.
+"""Write the pages that come from the code: docs/options.md, and the table of public names in docs/python.md.
 
     python docs/write_reference.py
 
-A test holds both pages to the code.
+A test compares both with the code.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import dataclasses
 import enum
 import inspect
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,10 +22,11 @@ from coview_stream.cli import PROGRAM, build_parser
 
 HERE = Path(__file__).resolve().parent
 _FIELD = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
+_NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
 def cell(text: str) -> str:
-    """Return a text that stays in its cell of a table; ``<`` would begin HTML."""
+    """Return a text for a cell of a Markdown table, where ``<`` would begin HTML."""
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
 
 
@@ -33,8 +35,13 @@ def code(text: str) -> str:
     return f"`{text}`".replace("|", "\\|") if text else ""
 
 
-def options_of(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield a row for each argument of a command: how it is written, and its help."""
+def role_free(text: str) -> str:
+    """Return a docstring's text with roles and double backticks as plain code."""
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
+
+
+def options_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str, str]]:
+    """Yield for each argument of a command: its name, how it is written, its help."""
     formatter = argparse.HelpFormatter(parser.prog, width=1000)
     for action in parser._actions:
         if action.help == argparse.SUPPRESS or isinstance(action, argparse._HelpAction):
@@ -46,20 +53,30 @@ def options_of(parser: argparse.ArgumentParser) -> Iterator[str]:
             value = " ".join(value) if isinstance(value, tuple) else str(value)
         more = " ..." if action.nargs in ("+", "*") else ""
         text = formatter._expand_help(action) if action.help else ""
-        yield f"| {code(f'{name} {value}{more}'.strip())} | {cell(text)} |"
+        yield name.rpartition(" ")[2] or value, code(f"{name} {value}{more}".strip()), cell(text)
 
 
 def commands() -> Iterator[str]:
-    """Yield a section for each command."""
+    """Yield a section for each command, and one for the options that several commands share."""
     found = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    users: dict[tuple[str, str, str], list[str]] = {}
     for name, parser in found.choices.items():
-        yield f"## {PROGRAM} {name}\n\n{cell(parser.description or '')}\n\n| | |\n|---|---|\n" + "\n".join(
-            options_of(parser)
-        )
+        for option in options_of(parser):
+            users.setdefault(option, []).append(name)
+    common = {option for option, by in users.items() if len(by) > 1 and option[2] != "likewise"}
+    for name, parser in found.choices.items():
+        rows = [option for option, by in users.items() if name in by]
+        own = [f"| {written} | {text} |" for option, written, text in rows if (option, written, text) not in common]
+        shared = [code(option[0]) for option in rows if option in common]
+        table = "\n\n| | |\n|---|---|\n" + "\n".join(own) if own else ""
+        also = "\n\n" + textwrap.fill(f"[Shared](#shared-options): {', '.join(shared)}", 118) if shared else ""
+        yield f"## {PROGRAM} {name}\n\n{cell(parser.description or '')}{table}{also}"
+    table = [f"| {option[1]} | {option[2]} | {', '.join(by)} |" for option, by in users.items() if option in common]
+    yield "## Shared options\n\n| | | commands |\n|---|---|---|\n" + "\n".join(table)
 
 
 def documented_fields(kind: type) -> dict[str, str]:
-    """Return what the docstring of a configuration says about each of its fields."""
+    """Return the text of each field in the docstring of a configuration."""
     _, _, attributes = inspect.getdoc(kind).partition("\nAttributes:\n")
     attributes = re.split(r"^\S", attributes, maxsplit=1, flags=re.MULTILINE)[0]
     return {name: " ".join(text.split()) for name, text in _FIELD.findall(attributes)}
@@ -94,45 +111,38 @@ def settings() -> Iterator[str]:
         yield f"### {name}\n\n{first}\n\n| field | default | |\n|---|---|---|\n" + "\n".join(rows)
 
 
-def role_free(text: str) -> str:
-    """Return a docstring's text with roles and double backticks as plain code."""
-    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
-
-
 def options_page() -> str:
     """Return docs/options.md."""
     return "\n\n".join([
         "# Options",
-        "Every option of every command and every field of the configuration, as the code has them.\n"
+        "Every option of every command and every field of the configuration.\n"
         "Written by `python docs/write_reference.py`; do not edit.",
         *commands(),
         "## Configuration in Python",
-        "Frozen dataclasses of `coview_stream.config`; a value out of its range raises `ConfigError`,\n"
-                "which names the field. "
-        "Lengths in metres, angles in radians.",
+        "Frozen dataclasses of `coview_stream.config`. A value out of its range raises `ConfigError`,\n"
+        "which names the field. Lengths in metres, angles in radians.",
         *settings(),
     ]) + "\n"  # fmt: skip
 
 
-def api_page() -> str:
-    """Return docs/api.md: a directive of mkdocstrings for each public name."""
-    parts = [
-        "# Python",
-        "The names of `coview_stream` and what their docstrings say, on the site ([CONTRIBUTING](../CONTRIBUTING.md)\n"
-        "says how it is made); `help(coview_stream.Localizer)` says the same.\n"
-        "Written by `python docs/write_reference.py`; do not edit.",
-        "Poses are 4x4 float64 named `T_target_source`; clouds (N, 3), metres.",
-    ]
-    names = [name for name in coview_stream.__all__ if not name.startswith("_")]
-    parts += [f"::: coview_stream.{name}" for name in names]
-    parts += ["## Runs and clouds", "::: coview_stream.recordings.open_run", "::: coview_stream.clouds.read_cloud"]
-    return "\n\n".join(parts) + "\n"
+def names_table() -> str:
+    """Return the public names of ``coview_stream`` with the first sentence of each docstring."""
+    names = sorted((name for name in coview_stream.__all__ if not name.startswith("_")), key=str.casefold)
+    sentences = [inspect.getdoc(getattr(coview_stream, name)).split("\n\n")[0] for name in names]
+    rows = [f"| `{name}` | {role_free(cell(text))} |" for name, text in zip(names, sentences, strict=True)]
+    return "| | |\n|---|---|\n" + "\n".join(rows) + "\n"
+
+
+def python_page(text: str) -> str:
+    """Return docs/python.md with its table of names as the code has them."""
+    return _NAMES.sub(lambda _: names_table(), text)
 
 
 def main() -> None:
     """Write both pages."""
     (HERE / "options.md").write_text(options_page(), encoding="utf-8")
-    (HERE / "api.md").write_text(api_page(), encoding="utf-8")
+    page = HERE / "python.md"
+    page.write_text(python_page(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

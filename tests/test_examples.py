@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import runpy
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from nightly import nightly
 
 from coview_stream import BaseMap
-from coview_stream.cli import COMMANDS, build_parser
 from coview_stream.clouds import read_tum
 from coview_stream.messages import decode_cloud, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
@@ -198,19 +196,3 @@ def test_readme_python_runs(world, monkeypatch, capsys):
     monkeypatch.chdir(world.parents[1])
     exec(compile(block("python"), "README.md", "exec"), {})
     assert len(capsys.readouterr().out.splitlines()) > 10  # a line per frame that got a pose
-
-
-def test_readme_commands_parse():
-    lines = [line.split("#")[0] for name in ("command 1", "live", "commands") for line in block(name).splitlines()]
-    calls = [line.split("coview-stream ")[1] for line in lines if "coview-stream " in line]
-    assert len(calls) == 12
-    for call in calls:
-        build_parser().parse_args(shlex.split(call))
-
-
-def test_readme_lists_every_command():
-    present = {name for name in COMMANDS if name in build_parser().format_help()}
-    rows = re.findall(r"^\| not yet \| ((?:`\w+`(?:, )?)+)", README, re.MULTILINE)
-    denied = set(re.findall(r"\w+", " ".join(rows)))
-    assert denied == set()
-    assert present == set(COMMANDS) - denied

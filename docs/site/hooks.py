@@ -1,4 +1,4 @@
-"""Hooks of the site: pages that the navigation does not name, links that leave docs/, roles of docstrings."""
+"""Hooks of the site: unnamed pages, links that leave docs/, the Python reference, roles of docstrings."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ DOCS = Path(__file__).resolve().parents[1]
 _OUTSIDE = re.compile(r"\[([^\]]*)\]\((\.\./[^)]*)\)")
 _COMMENT = re.compile(r"^(<!--.*-->)\n(?=\S)", re.MULTILINE)
 _ITEM = re.compile(r"^(?![*\-|>#\s]|\d+\. |```)(.+)\n(?=[*-] \S)", re.MULTILINE)
+_NAMES = re.compile(r"<!-- names -->\n.*?<!-- end -->", re.DOTALL)
+_NAME = re.compile(r"^\| `(\w+)` ", re.MULTILINE)
 _ROLE = re.compile(r":\w+:(<code>)~?\.?(?:coview_\w+\.(?:\w+\.)*)?")
 
 
@@ -30,9 +32,17 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Show a link out of docs/ as its text and path, and put blank lines where Python-Markdown needs them."""
+    """Replace the table of public names by their docstrings, and make the text fit for Python-Markdown.
+
+    A link out of docs/ becomes its text and path; lists and comments get the blank lines that they need.
+    """
+    markdown = _NAMES.sub(_reference, markdown)
     parts = re.split(r"(^```.*?^```$)", markdown, flags=re.MULTILINE | re.DOTALL)
     return "".join(part if part.startswith("```") else _prose(part) for part in parts)
+
+
+def _reference(table: re.Match[str]) -> str:
+    return "\n\n".join(f"::: coview_stream.{name}" for name in _NAME.findall(table[0]))
 
 
 def _prose(text: str) -> str:
