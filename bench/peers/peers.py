@@ -1,7 +1,7 @@
 """Other libraries on the same queries, on this machine.
 
 The queries are those of a robot that was switched on eight metres ago; ``bench/peers/libraries.py`` says how each peer
-is set, docs/performance.md what the columns mean. A trial ends after ``--limit`` seconds, so that a slow peer answers
+is set, docs/results.md what the columns mean. A trial ends after ``--limit`` seconds, so that a slow peer answers
 the first queries only; both sides' shares are of those. Extra ``peers``; one that is missing gets a line that says so.
 """
 

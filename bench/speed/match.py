@@ -3,7 +3,7 @@
 Scores are those of both channels together. The baselines are exact and have everything made beforehand that depends on
 the map; the ratio is against the faster of the two in the same run, one query at a time. Stations and keyframes are
 those of a simulated town. What the codes leave out and what that costs the search: ``python -m bench scale``. See
-docs/performance.md.
+docs/results.md.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ _CELL = 1.0  # metres: the area that a map covers is counted in such squares
 _SAMPLED = 100_000  # points, where a sample will do; set by hand
 _STRAY = 0.1  # per cent of the points at either end of the heights that may be birds or pits
 
-# Limits of the warnings, set by hand; they decide nothing. docs/accuracy.md has the table of densities.
+# Limits of the warnings, set by hand; they decide nothing. docs/results.md has the table of densities.
 _THIN = 8.0  # points per m2: from 8 on real runs were found at once or as late as on the whole survey
 _LOW = 1.0  # metres: nothing that stands is lower
 _BARE = 0.02  # share of the squares on which something has to stand

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
 
-_MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/streaming.md promises two
+_MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/operate.md promises two
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_risk(parser)
     add_verify_key(parser)
     add_state(parser)
-    operation = parser.add_argument_group("operation (docs/operations.md)")
+    operation = parser.add_argument_group("operation (docs/operate.md)")
     operation.add_argument(
         "--node",
         metavar="NAME",

@@ -168,7 +168,7 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
             yield explanation
             return
     if ground is None:
-        remedy = "is z up, are points in metres, and are those on the ground sent too? docs/troubleshooting.md"
+        remedy = "is z up, are points in metres, and are those on the ground sent too? docs/reasons.md"
         yield Finding("warn", "ground", "none is seen below the sensor", remedy, robot)
         return
     yield _ground_finding(ground, robot)
@@ -405,5 +405,5 @@ def _motion_finding(fit: _Fit | None, robot: str | None) -> Finding:
         return Finding("ok", "motion", found, robot=robot)
     if fit.spread < _YAW_SPREAD and abs(fit.yaw) < _YAW:
         return Finding("FAIL", "motion", found, "are both in metres? is odometry's scale right?", robot)
-    remedy = "is it T_odom_body of the body the clouds are in, at their stamps? docs/troubleshooting.md"
+    remedy = "is it T_odom_body of the body the clouds are in, at their stamps? docs/reasons.md"
     return Finding("FAIL", "motion", found, remedy, robot)

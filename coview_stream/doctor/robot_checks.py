@@ -96,7 +96,7 @@ def _unreadable(
     elif first.counter == "unknown_encoding":
         remedy = f"send one of {', '.join(codecs)}, and name it in the Encoding"
     else:
-        remedy = "compare the sender with docs/streaming.md, 'Byte layout'"
+        remedy = "compare the sender with docs/wire.md, 'Byte layout'"
     return Finding("FAIL" if len(unreadable) == total else "warn", what, found, remedy, robot)
 
 
@@ -350,7 +350,7 @@ def _not_found(reason: str) -> str:
         return "its data does not come: see clouds and odometry above"
     if "two places" in reason or "several places" in reason or "leads" in reason:
         return "drive on, past what tells these places apart; `info --ambiguity` shows where that takes long"
-    return "drive ten metres; if all else here is ok: is it on this map? docs/troubleshooting.md"
+    return "drive ten metres; if all else here is ok: is it on this map? docs/reasons.md"
 
 
 def _text(status: dict[str, Any], name: str) -> str:

@@ -106,6 +106,6 @@ def place_finding(run: Run, base_map: BaseMap) -> Finding:
     found = f"none on this map after {driven:.0f} m: {reason or 'too little has been seen'}"
     remedy = (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres, "
-        "and has the site not changed? docs/troubleshooting.md"
+        "and has the site not changed? docs/reasons.md"
     )
     return Finding("warn", "place", found, remedy)

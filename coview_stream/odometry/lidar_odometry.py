@@ -46,7 +46,7 @@ class LidarOdometry:
     The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
     then, level. It drifts, but not in tilt where there are walls
     (:mod:`~coview_stream.odometry.tilt_filter`). The motion between two frames is predicted from the
-    one before, over the time between their stamps, and deskews the frame as well. ``docs/odometry.md`` has the costs;
+    one before, over the time between their stamps, and deskews the frame as well. ``docs/results.md`` has the costs;
     kiss-icp holds the interpreter lock.
 
     Attributes:

@@ -237,7 +237,7 @@ def test_the_wrong_half_of_a_pair_is_told(keys):
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl")
 def test_keys_of_openssl_are_read(tmp_path):
-    """As docs/operations.md says."""
+    """As docs/operate.md says."""
     private, public = tmp_path / "site.key", tmp_path / "site.pub"
     subprocess.run(["openssl", "genpkey", "-algorithm", "ed25519", "-out", private], check=True)
     subprocess.run(["openssl", "pkey", "-in", private, "-pubout", "-out", public], check=True)

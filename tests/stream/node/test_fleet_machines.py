@@ -22,10 +22,10 @@ from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.stream.client.client import RobotClient
 
 PORT = 7461
-MAX_GAP = 3.0  # seconds that docs/scale.md promises
+MAX_GAP = 3.0  # seconds that docs/large.md promises
 FALSE = 1.0  # metres
 TRANSPORT = {"link": {"tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 1_500_000}}}}}}
-"""As docs/scale.md has it: or a machine that is silent holds all others up for five seconds."""
+"""As docs/large.md has it: or a machine that is silent holds all others up for five seconds."""
 
 ROBOTS = ("r1", "r2", "r3", "r4")
 
