@@ -48,6 +48,7 @@ INNER = {
         "station_index",
         "likelihood_field",
         "sources",
+        "map_arrays",
         "build",
         "map_parts",
         "summary",

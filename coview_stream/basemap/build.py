@@ -8,26 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy import ndimage
 
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.ground import ground_filter
-from coview_stream.basemap.likelihood_field import field_arrays
+from coview_stream.basemap.map_arrays import MemoryArrays, MemoryTile, map_arrays
 from coview_stream.basemap.sources import Source
-from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, below_another, describe_storeys, find_stations
-from coview_stream.basemap.tiles import scaled_normals, sort_by_tile, unit_normals
+from coview_stream.basemap.tiles import scaled_normals, sort_by_tile
 from coview_stream.clouds.cloud import Cloud, merge
 from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
-from coview_stream.geometry.arrays import Floats, Ints
-from coview_stream.geometry.transforms import Points
 
 _MIN_POINTS = 1000  # set by hand
-_SURVEY_MARGIN = 1  # cells; set by hand
 
 
 def build_arrays(sources: list[Source], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
@@ -92,20 +86,15 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
         with _progress_bar(progress, "learned features") as step:
             learned = feature_arrays(points, step)
     sorted_points, packed, index = sort_by_tile(points, scaled_normals(normals, planarity), config.tile)
-    surveyed, surveyed_corner = surveyed_cells(points, config.block)
     with _progress_bar(progress, "likelihood field") as step:
-        field = field_arrays(sorted_points, unit_normals(packed), surveyed > 0, surveyed_corner, config.block)
+        made, _ = map_arrays(MemoryTile(config, sorted_points, packed, stations, described), MemoryArrays())
         step(1, 1)
     arrays: Arrays = {
         "origin": origin + shift,
-        "stations": stations,
         "points": sorted_points,
         "normals": packed,
         "tile_index": index,
-        "surveyed": surveyed,
-        "surveyed_corner": surveyed_corner,
-        **StationIndex.of(described).arrays(),
-        **field,
+        **made,
         **learned[0],
     }
     parameters = {
@@ -123,36 +112,6 @@ def _read(source: Source, done: int, total: int, step: Progress) -> Cloud:
     cloud = source.read()
     step(done + 1, total)
     return cloud
-
-
-def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
-    """Mask block-sized cells (H, W) that hold points or neighbour on cells that do; also the lower left corner (2,).
-
-    The neighbours bridge the shadows of buildings, which have no points but were surveyed.
-    """
-    return surveyed_around(cells_of(points, block), block)
-
-
-def cells_of(points: Points, block: float) -> Ints:
-    """Return column and row (K, 2) of the block-sized cells that hold points (N, 3), each once."""
-    cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
-    if not len(cells):
-        return cells
-    low = cells.min(axis=0)
-    columns, rows = (cells - low).T
-    grid = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1), dtype=bool)
-    grid[rows, columns] = True
-    return np.asarray(np.argwhere(grid)[:, ::-1] + low)
-
-
-def surveyed_around(cells: Ints, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
-    """Return the mask of :func:`surveyed_cells` of cells (K, 2) that hold points."""
-    low = cells.min(axis=0) - _SURVEY_MARGIN
-    columns, rows = (cells - low).T
-    grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)
-    grid[rows, columns] = True
-    square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
-    return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block
 
 
 def _names(paths: list[Path]) -> str:

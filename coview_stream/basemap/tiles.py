@@ -10,6 +10,9 @@ import numpy.typing as npt
 from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
+Key = tuple[int, int]
+"""Column and row of a tile."""
+
 _NORMAL_SCALE = 127.0
 _SHORTEST = 0.0625  # length of a kept normal: a shorter one would lose its direction, which would be off by 7 degrees
 

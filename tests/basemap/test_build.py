@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.build import surveyed_cells
 from coview_stream.basemap.ground import cloth_available
+from coview_stream.basemap.map_arrays import cells_of, surveyed_around
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import CloudError, ConfigError, CoViewError, MapError
@@ -143,7 +143,7 @@ def test_crop_and_surveyed_cells(whole):
 
 
 def test_surveyed_cells_reach_one_cell_beyond_the_points():
-    grid, corner = surveyed_cells(np.array([[1.0, 1.0, 0], [1.0, 9.0, 5]], np.float32), 2.0)
+    grid, corner = surveyed_around(cells_of(np.array([[1.0, 1.0, 0], [1.0, 9.0, 5]], np.float32), 2.0), 2.0)
     np.testing.assert_array_equal(corner, [-2.0, -2.0])
     # row along y: cells of y = 1 and y = 9 with a neighbour on each side; between them nothing
     assert grid.shape == (7, 3)

@@ -1,38 +1,44 @@
-"""Assembly of a site: the arrays of a map, out of the layers of some or all of its tiles.
+"""Arrays of a map from the layers of a site's tiles.
 
-What layers do not hold is made here: the likelihood field, the codes of the stations' descriptors, what has been
-surveyed. Tiles are worked on one after the other, each with the points around it, also those of tiles that are not
-asked for but there. What is made is written to files as it is made, so that memory is bounded by a tile, not by the
-map.
+A tile is worked on with the points around it, also those of neighbours that are in the store but were not asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from pathlib import Path
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from coview_kernels import StationCodes
-from coview_stream.basemap.build import surveyed_around
 from coview_stream.basemap.file_format import Arrays
-from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, LAYERS, field_arrays, layers_arrays
+from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, layers_arrays
+from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, map_arrays
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.assemble_codes import station_codes
-from coview_stream.basemap.site.earlier import PARAMETER, Earlier, record, states_of
-from coview_stream.basemap.site.manifest import Key, Manifest, SiteGrid, TileEntry
+from coview_stream.basemap.site.layers import decode, read_cloud_layer, read_stations_layer
+from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEntry
 from coview_stream.basemap.site.store import TileStore
-from coview_stream.basemap.site.tile_clouds import TileClouds, layer_of
-from coview_stream.basemap.tiles import unit_normals
+from coview_stream.basemap.stations import Described, describe_storeys
+from coview_stream.basemap.tiles import Key, sort_by_tile_packed, unit_normals
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError
-from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
+from coview_stream.geometry.transforms import Points
+
+log = logging.getLogger("coview_stream.maps")
 
 Progress = Callable[[int, int], None]
 
-_FIELD_MARGIN = 16.0  # metres around a tile that its field sees, one tile of the field
-_IN_PARTS = "too large to be searched as one; open a part of the site, --around X,Y,RADIUS"
+VERSION = 3
+"""Version of the arrays that are made of the same layers."""
+
+PARAMETER = "made_tiles"
+"""Parameter of a working file: for each tile its state, first station, stations, first row of the field, rows."""
+
+_FIELD_MARGIN = 16.0  # metres around a tile that its field depends on: one tile of the field
+_PORTION = 8192  # stations described at a time: 60 MB of descriptors
 _LEARNED = ("local", "sigma", "tiles", "place", "place_at")
 
 
@@ -42,23 +48,22 @@ def assemble(
     into: ArrayFiles,
     progress: Progress | None = None,
     keys: Collection[Key] | None = None,
-    earlier: Path | None = None,
+    earlier: Callable[[Mapping[Key, str]], EarlierMap] | None = None,
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the arrays of a map, and its parameters.
 
     Args:
         manifest: of the site.
-        store: its layers.
-        into: where they are made; they stay usable after it is closed.
+        store: holds the layers.
+        into: holds the arrays; they stay usable after it is closed.
         progress: called with steps done and all steps.
-        keys: the tiles to take; None takes all.
-        earlier: a working file of the site, from which tiles that are the same are taken.
+        keys: tiles of the map; None takes all.
+        earlier: opens an earlier map, given the states of the tiles (:meth:`SiteTiles.states`).
 
     Raises:
-        MapError: a layer is missing or damaged, no station is on these tiles, or there is no room.
+        MapError: a layer is missing or damaged, there are no stations on these tiles or too many, or there is no room.
     """
     entries = [tile for tile in manifest.tiles if keys is None or (tile.column, tile.row) in keys]
-    grid = SiteGrid(manifest.origin, manifest.tile, config_of_map(manifest.parameters["config"]))
     steps, done = 3 * len(entries), 0
 
     def step() -> None:
@@ -67,41 +72,32 @@ def assemble(
         if progress:
             progress(done, steps)
 
-    stations = sum(entry.stations for entry in entries)
-    if not stations:
+    if not sum(entry.stations for entry in entries):
         raise MapError("the site has no stations there; build it again, or ask for other tiles")
-    if stations > StationCodes.MAX_STATIONS:
-        raise MapError(f"{stations} stations, {StationCodes.MAX_STATIONS} at most: {_IN_PARTS}")
-    clouds = TileClouds(manifest, grid, store, entries, into, step)
-    states = states_of(manifest, clouds)
-    taken = Earlier(states, earlier, grid.config.descriptor.channels)
-    surveyed, corner = surveyed_around(clouds.cells(beside=False), grid.config.block)
-    rows = _field(clouds, taken, into, step)
-    small = station_codes(clouds, taken, into, step)
-    arrays: Arrays = {
-        "origin": np.array(manifest.origin, dtype=np.float64),
-        "stations": np.concatenate(list(clouds.stations.values())),
-        "tile_index": clouds.index(),
-        "surveyed": surveyed,
-        "surveyed_corner": corner,
-        **into.arrays(),
-        **small,
-    }
-    arrays |= {name: arrays[name][: clouds.points] for name in ("points", "normals")}  # without those around
-    features = manifest.parameters.get("learned") is not None and all("features" in t.layers for t in entries)
-    if features:
+    tiles = SiteTiles(manifest, store, entries, into, step)
+    states = tiles.states(manifest)
+    arrays, rows = map_arrays(tiles, into, None if earlier is None else earlier(states), step)
+    arrays |= {"origin": np.array(manifest.origin, dtype=np.float64), "tile_index": tiles.index()}
+    arrays |= {name: arrays[name][: tiles.points] for name in ("points", "normals")}  # without the neighbours' points
+    learned = manifest.parameters.get("learned")
+    if learned is None or not all("features" in entry.layers for entry in entries):
+        learned = None
+    else:
         arrays |= _features(entries, store)
-    parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256}
+    parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256, "learned": learned}
     if keys is not None and isinstance(read := parameters.get("source_points"), int):
-        share = clouds.points / sum(tile.points for tile in manifest.tiles)
-        parameters["source_points"] = round(share * read)  # about: how many lay on each tile is not kept
-    counts = {key: len(each) for key, each in clouds.stations.items()}
-    parameters[PARAMETER] = record(states, counts, rows)
-    return arrays, parameters | {"learned": manifest.parameters["learned"] if features else None}
+        # an estimate: the source points of single tiles are not known
+        parameters["source_points"] = round(read * tiles.points / sum(tile.points for tile in manifest.tiles))
+    table: list[list[Any]] = []
+    first = row = 0
+    for key, stations in tiles.stations.items():
+        table.append([states[key], first, len(stations), row, rows[key]])
+        first, row = first + len(stations), row + rows[key]
+    return arrays, parameters | {PARAMETER: table}
 
 
-def layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
-    """Return the rasters in which the field of these arrays is looked up, made in files.
+def field_layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
+    """Return the rasters in which the field of a map is looked up, made in files.
 
     Raises:
         MapError: the map is too large for them, or there is no room.
@@ -109,50 +105,157 @@ def layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
     try:
         made = layers_arrays(arrays, into.zeros, into.release)
     except ValueError as error:
-        raise MapError(f"{error}: {_IN_PARTS}") from error
-    kept = into.arrays()
-    return {name: kept.get(name.removeprefix(LAYERS), values) for name, values in made.items()}
+        raise MapError(f"{error}: {TOO_LARGE}") from error
+    files = into.arrays()
+    return {name: files.get(name.removeprefix(LAYERS), values) for name, values in made.items()}
 
 
-def _field(clouds: TileClouds, earlier: Earlier, into: ArrayFiles, step: Callable[[], None]) -> dict[Key, int]:
-    """Make the likelihood field tile by tile, and return how many of its rows are each tile's."""
-    surveyed, corner = surveyed_around(clouds.cells(beside=True), clouds.grid.config.block)
-    counts = {}
-    for key in clouds.stations:
-        made = earlier.field(key) or _field_of_tile(clouds, key, surveyed > 0, corner)
-        for name, rows in made.items():
-            into.append(name, rows)
-        counts[key] = len(made[FIELD_ARRAYS[0]]) if made else 0
-        earlier.release()
-        step()
-    return counts
+class SiteTiles:
+    """Tiles of a site for :func:`~coview_stream.basemap.map_arrays.map_arrays`; their clouds lie in files.
+
+    Attributes:
+        config: settings of the map.
+        stations: (M, 3) stations of each tile, relative to the origin.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        store: TileStore,
+        entries: Sequence[TileEntry],
+        into: ArrayFiles,
+        step: Callable[[], None],
+    ) -> None:
+        """Decode the tiles, and the clouds of neighbours that are in the store.
+
+        Raises:
+            MapError: a layer is missing or damaged, or does not match the manifest.
+        """
+        self.config = config_of_map(manifest.parameters["config"])
+        self.stations: dict[Key, Floats32] = {}
+        self._grid = SiteGrid(manifest.origin, manifest.tile, self.config)
+        self._entries, self._files = entries, into
+        self._clouds: dict[Key, str] = {}  # hash
+        self._spans: dict[Key, tuple[int, int]] = {}
+        self._cells: dict[Key, Ints] = {}
+        self._index: list[Ints] = []
+        for entry in entries:
+            self._add(entry, *self._read(entry, store))
+            stations = read_stations_layer(layer_of(entry, "stations", store), self.config.block)
+            if len(stations) != entry.stations:
+                raise MapError(f"tile {entry.column}, {entry.row}: its stations are not those that the manifest counts")
+            self.stations[entry.column, entry.row] = stations
+            step()
+        neighbours = {key for own in self._spans for key in self._grid.around(own)} - self._spans.keys()
+        for entry in manifest.tiles:
+            cloud = entry.layers["cloud"]
+            if (entry.column, entry.row) in neighbours and store.holds(cloud.sha256, cloud.bytes):
+                try:
+                    self._add(entry, *self._read(entry, store))
+                except MapError as error:
+                    log.warning("%s; the tiles beside it are made without it", error)
+
+    @property
+    def points(self) -> int:
+        """Number of points, without those of neighbours."""
+        return sum(end - begin for begin, end in (self._spans[key] for key in self.stations))
+
+    def cells(self, beside: bool) -> Ints:
+        """Return column and row (K, 2) of the blocks that hold points; ``beside``: also those of neighbours."""
+        return np.concatenate([self._cells[key] for key in (self._cells if beside else self.stations)])
+
+    def index(self) -> Ints:
+        """Return the tile index (T, 4) of the map's cloud."""
+        return np.concatenate(self._index[: len(self.stations)])
+
+    def states(self, manifest: Manifest) -> dict[Key, str]:
+        """Return a hash of the settings, the stations of each tile, and the clouds on it and around it."""
+        settings = [VERSION, manifest.origin, manifest.tile, repr(self.config)]
+        states = {}
+        for entry in self._entries:
+            key = entry.column, entry.row
+            around = [[*other, self._clouds[other]] for other in self._grid.around(key) if other in self._clouds]
+            text = json.dumps([settings, key, entry.layers["stations"].sha256, around])
+            states[key] = hashlib.sha256(text.encode()).hexdigest()[:32]
+        return states
+
+    def described(self, wanted: Ints, keys: Collection[Key] | None = None) -> Iterator[tuple[Described, Ints]]:
+        """Yield descriptors of stations, portion by portion, with their numbers in the map."""
+        config = self.config.descriptor
+        begin = 0
+        for key, stations in self.stations.items():
+            numbers = wanted[(wanted >= begin) & (wanted < begin + len(stations))]
+            if len(numbers) and (keys is None or key in keys):
+                points, _ = self._around(key, max(HALO, config.radius + 2.0 * self.config.block))
+                for start in range(0, len(numbers), _PORTION):
+                    part = numbers[start : start + _PORTION]
+                    yield describe_storeys(points, stations, self.config.block, config, None, part - begin), part
+            begin += len(stations)
+
+    def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
+        """Return the likelihood field of a tile; no arrays where nothing is surveyed."""
+        block, tile = self.config.block, self._grid.tile
+        first = np.rint(corner / block).astype(np.int64)
+        low = np.rint((self._grid.corner(key)[:2] - _FIELD_MARGIN) / block).astype(np.int64)
+        high = np.rint((self._grid.corner(key)[:2] + tile + _FIELD_MARGIN) / block).astype(np.int64)
+        begin = np.clip(low - first, 0, surveyed.shape[::-1])
+        end = np.clip(high - first, begin, surveyed.shape[::-1])
+        window = surveyed[begin[1] : end[1], begin[0] : end[0]]
+        if not window.any():
+            return {}
+        points, packed = self._around(key, _FIELD_MARGIN)
+        at = (begin + first) * block
+        inside = ((points[:, :2] >= at) & (points[:, :2] < at + np.array(window.shape[::-1]) * block)).all(axis=1)
+        made = field_arrays(points[inside], unit_normals(packed[inside]), window, at, block)
+        rows, columns = made["field.tiles"][:, 0], made["field.tiles"][:, 1]
+        per = round(tile / _FIELD_MARGIN)
+        own = (columns // per == key[0]) & (rows // per == key[1])
+        return {name: values[own] for name, values in made.items()}
+
+    def _around(self, key: Key, margin: float) -> tuple[Points, Int8s]:
+        """Return points and packed normals within ``margin`` metres of a tile."""
+        low = self._grid.corner(key)[:2] - margin
+        high = low + self._grid.tile + 2.0 * margin
+        clouds = []
+        for other in self._grid.around(key):
+            if other in self._spans:
+                points, normals = (self._files.rows(name, *self._spans[other]) for name in ("points", "normals"))
+                near = ((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1)
+                clouds.append((points[near], normals[near]))
+        return np.concatenate([points for points, _ in clouds]), np.concatenate([normals for _, normals in clouds])
+
+    def _read(self, entry: TileEntry, store: TileStore) -> tuple[Points, Int8s]:
+        key = entry.column, entry.row
+        cloud = layer_of(entry, "cloud", store)
+        points, packed = read_cloud_layer(cloud, self._grid.corner(key), self._grid.tile, self.config.voxel)
+        if len(points) != entry.points:
+            raise MapError(f"tile {key[0]}, {key[1]}: its cloud is not the one that the manifest counts")
+        return points, packed
+
+    def _add(self, entry: TileEntry, points: Points, packed: Int8s) -> None:
+        key = entry.column, entry.row
+        index = np.zeros((0, 4), dtype=np.int64)
+        if len(points):
+            points, packed, index = sort_by_tile_packed(points, packed, self.config.tile)
+        begin = self._files.append("points", points)
+        self._files.append("normals", packed)
+        index[:, 2:] += begin
+        self._index.append(index)
+        self._spans[key] = begin, begin + len(points)
+        self._cells[key] = cells_of(points, self.config.block)
+        self._clouds[key] = entry.layers["cloud"].sha256
 
 
-def _field_of_tile(clouds: TileClouds, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
-    grid = clouds.grid
-    block = grid.config.block
-    first = np.rint(corner / block).astype(np.int64)
-    low = np.rint((grid.corner(key)[:2] - _FIELD_MARGIN) / block).astype(np.int64)
-    high = np.rint((grid.corner(key)[:2] + grid.tile + _FIELD_MARGIN) / block).astype(np.int64)
-    begin = np.clip(low - first, 0, surveyed.shape[::-1])
-    end = np.clip(high - first, begin, surveyed.shape[::-1])
-    known = surveyed[begin[1] : end[1], begin[0] : end[0]]
-    if not known.any():
-        return {}
-    points, packed = clouds.around(key, _FIELD_MARGIN)
-    at = (begin + first) * block
-    inside = ((points[:, :2] >= at) & (points[:, :2] < at + np.array(known.shape[::-1]) * block)).all(axis=1)
-    made = field_arrays(points[inside], unit_normals(packed[inside]), known, at, block)
-    rows, columns = made["field.tiles"][:, 0], made["field.tiles"][:, 1]
-    per = round(grid.tile / _FIELD_MARGIN)
-    own = (columns // per == key[0]) & (rows // per == key[1])
-    return {name: values[own] for name, values in made.items()}
+def layer_of(entry: TileEntry, name: str, store: TileStore) -> Arrays:
+    """Return the arrays of a tile's layer; MapError where it is missing or damaged."""
+    layer = entry.layers[name]
+    return decode(store.get(layer.sha256, layer.bytes), str(store.path(layer.sha256)))
 
 
 def _features(entries: Sequence[TileEntry], store: TileStore) -> Arrays:
     """Return the learned features of the tiles."""
-    found: list[Mapping[str, np.ndarray]] = [layer_of(entry, "features", store) for entry in entries]
+    layers = [layer_of(entry, "features", store) for entry in entries]
     try:
-        return {f"learned.{name}": np.concatenate([layer[name] for layer in found]) for name in _LEARNED}
+        return {f"learned.{name}": np.concatenate([layer[name] for layer in layers]) for name in _LEARNED}
     except (KeyError, ValueError) as error:
         raise MapError(f"a tile's features are not what they should be ({error}); fetch or build it again") from error

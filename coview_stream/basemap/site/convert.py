@@ -18,8 +18,7 @@ from coview_stream.basemap import file_format
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.assemble import Progress, assemble
-from coview_stream.basemap.site.earlier import PARAMETER
+from coview_stream.basemap.site.assemble import PARAMETER, Progress, assemble, layer_of
 from coview_stream.basemap.site.layers import (
     PACKING,
     STEPS,
@@ -32,7 +31,6 @@ from coview_stream.basemap.site.layers import (
 from coview_stream.basemap.site.manifest import (
     TILE,
     VERSION,
-    Key,
     LayerEntry,
     Manifest,
     SiteGrid,
@@ -42,8 +40,7 @@ from coview_stream.basemap.site.manifest import (
 )
 from coview_stream.basemap.site.site_build import check_directory
 from coview_stream.basemap.site.store import TileStore
-from coview_stream.basemap.site.tile_clouds import layer_of
-from coview_stream.basemap.tiles import unit_normals
+from coview_stream.basemap.tiles import Key, unit_normals
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Ints

@@ -23,7 +23,6 @@ from coview_stream.basemap.site.manifest import (
     FILE,
     MAX_MANIFEST,
     Around,
-    Key,
     LayerEntry,
     Manifest,
     TileEntry,
@@ -31,6 +30,7 @@ from coview_stream.basemap.site.manifest import (
     tiles_around,
 )
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
+from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.http_file import open_web_file
 from coview_stream.errors import CloudError, MapError, TransportError, require_library, warn
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from coview_stream.basemap.signature import SigningKey, VerifyKey
 from coview_stream.basemap.site.store import SHA256, read_record, write_record
+from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.config import MapConfig
 from coview_stream.errors import ConfigError, MapError
@@ -267,9 +268,6 @@ HALO = 64.0
 
 FEATURE_HALO = 112.0
 """Metres around a tile that its learned features see: 64 for the network and 48 for the ground below those."""
-
-Key = tuple[int, int]
-"""Column and row of a tile."""
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,11 @@ import numpy as np
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.executors import Executor, SerialExecutor
-from coview_stream.basemap.site.manifest import TILE, Key, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
+from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
 from coview_stream.basemap.sources import Given, Source, sources_of
+from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.cloud_head import CloudHead, check_together
 from coview_stream.config import MapConfig
 from coview_stream.errors import CoViewError, InputError, MapError, warn

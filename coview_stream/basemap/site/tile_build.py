@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.site.layers import PACKING, cloud_layer, encode, square_metres, stations_layer
-from coview_stream.basemap.site.manifest import FEATURE_HALO, HALO, Key, LayerEntry, SiteGrid, TileEntry
+from coview_stream.basemap.site.manifest import FEATURE_HALO, HALO, LayerEntry, SiteGrid, TileEntry
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.sources import Source
 from coview_stream.basemap.stations import find_stations
+from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.cloud import CloudBuilder
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid

@@ -1,20 +1,20 @@
-"""Working file of a site: the one ``.coview`` file that a node maps into memory, made once and kept in the cache."""
+"""Working file of a site: a ``.coview`` file in the cache that nodes map into memory, written when a site is opened."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from coview_stream.basemap import file_format
+from coview_stream.basemap.file_format import Loaded, open_file, save
+from coview_stream.basemap.map_arrays import EarlierMap
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.assemble import assemble, layers
-from coview_stream.basemap.site.earlier import VERSION, earlier_file, remember_file
-from coview_stream.basemap.site.manifest import Key, Manifest, read_part
+from coview_stream.basemap.site.assemble import PARAMETER, VERSION, assemble, field_layers
+from coview_stream.basemap.site.manifest import Manifest, read_part
 from coview_stream.basemap.site.store import (
     TileStore,
     cache_folder,
@@ -22,49 +22,53 @@ from coview_stream.basemap.site.store import (
     evict,
     hold,
     lock,
+    read_record,
     remember_checked,
     remember_written,
+    write_record,
 )
+from coview_stream.basemap.tiles import Key
+from coview_stream.config import Channel, config_of_map
 from coview_stream.errors import MapError
 
 log = logging.getLogger("coview_stream.maps")
 
 
-def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, file_format.Loaded]:
-    """Return the working file of a site and what is in it; one that is damaged is made again.
+def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, Loaded]:
+    """Return the working file of a site and its content; a damaged one is written again.
 
     Args:
         place: directory of the site, or the file of a part of it.
-        check: compare its content with its checksum, unless that has been done since it was written.
-        verify_key: has to have signed the site.
+        check: compare the content with its checksum, unless that has been done since it was written.
+        verify_key: must have signed the site.
 
     Raises:
-        MapError: as :func:`working_file`.
+        MapError: see :func:`working_file`.
     """
     directory, keys = (place, None) if place.is_dir() else read_part(place)
     return open_made(lambda: working_file(directory, verify_key, keys=keys), check)
 
 
-def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, file_format.Loaded]:
-    """Return a file of the cache and what is in it; one that is damaged is made again.
+def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, Loaded]:
+    """Return a file of the cache and its content; a damaged one is written again.
 
     Args:
-        make: makes it, if it is not there, and returns it.
-        check: compare its content with its checksum, unless that has been done since it was written.
+        make: returns the file, and writes it if it does not exist.
+        check: compare the content with its checksum, unless that has been done since it was written.
 
     Raises:
-        MapError: as ``make``.
+        MapError: raised by ``make``.
     """
     path = make()
     before = checked(path)
     try:
-        loaded = file_format.open_file(path, check, checked=before, opened=hold)
+        loaded = open_file(path, check, checked=before, opened=hold)
     except MapError as error:
         log.warning("%s; it is made again", error)
         path.unlink(missing_ok=True)
         path = make()
         before = checked(path)
-        loaded = file_format.open_file(path, check, checked=before, opened=hold)
+        loaded = open_file(path, check, checked=before, opened=hold)
     if check and loaded.identity != before:
         remember_checked(path, loaded.identity)
     return path, loaded
@@ -76,15 +80,15 @@ def working_file(
     progress: bool | None = None,
     keys: Collection[Key] | None = None,
 ) -> Path:
-    """Return the working file of a site, made now if it is not there.
+    """Return the working file of a site, and write it if it does not exist.
 
-    That takes some seconds a tile, less where an earlier one of the site has the same tiles.
+    That takes some seconds a tile; tiles that an earlier working file of the site has are copied.
 
     Args:
         directory: of the site.
-        verify_key: has to have signed it.
-        progress: show a bar on stderr; None does on a terminal.
-        keys: tiles that it is to hold; None for all.
+        verify_key: must have signed the site.
+        progress: show a bar on stderr; None shows it on a terminal.
+        keys: tiles of the file; None for all.
 
     Raises:
         MapError: no site, a layer is missing or damaged, not signed with the key, or no room in the cache.
@@ -95,21 +99,55 @@ def working_file(
     folder, path = cache_folder(), _path(manifest, keys)
     with lock(path):
         if path.is_file():
-            remember_file(directory, path)
+            write_record(_record_name(directory), path.name)
             return path
+
+        def earlier(states: Mapping[Key, str]) -> EarlierMap:
+            channels = config_of_map(manifest.parameters["config"]).descriptor.channels
+            return _open_earlier(earlier_file(directory), states, channels)
+
         with _bar(f"{directory}: made ready for this machine", progress) as step, ArrayFiles(folder) as into:
-            earlier = earlier_file(directory)
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
-            file_format.save(path, arrays | layers(arrays, into), parameters)
+            save(path, arrays | field_layers(arrays, into), parameters)
         remember_written(path)
-        remember_file(directory, path)
+        write_record(_record_name(directory), path.name)
         evict(folder, path, directory)
     return path
 
 
 def working_path(directory: Path, keys: Collection[Key] | None = None) -> Path:
-    """Return where the working file of a site is or would be, or of some tiles; MapError where it is no site."""
+    """Return the path of a site's working file, which need not exist; MapError if the directory is no site."""
     return _path(Manifest.load(directory), keys)
+
+
+def earlier_file(directory: Path) -> Path | None:
+    """Return the working file of a site that was used last, if it still exists."""
+    try:
+        path = cache_folder() / str(read_record(cache_folder() / "parts" / _record_name(directory)))
+    except (OSError, ValueError):
+        return None
+    return path if path.parent == cache_folder() and path.is_file() else None
+
+
+def _open_earlier(path: Path | None, states: Mapping[Key, str], channels: Sequence[Channel]) -> EarlierMap:
+    """Open an earlier working file; one that cannot be read, or has another form, is as good as none."""
+    if path is None:
+        return EarlierMap()
+    try:
+        loaded = open_file(path, checked=checked(path))
+        table = {
+            str(state): (slice(first, first + count), slice(row, row + rows))
+            for state, first, count, row, rows in loaded.parameters.get(PARAMETER, ())
+        }
+    except (MapError, ValueError, TypeError) as error:
+        log.info("%s: nothing is taken from it (%s)", path, error)
+        return EarlierMap()
+    spans = {key: table[state] for key, state in states.items() if state in table}
+    return EarlierMap(loaded.arrays, spans, channels)
+
+
+def _record_name(directory: Path) -> str:
+    return hashlib.sha256(str(directory.resolve()).encode()).hexdigest()[:16] + ".last"
 
 
 def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
@@ -121,8 +159,8 @@ def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
 def _bar(title: str, show: bool | None) -> Iterator[Callable[[int, int], None]]:
     from tqdm import tqdm
 
-    wanted = sys.stderr.isatty() if show is None else show
-    with tqdm(desc=title, unit="step", disable=not wanted, leave=False) as bar:
+    shown = sys.stderr.isatty() if show is None else show
+    with tqdm(desc=title, unit="step", disable=not shown, leave=False) as bar:
 
         def step(done: int, total: int) -> None:
             bar.total = total

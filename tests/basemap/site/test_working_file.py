@@ -8,11 +8,11 @@ import pytest
 from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
-from coview_stream.basemap.site import earlier
-from coview_stream.basemap.site.earlier import PARAMETER, earlier_file
+from coview_stream.basemap.map_arrays import EarlierMap
+from coview_stream.basemap.site.assemble import PARAMETER
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.store import TileStore
-from coview_stream.basemap.site.working_file import working_file
+from coview_stream.basemap.site.working_file import earlier_file, working_file
 
 
 @pytest.fixture
@@ -24,13 +24,13 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture
 def taken(monkeypatch):
     """Number of tiles taken from an earlier file, each time that a working file is made."""
-    counts, real = [], earlier.Earlier.__init__
+    counts, real = [], EarlierMap.__init__
 
     def count(self, *args):
         real(self, *args)
         counts.append(len(self))
 
-    monkeypatch.setattr(earlier.Earlier, "__init__", count)
+    monkeypatch.setattr(EarlierMap, "__init__", count)
     return counts
 
 
@@ -106,7 +106,7 @@ def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
     working_file(site)
     assert taken == [0, 0]
     assert earlier_file(site) != first
-    (cache / "parts" / earlier._record_name(site)).write_text('"../../elsewhere.coview"')
+    next((cache / "parts").glob("*.last")).write_text('"../../elsewhere.coview"')
     assert earlier_file(site) is None
 
 
