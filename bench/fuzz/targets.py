@@ -1,4 +1,4 @@
-"""What is fuzzed: functions of bytes that give a value or a CoViewError, whatever the bytes are."""
+"""Targets of the fuzzing: functions of bytes that return a value or raise a CoViewError, whatever the bytes are."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _file(name: str, read: Callable[[Path], object]) -> Target:
 
 
 def _cloud(name: str) -> Target:
-    import laspy  # noqa: F401 - now, so that it is seen what of it is covered
+    import laspy  # noqa: F401 - now, so its coverage is seen
 
     from coview_stream.clouds import read_cloud
 

@@ -27,10 +27,10 @@ class Link:
         self._open: set[asyncio.StreamWriter] = set()
 
     async def run(self, conn: Connection) -> None:
-        """Forward until the other end of ``conn`` sends None; anything else that it sends is the mode from now on."""
+        """Forward until None is received; anything else is the mode from now on."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
-        def told() -> None:
+        def order() -> None:
             mode = conn.recv()
             if mode is None:
                 ended.set()
@@ -44,7 +44,7 @@ class Link:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WINDOW)
             listener.bind(("127.0.0.1", self._port))
             server = await asyncio.start_server(self._accept, sock=listener.dup())
-        loop.add_reader(conn.fileno(), told)
+        loop.add_reader(conn.fileno(), order)
         flapper = asyncio.create_task(self._flap())
         conn.send("ready")
         async with server:
@@ -114,5 +114,5 @@ class Link:
 
 
 def forward(conn: Connection, port: int, target: int, seed: int) -> None:
-    """Be a link until told to end."""
+    """Be a link until None is received."""
     asyncio.run(Link(port, target, seed).run(conn))

@@ -1,70 +1,64 @@
-"""A simulated robot that drives on for ever, in a process of its own, and goes wrong in the manner it is told to."""
+"""Simulated robots that drive for ever, with faulty senders on demand; and the record of the nodes' answers."""
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from dataclasses import dataclass
+from collections import Counter, deque
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.stream.drive import EPOCH_NS, Drive, RobotPlan
+from bench.soak.sites import Site
+from bench.stream.drive import EPOCH_NS, Drive, RobotPlan, stamp_of
 from bench.stream.processes import open_session
+from bench.stream.scores import Posed, errors
 from coview_stream.clouds import read_tum
 from coview_stream.geometry.arrays import Floats
-from coview_stream.messages import encode_cloud, encode_odometry
-from coview_stream.messages.types import CloudMessage, OdometryMessage
+from coview_stream.messages import decode_pose, encode_cloud, encode_odometry
+from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 
 CLOUD_PERIOD, ODOMETRY_PERIOD = 0.1, 0.02
-REOPEN = "reopen"
-"""Tells a robot to open its session anew, as one does that is started again."""
+REOPEN = "reopen"  # makes a robot open its session anew, as after a restart
+SIGNED = b"stranger"  # attachment of the stranger's messages on the robots' outputs
 
+FALSE_METRES, FALSE_DEGREES = 3.0, 5.0  # a pose further from the truth than either is false
 _LATE = 0.5  # seconds after which a message that the network held up is not sent any more
+_FED = 2.0  # seconds since the last of its messages, within which they arrive
+_FAR = 60.0  # seconds between a pose's stamp and its arrival, above which it belongs to no sent frame
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How a robot sends.
-
-    Attributes:
-        clouds: whether it sends clouds.
-        odometry: whether it sends odometry.
-        frozen: whether odometry says that it stands, while it drives.
-        stopped: whether the stamps stand.
-        unit_ns: nanoseconds of one unit of its stamps; a million if it stamps in milliseconds.
-        offset: seconds that its sensor clock is ahead of its start.
-        shift: x, y in metres and yaw in radians by which the odometry frame is another than at the start.
-        cloud_period: seconds between two clouds.
-    """
+    """How a robot sends."""
 
     clouds: bool = True
     odometry: bool = True
-    frozen: bool = False
-    stopped: bool = False
-    unit_ns: int = 1
-    offset: float = 0.0
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frozen: bool = False  # odometry stands while the robot drives
+    stopped: bool = False  # the stamps stand
+    unit_ns: int = 1  # nanoseconds of one unit of its stamps; a million if it stamps in milliseconds
+    offset: float = 0.0  # seconds that its sensor clock is ahead of its start
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres and radians between odometry frames, now and then
     cloud_period: float = CLOUD_PERIOD
 
 
 def stamp(content: float, manner: Manner) -> int:
-    """Return what a robot's clock says at a moment of its drive."""
+    """Stamp of a robot's clock at a moment of its drive."""
     return (EPOCH_NS + round((content + manner.offset) * 1e6) * 1000) // manner.unit_ns
 
 
 def content_of(stamp_ns: int, manners: list[Manner], near: float) -> float:
-    """Return the moment of the drive that a stamp means to one of the manners: that which is nearest to ``near``."""
-
-    def moment(manner: Manner) -> float:
-        return (stamp_ns * manner.unit_ns - EPOCH_NS) / 1e9 - manner.offset
-
-    return min(map(moment, manners), key=lambda content: abs(content - near))
+    """Moment of the drive that a stamp means in one of the manners: the nearest to ``near``."""
+    moments = [(stamp_ns * manner.unit_ns - EPOCH_NS) / 1e9 - manner.offset for manner in manners]
+    return min(moments, key=lambda content: abs(content - near))
 
 
 def shifted(T_odom_body: Floats, shift: tuple[float, float, float]) -> Floats:
-    """Return a pose in an odometry frame that is shifted and turned."""
+    """Pose in an odometry frame that is shifted and turned."""
     x, y, yaw = shift
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -73,7 +67,7 @@ def shifted(T_odom_body: Floats, shift: tuple[float, float, float]) -> Floats:
 
 
 def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
-    """Send until told to stop; what is received is a :class:`Manner`, :data:`REOPEN`, or None to end."""
+    """Send until None is received; a :class:`Manner` changes the sender, :data:`REOPEN` its session."""
     import zenoh
 
     drive = Drive(world, RobotPlan(name, float("inf")))
@@ -91,14 +85,14 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
     while True:
         kind = "odom" if due["odom"] <= due["cloud"] else "cloud"
         if conn.poll(max(0.0, start + due[kind] - time.monotonic())):
-            told = conn.recv()
-            if told is None:
+            order = conn.recv()
+            if order is None:
                 break
-            if told == REOPEN:
+            if order == REOPEN:
                 session.close()
                 session = open_session("client", connect=[endpoint])
                 continue
-            manner, since = told, round(time.monotonic() - start, 1)
+            manner, since = order, round(time.monotonic() - start, 1)
             due["cloud"] = max(due["cloud"], since)
             continue
         content, late = due[kind], time.monotonic() - start - due[kind]
@@ -117,4 +111,113 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
             **how[kind],
         )  # fmt: skip
     session.close()
-    conn.send("ended")
+
+
+@dataclass
+class Robot:
+    """Record of a robot: messages that arrived from and for it so far."""
+
+    name: str
+    site: Site
+    start: float = math.inf  # monotonic time at which its drive begins
+    manners: list[Manner] = field(default_factory=lambda: [Manner()])  # so far
+    poses: int = 0
+    false: list[tuple[float, float, float]] = field(default_factory=list)  # seconds, metres, degrees
+    unreadable: int = 0
+    worst: tuple[float, float] = (0.0, 0.0)
+    fed_at: dict[str, float] = field(default_factory=lambda: {"odom": -math.inf, "cloud": -math.inf})
+    garbled: int = 0  # false or unreadable while the nodes' link flips bits
+    corrected: float = -math.inf  # moment of the newest frame that a pose came from
+    latencies: list[float] = field(default_factory=list)  # seconds
+    state: str = ""
+    states: Counter[str] = field(default_factory=Counter)
+    awaited: float = math.inf  # moment of the drive
+    recovered: float | None = None  # arrival of the first pose from a frame of that moment or later
+
+    def __post_init__(self) -> None:
+        self.drive = Drive(self.site.world, RobotPlan(self.name, math.inf))
+
+    def expect(self, moment: float) -> None:
+        """Wait for a pose from a frame that was taken at a monotonic time or later."""
+        self.awaited, self.recovered = moment - self.start, None
+
+    def fed(self, now: float) -> bool:
+        """Whether its odometry and clouds arrive at the router."""
+        return now - min(self.fed_at.values()) < _FED
+
+    def take_status(self, payload: bytes) -> None:
+        """Note a status."""
+        try:
+            state = str(json.loads(payload)["state"])
+        except (ValueError, KeyError, TypeError):
+            self.unreadable += 1
+            return
+        self.states[state] += state != self.state
+        self.state = state
+
+    def take_pose(self, at: float, sample: Sample) -> None:
+        """Judge a pose by the truth at its stamp."""
+        try:
+            pose = decode_pose(sample)
+        except Exception:  # whatever a node may publish
+            self.unreadable += 1
+            return
+        due = at - self.start
+        content = content_of(pose.stamp_ns, self.manners, due)
+        self.poses += 1
+        if abs(content - due) > _FAR:
+            self.false.append((round(due, 2), math.inf, math.inf))
+            return
+        posed = Posed(at, stamp_of(content), pose.T_map_body)
+        metres, degrees = (float(error[0]) for error in errors([posed], self.drive.truth))
+        self.worst = max(self.worst[0], metres), max(self.worst[1], degrees)
+        if not (metres <= FALSE_METRES and degrees <= FALSE_DEGREES):
+            self.false.append((round(due, 2), round(metres, 2), round(degrees, 2)))
+        corrected = content - pose.age
+        if math.isfinite(corrected) and (corrected > self.corrected + 0.002 or corrected < self.corrected - _FAR):
+            self.corrected = corrected
+            self.latencies.append(due - corrected)
+        if self.recovered is None and corrected >= self.awaited:
+            self.recovered = at
+
+
+class Watch:
+    """Subscriber of all outputs, straight at the router; :meth:`update` judges the messages since the last time."""
+
+    def __init__(self, endpoint: str, robots: list[Robot]) -> None:
+        import zenoh
+
+        self.robots = {robot.name: robot for robot in robots}
+        self.session = open_session("client", connect=[endpoint])
+        self.flipping = False  # whether bits may be flipped on the way from the nodes
+        self._came: deque[tuple[float, str, bytes, str]] = deque()
+        direct = zenoh.handlers.Callback(self._take, indirect=False)
+        keys = ("coview/*/out/pose", "coview/*/out/status", "coview/*/in/odom", "coview/*/in/cloud")
+        self._held = [self.session.declare_subscriber(key, direct) for key in keys]
+
+    def _take(self, sample: Any) -> None:
+        at = time.monotonic()
+        if sample.attachment is None or sample.attachment.to_bytes() != SIGNED:
+            key = str(sample.key_expr)
+            payload = b"" if "/in/" in key else sample.payload.to_bytes()
+            self._came.append((at, key, payload, str(sample.encoding)))
+
+    def update(self) -> None:
+        """Judge the messages since the last time."""
+        while self._came:
+            at, key, payload, encoding = self._came.popleft()
+            _, name, way, kind = key.split("/")
+            robot = self.robots.get(name)
+            if robot is None:
+                continue
+            before = len(robot.false), robot.unreadable
+            if way == "in":
+                robot.fed_at[kind] = at
+            elif kind == "status":
+                robot.take_status(payload)
+            else:
+                robot.take_pose(at, Sample(key, payload, encoding))
+            if self.flipping:
+                robot.garbled += len(robot.false) - before[0] + robot.unreadable - before[1]
+                del robot.false[before[0] :]
+                robot.unreadable = before[1]

@@ -19,10 +19,7 @@ _SENSOR = "vlp16"
 
 
 class Site(NamedTuple):
-    """A world on disk (``run/``, ``truth.tum``), its map, and whether a robot has to be found on it.
-
-    In a deceptive site no pose is a right answer, and only a false one a wrong one.
-    """
+    """A world on disk (``run/``, ``truth.tum``) and its map; on a deceptive one, no pose is right."""
 
     name: str
     world: Path

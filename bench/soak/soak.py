@@ -1,63 +1,55 @@
-"""Robots that drive for hours while something goes wrong every minute: what holds, how soon it is back, what leaks.
+"""Robots that drive for hours with a fault every minute: false poses, stuck states, time to recover, leaks.
 
-A router, a node for each site (through the command line), robots that replay simulated drives for ever, and a fault
+A router, a node for each site (through the command line), robots that replay simulated drives for ever, and faults
 drawn from the whole matrix, each kind once before any comes again. Robots drive in a town, in which they have to be
-found again within 60 s of a fault, and in deceptive sites, in which no pose is a right answer and a false one is not:
-a yard of equal boxes, and one whose containers were all moved. Rows are kept after every fault (--json). Needs the
-extra ``bench``.
+found again within 60 s of a fault, and in deceptive sites, in which only no pose is right: a yard of equal boxes, and
+one whose containers were all moved. An interrupted soak prints its rows so far. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
+import math
 import sys
 import time
 import traceback
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from random import Random
-from typing import Any
 
 import numpy as np
 
-from bench.harness.files import fingerprint, folder
-from bench.harness.rows import Row, table
-from bench.soak import figures
-from bench.soak.faults import FAULTS, SkippedError
+from bench.harness.files import folder
+from bench.harness.rows import Row, judged, table
+from bench.soak.faults import ENDS_PROCESSES, FAULTS
 from bench.soak.sites import KINDS, prepare
-from bench.soak.stage import Stage
-from coview_stream.clouds.atomic_file import atomic_path
+from bench.soak.stage import Node, Stage, slope
 from coview_stream.errors import InputError
 
 STUCK = 60.0  # seconds without a pose after a fault, while frames arrive
 FIRST_FIX = 90.0  # seconds, of a machine that starts everything at once
+WARM = 600.0  # seconds of a process that its slopes leave out
+MIN_HOURS = 0.25  # below which a slope is no evidence
+LEAKS = (("megabytes", 1.0, "MB/h"), ("descriptors", 1.0, "per h"))  # figure, and its target per hour
 
 
 @dataclass
 class Event:
-    """One fault: when it began, and what became of every robot that has to be found again."""
+    """One fault: when it began, and the recovery of every robot that has to be found again."""
 
     fault: str
     begin: float  # seconds since the first robot drove
-    seconds: float  # that it lasted
-    recoveries: dict[str, float | None]  # None: not in STUCK seconds
-    stuck: list[str]  # of those, whom frames were sent to
-    unfed: list[str]  # of those, whose frames did not arrive at the router
+    recoveries: dict[str, float | None] = field(default_factory=dict)  # None: not in STUCK seconds
+    stuck: list[str] = field(default_factory=list)  # of those, the robots whose frames arrived
+    unfed: list[str] = field(default_factory=list)  # of those, the robots whose frames did not reach the router
     false: int = 0
     crashes: int = 0
-    zombies: int = 0
-    skipped: str = ""
-
-    @property
-    def lasted(self) -> float:
-        """Seconds from its begin until all were found again, or were given up."""
-        return self.seconds + max((STUCK if each is None else each for each in self.recoveries.values()), default=0.0)
+    skipped: str = ""  # error of the bench
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add how long, how many and what."""
+    """Add duration, robots and faults."""
     parser.add_argument("--minutes", type=float, default=60.0, help="after all robots have been found (60)")
     parser.add_argument("--robots", type=int, default=2, help="in a town, a yard of equal boxes, a rearranged yard ...")
     parser.add_argument("--every", type=float, default=60.0, metavar="S", help="seconds from fault to fault (60)")
@@ -68,7 +60,7 @@ def options(parser: ArgumentParser) -> None:
 def chosen(words: Sequence[str], seed: int) -> Iterator[str]:
     """Yield names of faults for ever, each once before any comes again, in an order drawn anew each time.
 
-    In every other round, from the second on, no process of a node is ended: some have to grow old for leaks to be seen.
+    Every other round, from the second on, ends no process of a node, because leaks show only in old processes.
     """
     names = [name for name in FAULTS if not words or any(word in name for word in words)]
     if not names:
@@ -76,12 +68,12 @@ def chosen(words: Sequence[str], seed: int) -> Iterator[str]:
     rng = Random(seed)
     while True:
         yield from rng.sample(names, len(names))
-        gentle = [name for name in names if not FAULTS[name].ends_processes]
+        gentle = [name for name in names if name not in ENDS_PROCESSES]
         yield from rng.sample(gentle, len(gentle))
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Run the soak; the summary is that of what there was when it is interrupted."""
+    """Run the soak; an interrupted one has a summary as well."""
     faults = chosen(asked.faults, asked.seed)
     first = next(faults)
     if asked.robots < 1:
@@ -89,154 +81,151 @@ def rows(asked: Namespace) -> Iterator[Row]:
     kinds = [KINDS[k % len(KINDS)] for k in range(asked.robots)]
     made = {kind: prepare(folder(), kind, asked.seed, asked.quick) for kind in dict.fromkeys(kinds)}
     stage = Stage([made[kind] for kind in kinds], folder() / "soak", asked.seed)
-    soak = Soak(stage, asked)
-    ended: list[float] = []
+    begin, events, ended = time.monotonic(), list[Event](), list[float]()
     try:
         try:
-            yield soak.find()
+            yield first_fixes(stage)
+            begin = time.monotonic()
+            stage.wait(min(10.0, asked.every / 3))
             for name in itertools.chain([first], faults):
-                yield soak.play(name)
-                soak.keep()
-                if time.monotonic() > soak.end:
+                events.append(play(stage, name, begin, asked.every))
+                yield Row(f"soak/{len(events)}: {name}", text=_text(events[-1]), details=asdict(events[-1]))
+                if time.monotonic() > begin + 60 * asked.minutes:
                     break
         except KeyboardInterrupt:
-            print("soak: interrupted; what there was until now:", file=sys.stderr)
+            print("soak: interrupted; the rows so far:", file=sys.stderr)
     finally:
         ended = stage.close()
-    yield from soak.summary(ended)
+    hours = (time.monotonic() - begin) / 3600
+    yield from held(stage, hours)
+    yield from survived(events)
+    yield from processes(stage.nodes, hours)
+    yield Row("soak/end after SIGTERM, worst s", max(ended, default=math.nan))
 
 
-class Soak:
-    """One soak under way: its events so far, and the rows made of them."""
+def first_fixes(stage: Stage) -> Row:
+    """Wait until the robots of the town are found for the first time."""
+    stage.wait(120.0, lambda: all(robot.state for robot in stage.robots))
+    stage.begin()
+    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
+    for robot in wanted:
+        robot.expect(robot.start)
+    stage.wait(FIRST_FIX, lambda: all(robot.recovered for robot in wanted))
+    fixes = {robot.name: robot.recovered and round(robot.recovered - robot.start, 1) for robot in wanted}
+    text = "; ".join(f"{name} {seconds}" for name, seconds in fixes.items())
+    return Row("soak/first fix, s", text=text, details=fixes)
 
-    def __init__(self, stage: Stage, asked: Namespace) -> None:
-        self.stage, self.asked = stage, asked
-        self.events: list[Event] = []
-        self.start = self.end = time.monotonic()
-        self.rows: list[Row] = []
 
-    def find(self) -> Row:
-        """Wait until the robots of the town are found for the first time."""
-        stage = self.stage
-        stage.wait(120.0, lambda: all(robot.status for robot in stage.robots))
-        stage.begin()
-        self.start = time.monotonic()
-        wanted = [robot for robot in stage.robots if not robot.site.deceptive]
+def play(stage: Stage, name: str, start: float, every: float) -> Event:
+    """Make one fault, and wait until all robots are found again and the next fault is due."""
+    begin = time.monotonic()
+    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
+    event, false, crashes = Event(name, begin - start), _false(stage), _crashes(stage)
+    try:
+        whole = FAULTS[name](stage)
+    except Exception as error:  # of the bench, not of the product; the soak goes on
+        traceback.print_exc()
+        event.skipped = f"{type(error).__name__}: {error}"
+    else:
         for robot in wanted:
-            robot.expect(robot.start)
-        stage.wait(FIRST_FIX, lambda: all(robot.recovered for robot in wanted))
-        fixes = {each.name: each.recovered and each.recovered - each.start for each in wanted}
-        self.end = time.monotonic() + 60 * self.asked.minutes
-        stage.wait(min(10.0, self.asked.every / 3))
-        row = Row(
-            "soak/first fix, s",
-            text="; ".join(f"{name} {fix and round(fix, 1)}" for name, fix in fixes.items()),
-            details=fixes,
-        )
-        self.rows.append(row)
-        return row
+            robot.expect(whole)
+        stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
+        now = time.monotonic()
+        for robot in wanted:
+            event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
+            if robot.recovered is None:
+                (event.stuck if robot.fed(now) else event.unfed).append(robot.name)
+    for node in stage.nodes:
+        node.revive()
+    if event.stuck or event.unfed:  # counted; the next fault needs working robots
+        stage.rescue()
+        for robot in wanted:
+            robot.expect(time.monotonic())
+        stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
+    stage.wait(max(5.0 if every >= 30 else 1.0, begin + every - time.monotonic()))
+    event.false, event.crashes = _false(stage) - false, _crashes(stage) - crashes
+    return event
 
-    def play(self, name: str) -> Row:
-        """Make one fault, and wait until all is well again and the next is due."""
-        stage, begin = self.stage, time.monotonic()
-        wanted = [each for each in stage.robots if not each.site.deceptive]
-        false, crashes = self.false(), self.crashes()
-        event = Event(name, begin - self.start, 0.0, {}, [], [])
-        try:
-            whole = FAULTS[name].make(stage)
-        except SkippedError as error:
-            event.skipped = str(error)
-        except Exception as error:  # of the bench, not of what it tests; the soak goes on
-            traceback.print_exc()
-            event.skipped = f"{type(error).__name__}: {error}"
-        if not event.skipped:
-            event.seconds = whole - begin
-            for robot in wanted:
-                robot.expect(whole)
-            stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
-            now = time.monotonic()
-            for robot in wanted:
-                event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
-                if robot.recovered is None:
-                    (event.stuck if robot.fed(now) else event.unfed).append(robot.name)
-        for node in stage.nodes:
-            node.revive()
-        if event.stuck or event.unfed:  # counted; the next fault is to find robots that work
-            stage.rescue()
-            for robot in wanted:
-                robot.expect(time.monotonic())
-            stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
-        stage.wait(max(5.0 if self.asked.every >= 30 else 1.0, begin + self.asked.every - time.monotonic()))
-        event.false, event.crashes = self.false() - false, self.crashes() - crashes
-        event.zombies = sum(node.zombies() for node in stage.nodes)
-        self.events.append(event)
-        row = Row(f"soak/{len(self.events)}: {name}", text=self._said(event), details=asdict(event))
-        self.rows.append(row)
-        return row
 
-    def _said(self, event: Event) -> str:
-        if event.skipped:
-            return f"skipped: {event.skipped}"
-        back = [f"{name} {'STUCK' if each is None else f'{each:.1f} s'}" for name, each in event.recoveries.items()]
-        marks = (
-            ["nodes started again by hand"] * bool(event.stuck or event.unfed)
-            + [f"{event.false} FALSE"] * bool(event.false)
-            + [f"{event.crashes} CRASHES"] * bool(event.crashes)
-        )
-        states = " ".join(f"{each.name}:{each.state}" for each in self.stage.robots)
-        return "; ".join([*(back or ["nobody had to be found"]), *marks, states])
+def _false(stage: Stage) -> int:
+    return sum(len(robot.false) + robot.unreadable for robot in stage.robots)
 
-    def false(self) -> int:
-        """Return how many poses were false so far."""
-        return sum(len(each.false) + each.unreadable for each in self.stage.robots)
 
-    def crashes(self) -> int:
-        """Return how many processes ended so far that nobody ended, or did not end that should have."""
-        return sum(len(node.crashes) for node in self.stage.nodes)
+def _crashes(stage: Stage) -> int:
+    return sum(len(node.crashes) for node in stage.nodes)
 
-    def summary(self, ended: Sequence[float] = ()) -> Iterator[Row]:
-        """Yield the rows of the targets."""
-        hours = (time.monotonic() - self.start) / 3600
-        faults = [(self.start + each.begin - 1.0, self.start + each.begin + each.lasted + 15.0) for each in self.events]
-        yield from figures.held(self.stage.robots, hours, faults)
-        yield from figures.survived(self.events)
-        yield from figures.processes(self.stage.nodes, hours, ended)
-        details: dict[str, Any] = {"code": fingerprint(), "bench": fingerprint("bench/soak")}
-        details |= {"minutes": 60 * hours, "robots": len(self.stage.robots), "seed": self.asked.seed}
-        yield Row("soak/code", text=fingerprint(), details=details)
 
-    def keep(self) -> None:
-        """Write what there is so far where --json will be written at the end."""
-        if self.asked.json is not None:
-            every = [*self.rows, *self.summary()]
-            with atomic_path(self.asked.json) as part:
-                part.write_text(json.dumps([row.to_dict() for row in every], indent=1, allow_nan=False) + "\n")
+def _text(event: Event) -> str:
+    if event.skipped:
+        return f"skipped: {event.skipped}"
+    back = [f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in event.recoveries.items()]
+    marks = [f"{event.false} FALSE"] * bool(event.false) + [f"{event.crashes} CRASHES"] * bool(event.crashes)
+    return "; ".join([*(back or ["no robot had to be found"]), *marks])
+
+
+def held(stage: Stage, hours: float) -> Iterator[Row]:
+    """Yield poses, false ones and latency of every robot."""
+    for robot in stage.robots:
+        name = f"soak/{robot.name} ({robot.site.name})"
+        details = {"states": dict(robot.states), "false": robot.false[:100], "unreadable": robot.unreadable}
+        yield Row(f"{name}: poses", robot.poses, text=f"{robot.poses} in {hours:.2f} h", details=details)
+        wrong = len(robot.false) + robot.unreadable
+        yield judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
+        if robot.garbled:
+            yield Row(f"{name}: false or unreadable while the nodes' link flips bits", robot.garbled)
+        yield Row(f"{name}: worst pose, m / degrees", text=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}")
+        if robot.latencies:
+            parts = np.percentile(1e3 * np.array(robot.latencies), (50, 95, 99))
+            yield Row(f"{name}: cloud to pose p50 / p95 / p99, ms", text=" / ".join(f"{part:.0f}" for part in parts))
+
+
+def survived(events: Sequence[Event]) -> Iterator[Row]:
+    """Yield the faults, and the robots that did not recover."""
+    made = [event for event in events if not event.skipped]
+    times = [seconds for event in made for seconds in event.recoveries.values() if seconds is not None]
+    stuck, unfed = (sum(len(getattr(event, name)) for event in made) for name in ("stuck", "unfed"))
+    yield Row("soak/faults", len(made), text=f"{len(made)} of {len({event.fault for event in made})} kinds")
+    if times:
+        yield Row("soak/back after, median / worst s", text=f"{np.median(times):.1f} / {max(times):.1f}")
+    yield judged("soak/stuck for 60 s while frames came", f"{stuck} of {len(times) + stuck}", "0", stuck == 0, stuck)
+    yield Row("soak/robots of the bench that did not reach the router again", float(unfed))
+    if skipped := sorted({f"{event.fault} ({event.skipped})" for event in events if event.skipped}):
+        yield Row("soak/skipped", text="; ".join(skipped))
+
+
+def processes(nodes: Sequence[Node], hours: float) -> Iterator[Row]:
+    """Yield crashes, and the slopes of memory and descriptors of all nodes' processes."""
+    crashes = [f"{node.site.name}: {crash}" for node in nodes for crash in node.crashes]
+    text = "; ".join(crashes) or "0"
+    yield judged("soak/ended by themselves, or not when asked", text, "0", not crashes, len(crashes))
+    logs = (node.log.read_text(errors="replace") for node in nodes)
+    traces = sum(log.count("Traceback (most recent call last)") for log in logs)
+    yield judged("soak/tracebacks in logs", str(traces), "0", traces == 0, traces)
+    for node in nodes:
+        parts = sorted({part for part, _ in node.samples})
+        for figure, most, unit in LEAKS:
+            slopes = {p: slope([s for (own, _), s in node.samples.items() if own == p], figure, WARM) for p in parts}
+            known = [value for value in slopes.values() if value is not None]
+            total = sum(known) if known else math.nan
+            text = "; ".join(f"{part} {'-' if value is None else f'{value:+.2f}'}" for part, value in slopes.items())
+            long = hours >= MIN_HOURS and bool(known)
+            yield judged(
+                f"soak/{node.site.name}: {figure} of its processes, slope after 10 min",
+                f"{total:+.2f} {unit} ({text})" if known else "-",
+                f"< {most:g} {unit}" if long else "", total < most if long else None, total,
+            )  # fmt: skip
+        last = {part: samples[-1].megabytes for (part, _), samples in node.samples.items()}
+        yield Row(f"soak/{node.site.name}: memory of its own at the end, MB", sum(last.values()), details=last)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Lay out the faults by kind, and what was held."""
-    del asked
+    """Lay out the faults by kind."""
     events = [row.details for row in rows if "recoveries" in row.details]
     body = []
-    for name in dict.fromkeys(event["fault"] for event in events):
+    for name in sorted({event["fault"] for event in events}):
         own = [event for event in events if event["fault"] == name and not event["skipped"]]
-        times = [each for event in own for each in event["recoveries"].values() if each is not None]
+        times = [s for event in own for s in event["recoveries"].values() if s is not None]
         lost = sum(len(event["stuck"]) + len(event["unfed"]) + event["crashes"] > 0 for event in own)
-        body.append(
-            [
-                name,
-                str(len(own)),
-                str(len(own) - lost),
-                f"{np.median(times):.1f}" if times else "-",
-                f"{max(times):.1f}" if times else "-",
-                str(sum(event["false"] for event in own)),
-            ]
-        )
-    facts = [row for row in rows if "recoveries" not in row.details]
-    verdict = {True: "holds", False: "**does not hold**", None: ""}
-    said = [
-        [row.name.removeprefix("soak/"), row.text or f"{row.ours:.3g} {row.unit}", row.target, verdict[row.holds]]
-        for row in facts
-    ]
-    head = ["fault", "times", "survived", "back after, median s", "worst s", "false poses"]
-    return {"faults": table(head, sorted(body)), "held": table(["what", "measured", "target", "verdict"], said)}
+        spent = [f"{np.median(times):.1f}", f"{max(times):.1f}"] if times else ["-", "-"]
+        body.append([name, str(len(own)), str(len(own) - lost), *spent, str(sum(event["false"] for event in own))])
+    return {"": table(["fault", "times", "survived", "back after, median s", "worst s", "false poses"], body)}

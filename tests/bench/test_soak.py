@@ -1,0 +1,127 @@
+"""Scores of the soak: false poses, recoveries, stamps of odd clocks, slopes of memory; and a short one."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nightly import nightly
+
+from bench.harness.files import ROOT, environment
+from bench.harness.rows import Row
+from bench.soak.faults import ENDS_PROCESSES, FAULTS
+from bench.soak.robots import Manner, Robot, content_of, stamp
+from bench.soak.sites import Site
+from bench.soak.soak import chosen
+from bench.soak.stage import Sampled, slope
+from coview_stream.clouds import write_tum
+from coview_stream.messages import encode_pose
+from coview_stream.messages.types import PoseMessage, Sample
+
+START = 1000.0  # monotonic
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    """Return a robot that drives along x at 5 m/s, frame after frame."""
+    truth = np.tile(np.eye(4), (400, 1, 1))
+    truth[:, 0, 3] = 0.5 * np.arange(400)
+    write_tum(tmp_path / "truth.tum", 1000.0 + 0.1 * np.arange(400), truth)
+    return Robot("r1", Site("town", tmp_path, tmp_path / "site.coview", deceptive=False), start=START)
+
+
+def say(
+    robot: Robot, content: float, x: float = 0.0, degrees: float = 0.0, age: float = 0.0, manner: Manner | None = None
+) -> None:
+    """Have a pose arrive 0.1 s after its moment, off by metres and degrees."""
+    off, a = np.eye(4), math.radians(degrees)
+    off[:2, :2], off[0, 3] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]], x
+    T = robot.drive.truth(stamp(content, Manner())) @ off
+    message = PoseMessage(stamp(content, manner or Manner()), "r1", "TRACKING", T, np.eye(6), 1.0, "0" * 64, age)
+    sent = encode_pose(message, "json")
+    robot.take_pose(START + content + 0.1, Sample("coview/r1/out/pose", sent.payload, sent.encoding))
+
+
+@pytest.mark.parametrize(("x", "degrees", "false"), [(2.9, 4.9, 0), (3.1, 0.0, 1), (0.0, 5.1, 1)])
+def test_a_pose_is_false_beyond_three_metres_or_five_degrees(
+    robot: Robot, x: float, degrees: float, false: int
+) -> None:
+    say(robot, 10.0, x, degrees)
+    assert len(robot.false) + robot.unreadable == false
+
+
+def test_a_pose_is_judged_by_its_stamp_whatever_the_sensor_clock(robot: Robot) -> None:
+    late = Manner(offset=3600.0)
+    say(robot, 10.0, manner=late)
+    assert len(robot.false) == 1  # of a clock that the robot never had
+    robot.manners.append(late)
+    say(robot, 10.2, manner=late)
+    say(robot, 10.4)
+    assert (len(robot.false), robot.poses) == (1, 3)
+    robot.take_pose(START, Sample("coview/r1/out/pose", b"\xff", "application/json"))
+    robot.take_status(b"[]")
+    assert robot.unreadable == 2
+
+
+def test_only_a_frame_taken_afterwards_is_a_recovery(robot: Robot) -> None:
+    robot.expect(START + 10.0)
+    say(robot, 11.0, age=1.5)  # dead reckoning since a frame before
+    assert robot.recovered is None
+    say(robot, 11.2, age=0.2)
+    assert robot.recovered == pytest.approx(START + 11.3)
+
+
+@pytest.mark.parametrize("manner", [Manner(), Manner(offset=3600.0), Manner(offset=-600.0), Manner(unit_ns=1_000_000)])
+def test_a_stamp_gives_the_moment_of_the_drive_whatever_the_clock_did(manner: Manner) -> None:
+    known = [Manner(), Manner(offset=3600.0), Manner(offset=-600.0), Manner(unit_ns=1_000_000)]
+    for content in (0.1, 250.25, 3599.9):
+        assert content_of(stamp(content, manner), known, near=content + 2.0) == pytest.approx(content, abs=1e-3)
+
+
+def test_every_fault_comes_once_before_any_comes_again_and_processes_grow_old_every_other_round() -> None:
+    gentle = set(FAULTS) - set(ENDS_PROCESSES)
+    assert len(ENDS_PROCESSES) == 4
+    drawn = list(islice(chosen([], 5), 2 * len(FAULTS) + len(gentle)))
+    first, second, third = drawn[: len(FAULTS)], drawn[len(FAULTS) : -len(FAULTS)], drawn[-len(FAULTS) :]
+    assert set(first) == set(third) == set(FAULTS)
+    assert set(second) == gentle
+
+
+def samples(begin: float, seconds: float, start: float, per_hour: float, warm_up: float = 0.0) -> list[Sampled]:
+    at = np.arange(0.0, seconds, 10.0)
+    memory = start + per_hour * at / 3600 + warm_up * (1 - np.exp(-at / 30))
+    noise = np.random.default_rng(int(begin)).normal(0, 0.05, len(at))
+    return [Sampled(begin + t, m, 20) for t, m in zip(at, memory + noise, strict=True)]
+
+
+def test_a_leak_shows_across_restarts_and_warming_up_is_none() -> None:
+    rows = [samples(0.0, 1200.0, 100.0, 12.0), samples(1300.0, 1500.0, 80.0, 12.0)]
+    assert slope(rows, "megabytes", warm=180.0) == pytest.approx(12.0, abs=1.0)
+    assert slope(rows, "descriptors", warm=180.0) == 0.0
+    rows = [samples(900.0 * k, 800.0, 100.0 + k, 0.0, warm_up=40.0) for k in range(4)]
+    assert abs(slope(rows, "megabytes", warm=240.0) or 0.0) < 0.7
+    assert slope([samples(0.0, 60.0, 1.0, 0.0)], "megabytes", warm=0.0) is None
+
+
+@pytest.mark.slow
+@nightly
+def test_a_short_soak_survives_two_faults(tmp_path: Path) -> None:
+    pytest.importorskip("psutil")
+    out = tmp_path / "rows.json"
+    words = ["--quick", "--minutes", "0.3", "--every", "8", "--robots", "1", "--faults", "router", "no odometry"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "bench", "soak", *words, "--work", str(tmp_path), "--json", str(out)],
+        cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=400, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [Row.from_dict(values) for values in json.loads(out.read_text())]
+    events = [row.details for row in rows if "recoveries" in row.details]
+    assert {event["fault"] for event in events} == {"router killed, back after 3 s", "no odometry for 5 s"}
+    assert all(event["recoveries"]["r1"] < 60 for event in events)
+    assert all(row.holds for row in rows if row.holds is not None)
