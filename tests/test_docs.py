@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import coview_stream
+from bench.harness.run import BENCHMARKS
 from coview_stream import RejectionReason, State
 from coview_stream.cli import build_parser
 from coview_stream.localization.result import KeyframeEvidence
@@ -252,9 +253,15 @@ def test_commands_in_page_parse(page):
 
 def test_commands_are_found_and_a_wrong_option_is_refused():
     assert sum(whole for page in PAGES for whole, _ in calls(page)) > 30
-    assert sum(not whole for page in PAGES for whole, _ in calls(page)) > 5
+    assert sum(not whole for page in PAGES for whole, _ in calls(page)) > 2
     with pytest.raises(coview_stream.CoViewError, match="no-such"):
         build_parser().parse_args(["watch", "--no-such"])
+
+
+def test_benchmarks_in_pages_exist():
+    named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
+    assert len(named) > 5
+    assert named - {*BENCHMARKS, "results"} == set()
 
 
 def test_code_about_frames_runs():
