@@ -27,9 +27,9 @@ from coview_stream.geometry.transforms import (
     transform,
     yaw_of,
 )
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
@@ -125,12 +125,12 @@ class Chain:
         self.config = replace(config, registration=registration)
         self._base_map, self._local_maps = base_map, LocalMaps(base_map, registration.source_range)
 
-    def scan(self, query: SearchRequest) -> ScanInput:
+    def scan(self, query: SearchRequest) -> ObservedScan:
         """Return what of a query is registered."""
         points = prepare_scan(query.submap, query.position, self.config.registration)
-        return ScanInput(points, query.cloud, query.T_odom_body)
+        return ObservedScan.of(points, query.cloud, query.T_odom_body)
 
-    def register(self, named: list[Hypothesis], scan: ScanInput) -> tuple[Scored, list[Candidate]]:
+    def register(self, named: list[Hypothesis], scan: ObservedScan) -> tuple[Scored, list[Candidate]]:
         """Return the evidence of the places named, and the most probable of them registered, in that order."""
         scored = PlaceScorer(self._base_map).score(named, range(len(named)), 0, scan)
         found = [

@@ -19,9 +19,10 @@ from bench.harness.worlds import Place
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput, register
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
@@ -101,5 +102,5 @@ class Tracking:
             return Answer(None, False)
         T = found.T_map_source
         # the submap's frame takes the place of odometry's
-        scan = ScanInput(source, newest.cloud, inverse(place.T_odom_submap) @ newest.T_odom_body)
+        scan = ObservedScan.of(source, newest.cloud, inverse(place.T_odom_submap) @ newest.T_odom_body)
         return Answer(T, PlaceEvidence(self._site).observe(scan, T).ratio > 0.0)

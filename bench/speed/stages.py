@@ -33,8 +33,8 @@ TRACKING = (
     ("match to map, the rest of it", "tracking.tracker:Tracker.match_to_map"),
     ("crop of the map", "registration.local_map:LocalMaps.around"),
     ("points to register", "tracking.tracker:prepare_scan"),
-    ("registration", "registration.register:register"),
-    ("observed scan", "evidence.observed_scan:ObservedScan.of"),
+    ("registration", "tracking.map_matching:register"),
+    ("observed scan", "evidence.observation:ObservedScan.of"),
 )
 SEARCH = (
     ("step, the rest of it", "search.global_search:GlobalSearch.update"),
@@ -44,10 +44,10 @@ SEARCH = (
     ("learned: vote", "search.learned.matcher:FeatureMatcher.vote"),
     ("consensus", "search.consensus:Consensus.vote"),
     ("distinct places", "search.consensus:Consensus.hypotheses"),
-    ("field: look up", "evidence.observed_scan:ScanPart.look_up"),
+    ("field: look up", "evidence.observation:ScanPart.look_up"),
     ("evidence", "search.scoring:PlaceScorer.score"),
     ("crop of the map", "registration.local_map:LocalMaps.around"),
-    ("registration", "registration.register:register"),
+    ("registration", "search.refinement:register"),
     ("decision", "search.global_search:decide"),
 )
 """Label, and where the function is looked up, below the package of localization."""

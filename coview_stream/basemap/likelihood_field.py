@@ -1,4 +1,4 @@
-"""Likelihood field of a map: rasters of what verification asks of the map at a pose, which is scored by looking up.
+"""Likelihood field of a map: rasters in which a pose is scored by looking up.
 
 Square cells of half a metre, in tiles of 16 m that are stored only where the map has been surveyed:
 

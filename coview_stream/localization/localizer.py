@@ -17,11 +17,11 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.evidence.observation import RangeImage
 from coview_stream.localization.frame import Frame, FramePreparation
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.registration.verification import RangeImage
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch

@@ -11,8 +11,8 @@ from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, posi
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.evidence.words import one_in
-from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift

@@ -7,24 +7,11 @@ can be called from any thread. Importing this package does not import Taichi; th
 
 from __future__ import annotations
 
-from coview_kernels.arrays import OverheadGrid, PolarGrid
+from coview_kernels.arrays import OverheadGrid, PolarGrid, Raster
 from coview_kernels.covisibility import coview
 from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.distinct import distinct_poses
-from coview_kernels.evidence import (
-    Beams,
-    Distances,
-    PointCounts,
-    PointKind,
-    Raster,
-    RayCounts,
-    Sight,
-    beam_cells,
-    match_points,
-    match_rays,
-    sort_beams,
-)
-from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores, near_structure, unexplained
+from coview_kernels.field import FieldMap, FieldScan, FieldScores, Move, field_scores, near_structure, unexplained
 from coview_kernels.icp import SCATTER, Alignment, Belief, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
@@ -39,24 +26,19 @@ from coview_kernels.windows import WindowImages, WindowRaster, window_products
 __all__ = [
     "SCATTER",
     "Alignment",
-    "Beams",
     "Belief",
     "CodedQuery",
     "Crop",
     "Cut",
-    "Distances",
     "FieldMap",
     "FieldScan",
     "FieldScores",
+    "Move",
     "OverheadGrid",
-    "PointCounts",
     "PointGrid",
-    "PointKind",
     "PolarGrid",
     "Raster",
-    "RayCounts",
     "Scale",
-    "Sight",
     "StationCodes",
     "VoxelFilter",
     "WindowImages",
@@ -64,7 +46,6 @@ __all__ = [
     "align_planes",
     "all_shift_distance",
     "backend",
-    "beam_cells",
     "column_spectra",
     "coview",
     "crop_points",
@@ -73,14 +54,11 @@ __all__ = [
     "field_scores",
     "height_columns",
     "lowest_heights",
-    "match_points",
-    "match_rays",
     "near_structure",
     "nearest",
     "offsets_near",
     "polar_bin",
     "shutdown",
-    "sort_beams",
     "station_bins",
     "submit",
     "transform_unique",

@@ -13,8 +13,8 @@ Integers = ti.types.ndarray(i32, 1)
 Bytes = ti.types.ndarray(ti.i8, 1)
 
 FINITE = 3.4028235e38
-# settings: centre (2) and squared radius; of sort also the grid's frame (8), the raster's corner (2), cells per metre
-RADIUS, FRAME, CORNER, PER_METRE = 2, 3, 11, 13
+# settings: centre (2) and squared radius; of sort also the grid's frame (8)
+RADIUS, FRAME = 2, 3
 
 
 @ti.func
@@ -47,8 +47,8 @@ def measure(points: Floats, spans: Integers, settings: Doubles, bounds: Floats, 
 
 @ti.kernel
 def sort(
-    points: Floats, normals: Bytes, spans: Integers, settings: Doubles, every: i32, columns: i32,
-    cell: Integers, starts: Integers, rows: Integers, planes: Floats, sample: Floats, top: Floats,
+    points: Floats, normals: Bytes, spans: Integers, settings: Doubles,
+    cell: Integers, starts: Integers, rows: Integers, planes: Floats,
 ):  # fmt: skip
     """Sort the points inside by cell, by counting; see crop.py for what is written. ``starts`` comes as zeros.
 
@@ -56,10 +56,10 @@ def sort(
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
-        number = ti.Vector([settings[k] for k in ti.static(range(14))])
+        number = ti.Vector([settings[k] for k in ti.static(range(11))])
         nx, ny = ti.cast(number[FRAME + 5], i32), ti.cast(number[FRAME + 6], i32)
         nz = ti.cast(number[FRAME + 7], i32)
-        at, kept, wait = 0, 0, 0
+        at = 0
         for s in range(spans.shape[0] // 2):
             for n in range(spans[2 * s], spans[2 * s + 1]):
                 x, y, z = points[3 * n], points[3 * n + 1], points[3 * n + 2]
@@ -70,15 +70,6 @@ def sort(
                     j = cell_of((v - number[FRAME + 1]) * number[FRAME + 4], ny)
                     c = (i * ny + j) * nz + cell_of((w - number[FRAME + 2]) * number[FRAME + 4], nz)
                     starts[c] = starts[c] + 1
-                    if wait == 0:
-                        sample[kept], sample[kept + 1], sample[kept + 2] = x, y, z
-                        kept += 3
-                        wait = every
-                    wait -= 1
-                    # neither is below zero
-                    a = ti.cast((u - number[CORNER]) * number[PER_METRE], i32) * columns
-                    a += ti.cast((v - number[CORNER + 1]) * number[PER_METRE], i32)
-                    top[a] = ti.max(top[a], z)
                 cell[at] = c
                 at += 1
         end = 0

@@ -36,6 +36,16 @@ class PolarGrid(NamedTuple):
     """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
 
 
+class Raster(NamedTuple):
+    """Values (NX, NY) of square cells."""
+
+    values: npt.NDArray[Any]
+    corner: F64
+    """(2,) x and y of the first cell's corner, metres."""
+    cell: float
+    """Edge of a cell, metres."""
+
+
 class OverheadGrid(NamedTuple):
     """Square cells seen from above; row along y, column along x."""
 
@@ -57,11 +67,6 @@ def as_float32(name: str, value: npt.ArrayLike, *shape: int | None) -> F32:
 def as_int32(name: str, value: npt.ArrayLike, *shape: int | None) -> I32:
     """Return ``value`` as a C-contiguous int32 array of ``shape`` (None: any length); ValueError otherwise."""
     return _as_array(name, value, np.int32, shape)
-
-
-def as_uint8(name: str, value: npt.ArrayLike, *shape: int | None) -> U8:
-    """Return ``value`` as a C-contiguous uint8 array of ``shape`` (None: any length); ValueError otherwise."""
-    return _as_array(name, value, np.uint8, shape)
 
 
 def as_finite64(name: str, value: npt.ArrayLike, *shape: int | None) -> F64:

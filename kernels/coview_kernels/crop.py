@@ -16,7 +16,7 @@ from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, I8, I32
 from coview_kernels.cells import CELL, Cells, grid_frame
 from coview_kernels.launch import Launch
-from coview_kernels.reference.crop import LOWEST, Crop, Cut
+from coview_kernels.reference.crop import Crop, Cut
 from coview_kernels.warm_up import compiled_by
 
 __all__ = ["Crop", "Cut", "crop_points"]
@@ -29,7 +29,7 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
         points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
         normals: (N, 3) int8, contiguous, normals, as long as the planarity around each point, times 127.
         spans: (S, 2) first row and row after the last of each stretch of the map to look at.
-        cut: what to cut out and what to make of it.
+        cut: the circle to cut out.
 
     Returns:
         The crop, or None where there is no point.
@@ -44,8 +44,8 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
     begin, end = stretches.T
     if not ((begin >= 0) & (begin <= end) & (end <= len(points))).all():
         raise ValueError(f"spans must lie in the map's {len(points)} points and not end before they begin")
-    if not (all(math.isfinite(v) for v in cut) and cut.radius > 0 and cut.every >= 1 and cut.cell > 0):
-        raise ValueError(f"cut must have a positive radius, every and cell, got {cut}")
+    if not (all(math.isfinite(v) for v in cut) and cut.radius > 0):
+        raise ValueError(f"cut must be finite with a positive radius, got {cut}")
 
     def ready() -> bool:
         return _measure.ready() and _sort.ready()
@@ -58,8 +58,8 @@ _measure = Launch(
     "crop", "measure", _NO[np.float32], _NO[np.int32], np.zeros(3), np.zeros(6, np.float32), _NO[np.int32]
 )
 _sort = Launch(
-    *("crop", "sort", _NO[np.float32], _NO[np.int8], _NO[np.int32], np.zeros(14), 1, 1),
-    *(_NO[np.int32], _NO[np.int32], _NO[np.int32], _NO[np.float32], _NO[np.float32], _NO[np.float32]),
+    *("crop", "sort", _NO[np.float32], _NO[np.int8], _NO[np.int32], np.zeros(11)),
+    *(_NO[np.int32], _NO[np.int32], _NO[np.int32], _NO[np.float32]),
 )
 _cells: I32 = np.empty(1 << 16, dtype=np.int32)  # of a crop's points, to work with
 
@@ -74,24 +74,17 @@ def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
         return None
     low, high = bounds[:3].astype(np.float64), bounds[3:].astype(np.float64)
     frame = grid_frame(low, high, CELL)
-    corner, shape = cut.raster(low, high)
-    starts, rows, planes, sample, top = _arena(
-        (int(frame[5:].prod()) + 1, np.int32), (4 * number, np.int32), (3 * number, np.float32),
-        (3 * -(-number // cut.every), np.float32), (shape[0] * shape[1], np.float32),
-    )  # fmt: skip
+    starts, rows, planes = _arena(
+        (int(frame[5:].prod()) + 1, np.int32), (4 * number, np.int32), (3 * number, np.float32)
+    )
     starts.fill(0)
-    top.fill(LOWEST)
     candidates = int((spans[:, 1] - spans[:, 0]).sum())
     if candidates > len(_cells):
         _cells = np.empty(1 << (candidates - 1).bit_length(), dtype=np.int32)
-    settings = np.concatenate((around, frame, corner, [1.0 / cut.cell]))
-    _launch(
-        _sort, flat, normals.reshape(-1), spans.reshape(-1), settings, cut.every, shape[1],
-        _cells, starts, rows, planes, sample, top,
-    )  # fmt: skip
+    settings = np.concatenate((around, frame))
+    _launch(_sort, flat, normals.reshape(-1), spans.reshape(-1), settings, _cells, starts, rows, planes)
     sorted_points = rows.view(np.float32).reshape(-1, 4)[:, :3]
-    cells = Cells(frame, starts, rows)
-    return Crop(sorted_points, planes.reshape(-1, 3), cells, sample.reshape(-1, 3), top.reshape(shape), corner)
+    return Crop(sorted_points, planes.reshape(-1, 3), Cells(frame, starts, rows))
 
 
 def _arena(*parts: tuple[int, Any]) -> list[npt.NDArray[Any]]:
@@ -110,7 +103,7 @@ def _launch(launch: Launch, *arguments: Any) -> None:
 
 def _compile() -> None:
     cloud = np.zeros((1, 3), dtype=np.float32)
-    crop_points(cloud, np.zeros((1, 3), dtype=np.int8), [[0, 1]], Cut(0.0, 0.0, 1.0, 1, 1.0))
+    crop_points(cloud, np.zeros((1, 3), dtype=np.int8), [[0, 1]], Cut(0.0, 0.0, 1.0))
 
 
 compiled_by("crop_points", _compile)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -46,6 +47,16 @@ Zeros = Callable[[str, tuple[int, ...], type[np.generic]], npt.NDArray[Any]]
 
 def _in_memory(name: str, shape: tuple[int, ...], kind: type[np.generic]) -> npt.NDArray[Any]:
     return np.zeros(shape, dtype=kind)
+
+
+class Move(Enum):
+    """How far hypotheses are moved to the best pose around them."""
+
+    NONE = "none"
+    NEAR = "near"
+    """By at most 0.4 m and 0.8 degrees, fine levels only."""
+    FAR = "far"
+    """By at most 3 m and 7 degrees."""
 
 
 class FieldScores(NamedTuple):
@@ -183,17 +194,14 @@ class FieldMap:
         return table, np.concatenate([[0.0], self.tiles[:, 2]]).astype(np.float32)
 
 
-def field_scores(
-    field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine: bool = True, near: bool = False
-) -> FieldScores:
-    """Score hypotheses; each is moved to the best pose around it first, if ``refine``.
+def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: Move = Move.FAR) -> FieldScores:
+    """Score hypotheses, each moved to the best pose around it first.
 
     Args:
         field: the map.
         scan: points to compare, relative to the pivot.
         poses: (H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians.
-        refine: whether the poses are moved.
-        near: no farther than odometry drifts between two keyframes: by 0.4 m and 0.8 degrees, fine levels only.
+        move: how far the poses are moved.
 
     Raises:
         ValueError: a shape is wrong, or a pose not finite.
@@ -201,7 +209,7 @@ def field_scores(
     start = as_finite64("poses", poses, None, 4)
     structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
     few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
-    plan = Plan(structure, low, free, *few, LEVELS if refine else 0, not near)
+    plan = Plan(structure, low, free, *few, 0 if move is Move.NONE else LEVELS, move is Move.FAR)
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre a kilometre from the corner

@@ -72,12 +72,12 @@ def test_near_refinement_follows_drift_and_wanders_no_farther(
     scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray],
 ):
     field, scan, pose, others = scene
-    found = kernels.field_scores(field, scan, [pose + np.array([0.3, -0.25, 0.2, 0.01])], near=True)
+    found = kernels.field_scores(field, scan, [pose + np.array([0.3, -0.25, 0.2, 0.01])], kernels.Move.NEAR)
     off = np.abs(found.pose[0] - pose)
     assert off[:2].max() < 0.2
     assert off[2] < 0.05
     assert off[3] < np.radians(0.6)
-    moved = np.abs(kernels.field_scores(field, scan, others, near=True).pose - others)
+    moved = np.abs(kernels.field_scores(field, scan, others, kernels.Move.NEAR).pose - others)
     assert moved[:, :2].max() <= 0.375 + 1e-4
     assert moved[:, 3].max() <= np.radians(0.75) + 1e-4
 
@@ -87,10 +87,14 @@ def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
     few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
-    for levels, coarse in ((0, True), (2, True), (2, False)):
+    for move, levels, coarse in (
+        (kernels.Move.NONE, 0, False),
+        (kernels.Move.FAR, 2, True),
+        (kernels.Move.NEAR, 2, False),
+    ):
         plan = Plan(scan.structure, scan.low, scan.free, *few, levels, coarse)
         poses, counts = reference.field_scores(field.layers, plan, starts - corner)
-        found = kernels.field_scores(field, scan, starts, refine=levels > 0, near=not coarse)
+        found = kernels.field_scores(field, scan, starts, move)
         # a point on a cell's edge may round to either side; a few of a thousand do
         same = (np.abs(found.pose - poses - corner) < 0.02).all(axis=1)
         assert same.mean() > 0.9
@@ -99,7 +103,7 @@ def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.
 
 def test_unsurveyed_cells_are_left_out(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
     field, scan, pose, _ = scene
-    half = kernels.field_scores(field, scan, [pose + np.array([24.0, 0, 0, 0])], refine=False)
+    half = kernels.field_scores(field, scan, [pose + np.array([24.0, 0, 0, 0])], kernels.Move.NONE)
     away = kernels.field_scores(field, scan, [pose + np.array([500.0, -300.0, 0, 0])])
     assert 0.2 * len(scan.structure) < half.structure[0] < 0.8 * len(scan.structure)
     assert not any(int(n[0]) for n in away[1:])
@@ -110,7 +114,7 @@ def test_walls_below_a_roof_edge_are_covered():
     field, _ = street(np.random.default_rng(3))
     below = np.column_stack([np.full(50, 17.0), np.full(50, 17.0), np.linspace(1, 9, 50)]).astype(np.float32)
     empty = np.zeros((0, 3), dtype=np.float32)
-    found = kernels.field_scores(field, FieldScan(below, empty, empty), np.zeros((1, 4)), refine=False)
+    found = kernels.field_scores(field, FieldScan(below, empty, empty), np.zeros((1, 4)), kernels.Move.NONE)
     assert found.structure[0] == 50
     assert found.covered[0] == 50
     assert found.near[0] == 0

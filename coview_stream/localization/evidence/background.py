@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.observation import Share
 
 # what is presumed before any place has been scored: as many chance places as these; set by hand
 _PSEUDO = 6.0  # chance places

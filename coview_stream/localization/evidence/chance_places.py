@@ -11,7 +11,7 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.evidence.background import Background, Most, estimate_background, scatter
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand
 _RINGS = (3.0, 5.0, 8.0, 12.0)  # metres from the pose
@@ -25,10 +25,10 @@ def observe_with_background(
     """Observe the map from poses (P, 4, 4) as they are, and measure the background around the first of them.
 
     Returns:
-        Observations (P, 7), see :class:`~coview_stream.localization.evidence.observed_scan.Share`, and the background.
+        Observations (P, 7), see :class:`~coview_stream.localization.evidence.observation.Share`, and the background.
     """
     poses = seen.poses(T_map_odom)
-    observed = seen.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), "no")[1]
+    observed = seen.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), kernels.Move.NONE).shares
     places, chance = observed[: len(poses)], observed[len(poses) :]
     return places, estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
 

@@ -26,7 +26,7 @@ from scipy.special import betaln
 
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.evidence.background import Background, outcomes
-from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.observation import Share
 
 # set by hand
 _KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand
 _PRIOR = 5e-4  # probability that a survey has a part of the site shifted as a whole
@@ -88,7 +88,7 @@ def _seen(
     for scan in reversed(scans):
         pose, structure = scan.poses(T), scan.many.points.structure
         if scan is not scans[-1]:  # the drift since then undone
-            pose, _, _ = scan.few.look_up(field, pose, "near")
+            pose = scan.few.look_up(field, pose, kernels.Move.NEAR).poses
             T = scan.transforms(pose)
         cos, sin = math.cos(pose[0, 3]), math.sin(pose[0, 3])
         turned = structure @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -22,7 +22,6 @@ from coview_stream.geometry.arrays import Floats, Ints, Reals
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
-from coview_stream.localization.registration.verification import STRUCTURE_HEIGHT
 
 # chosen on drives through a simulated town and a campus, their ground lifted by -0.2, 0 and 0.3 m, and looked at on
 # three real runs and a real forest plot spoilt likewise (docs/tracking.md); no command prints it
@@ -115,7 +114,7 @@ class GroundOffset:
 
 def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap) -> Floats | None:
     """Return the log-likelihoods (G, 51) of growths and offsets, -0.5 to 0.5 m; None without structure or ground."""
-    structure = _some(cloud.points[cloud.height > STRUCTURE_HEIGHT])
+    structure = _some(cloud.points[cloud.high])
     ground = _some(cloud.points[~cloud.above])
     if len(structure) < _FEW or len(ground) < _FEW:
         return None

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 # set by hand
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
 _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
+STRUCTURE_HEIGHT = 1.0  # metres above the lowest ground nearby
 _SEED = 20240  # of the choice among too many points
 
 
@@ -38,6 +39,11 @@ class RegistrationCloud:
     above: Bools
     height: Floats32
     ground_offset: float = 0.0
+
+    @property
+    def high(self) -> Bools:
+        """(N,) which points are structure: more than a metre above the ground."""
+        return np.asarray(self.height > STRUCTURE_HEIGHT)
 
     def lowered(self, metres: float) -> RegistrationCloud:
         """Return the scan with its ground lowered, to lie where the survey has it; negative metres raise it."""

@@ -18,7 +18,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import yaw_of
-from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.scoring import PlaceScorer, Scored, ScoredPlace
@@ -165,7 +165,7 @@ class _Rehearsal:
         self.changed = changed
         self._retrieval = Retrieval(base_map, config.retrieval)
         self._scorer = PlaceScorer(base_map)
-        self._scans: OrderedDict[tuple[float, ...], ScanInput | None] = OrderedDict()
+        self._scans: OrderedDict[tuple[float, ...], ObservedScan | None] = OrderedDict()
         self._clear()
 
     def _clear(self) -> None:
@@ -201,7 +201,7 @@ class _Rehearsal:
         scored = self._scorer.score([Hypothesis(np.eye(4), station, 0, 0.0), *others], range(len(others) + 1), 0, scan)
         return _judged(scored, scan.T_odom_body[:3, 3], self.config.acceptance.risk)
 
-    def _scan(self, place: Floats) -> ScanInput | None:
+    def _scan(self, place: Floats) -> ObservedScan | None:
         """Return the virtual scan at a place (3,) on the ground."""
         key = tuple(place.tolist())
         if key not in self._scans:

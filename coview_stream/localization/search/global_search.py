@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
 from coview_stream.localization.evidence.moved_part import find_moved_part
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.considered import Considered
@@ -40,7 +40,7 @@ class GlobalSearch:
 
     KERNELS = (
         "transform_unique", "describe_points", "distinct_poses", "field_scores", "align_planes",
-        "crop_points", "match_points", "match_rays", "sort_beams",
+        "crop_points",
     )  # fmt: skip
     """Names of the kernels that it runs, for :func:`coview_kernels.warm_up`."""
 
@@ -108,9 +108,8 @@ class GlobalSearch:
         if request.epoch != self._epoch:
             self.clear()
             self._epoch = request.epoch
-        scan = ScanInput(
-            prepare_scan(request.submap, request.position, self.config.registration), request.cloud, request.T_odom_body
-        )
+        cloud = prepare_scan(request.submap, request.position, self.config.registration)
+        scan = ObservedScan.of(cloud, request.cloud, request.T_odom_body)
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         named, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request, scan)
@@ -139,7 +138,7 @@ class GlobalSearch:
         each = [recognizer.hypotheses() for recognizer in self._recognizers]
         return [own for some in each for own in some], [rank for some in each for rank in range(len(some))]
 
-    def _guessed(self, request: SearchRequest, scan: ScanInput) -> list[Hypothesis]:
+    def _guessed(self, request: SearchRequest, scan: ObservedScan) -> list[Hypothesis]:
         """Return the best of the places that somebody named, on the ground; seldom, once they have been tried.
 
         Only a few: all of them, around one place, would be taken for what chance finds on this map.
@@ -152,12 +151,11 @@ class GlobalSearch:
         named = on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
         if len(named) <= _GUESSES:
             return named
-        seen = ObservedScan.of(scan)
-        poses = seen.poses(np.array([each.T_map_odom for each in named]))
-        scores = seen.few.look_up(self.base_map.field, poses, "far")[2]
+        poses = scan.poses(np.array([each.T_map_odom for each in named]))
+        scores = scan.few.look_up(self.base_map.field, poses, Move.FAR).scores
         return [named[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
-    def _register(self, scored: Scored, scan: ScanInput, request: SearchRequest) -> Candidate | None:
+    def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Candidate | None:
         """Register the most probable place and verify it there; None if it comes to another one, or leans."""
         if not scored.places:
             return None

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
@@ -18,9 +19,8 @@ from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, boxminus
 from coview_stream.localization.evidence.chance_places import observe_with_background
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.refinement import Candidate, register_place
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
@@ -55,7 +55,7 @@ class Modes:
 
 
 def find_modes(
-    leader: Candidate, scan: ScanInput, request: SearchRequest, base_map: BaseMap, config: LocalizerConfig,
+    leader: Candidate, scan: ObservedScan, request: SearchRequest, base_map: BaseMap, config: LocalizerConfig,
     local_maps: LocalMaps,
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around a registered place, and weigh what comes out within the place."""
@@ -67,11 +67,10 @@ def find_modes(
         other = register_place(beside, scan, base_map, config, local_maps)
         if other is not None and same_place(other.T_map_odom, place, request, BASIN_DISTANCE, BASIN_ANGLE):
             found.append(other)
-    seen = ObservedScan.of(scan)
     poses = np.array([each.T_map_odom for each in found])
-    _, background = observe_with_background(base_map.field, seen, poses[:1])
-    _, observed, _ = seen.many.look_up(base_map.field, seen.poses(poses), "no")
-    ratios = log_likelihood_ratios(observed, background)[0]
+    _, background = observe_with_background(base_map.field, scan, poses[:1])
+    observed = scan.many.look_up(base_map.field, scan.poses(poses), Move.NONE)
+    ratios = log_likelihood_ratios(observed.shares, background)[0]
     own: list[int] = []
     for k in np.argsort(-ratios, kind="stable"):
         if not any(_same(found[k], found[j], scan.T_odom_body) for j in own):

@@ -10,10 +10,10 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
+from coview_stream.localization.evidence.observation import Evidence, ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import ScanInput, register_and_verify
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior, Registration
-from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.scoring import ScoredPlace
 
@@ -47,7 +47,7 @@ class Candidate:
 
 
 def register_place(
-    place: ScoredPlace, scan: ScanInput, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps
+    place: ScoredPlace, scan: ObservedScan, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps
 ) -> Candidate | None:
     """Register a scan at a place and verify it; None off the map, with too few pairs, or if the result leans."""
     settings = config.registration
@@ -58,10 +58,10 @@ def register_place(
         return None
     level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
     upright = Prior(level, gravity_information(settings.gravity_sigma))
-    match = register_and_verify(base_map, scan, start, target, settings, scales, upright, scan.cloud.every(_EVERY))
-    if match.registration is None or tilt_of(match.T_map_odom) > config.acceptance.max_tilt:
+    registration = register(scan.cloud.every(_EVERY), start, target, settings, scales, upright, scan.body)
+    if registration is None or tilt_of(registration.T_map_source) > config.acceptance.max_tilt:
         return None
-    return Candidate(place, match.registration, match.evidence)
+    return Candidate(place, registration, scan.evidence(base_map.field, registration.T_map_source))
 
 
 def gravity_information(sigma: float) -> Floats:

@@ -1,7 +1,7 @@
 """Scores of places: hundreds of hypotheses of a keyframe at once, and the evidence of the best over all keyframes.
 
 Each hypothesis is moved to the best pose around it, up to three metres and seven degrees away, by looking up what the
-map has there (:mod:`coview_stream.localization.evidence.observed_scan`). The best places are followed: every later
+map has there (:mod:`coview_stream.localization.evidence.observation`). The best places are followed: every later
 keyframe observes the map from them as well, and where a place is new, the keyframes before are asked as well, so that
 places are compared on the same observations. The evidence of a place is the log-likelihood ratio of the mean of its
 observations (:mod:`coview_stream.localization.evidence.likelihood`), against the background of all others.
@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
-from coview_stream.localization.evidence.observed_scan import ObservedScan, Share, surroundings
+from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.posterior import expected_by_chance, posterior
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
@@ -187,7 +187,7 @@ class PlaceScorer:
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
 
-    def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ScanInput) -> Scored:
+    def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the places that are followed.
 
         Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them.
@@ -198,7 +198,7 @@ class PlaceScorer:
             hints: how many pose hints there are.
             scan: the keyframe's.
         """
-        seen, known = ObservedScan.of(scan), self._followed
+        seen, known = scan, self._followed
         named = len(hypotheses) - hints
         fresh = [*hypotheses[:named], *self._around_leader(), *hypotheses[named:]]
         every = [*known.hypotheses, *fresh]
@@ -259,14 +259,17 @@ class PlaceScorer:
             return _Observed(np.empty((0, 4)), _NOTHING, np.empty(0, dtype=np.float32), [])
         start = seen.poses(np.array([each.T_map_odom for each in every]))
         parts = [
-            seen.few.look_up(self._base_map.field, start[:known], "near"),
-            seen.few.look_up(self._base_map.field, start[known:], "far"),
+            seen.few.look_up(self._base_map.field, start[:known], Move.NEAR),
+            seen.few.look_up(self._base_map.field, start[known:], Move.FAR),
         ]
-        poses, shares, scores = (np.concatenate(both) for both in zip(*parts, strict=True))
+        poses, shares, scores = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "shares", "scores")
+        )
         found = _Observed(poses, shares, scores, [])
         # some points tell what is far below the best; what is not is told apart by more
         promising = np.argsort(-scores * found.inside, kind="stable")[:_PROMISING]
-        _, shares[promising], scores[promising] = seen.many.look_up(self._base_map.field, poses[promising], "no")
+        closer = seen.many.look_up(self._base_map.field, poses[promising], Move.NONE)
+        shares[promising], scores[promising] = closer.shares, closer.scores
         return replace(found, groups=_places(poses, scores * found.inside))
 
     def _follow(
@@ -303,8 +306,8 @@ class PlaceScorer:
         out = np.empty((len(T_map_odom), len(self._scans), len(Share)), dtype=np.float32)
         for k in reversed(range(len(self._scans))):
             scan = self._scans[k]
-            poses, out[:, k], _ = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), "near")
-            T_map_odom = scan.transforms(poses)
+            observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NEAR)
+            out[:, k], T_map_odom = observed.shares, scan.transforms(observed.poses)
         return out
 
     def _evidence(

@@ -11,8 +11,8 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, norms, pose_from
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput
 
 EYE = 1.7
 """Metres of the sensor above the ground; set by hand."""
@@ -31,7 +31,7 @@ _MOVED = (3.0, 6.0)  # metres by which it does
 _TABLE = 64  # patches until their draws repeat
 
 
-def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: RegistrationConfig) -> ScanInput | None:
+def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: RegistrationConfig) -> ObservedScan | None:
     """Return what a sensor at ``eye`` (3,) sees of a map; odometry frame = map frame. None where it sees nothing.
 
     The map's points within 40 m are seen where nothing stands before them in cells of a degree, 22 degrees up and down.
@@ -51,7 +51,7 @@ def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: Registr
     seen += np.random.default_rng(0).normal(0.0, _NOISE, seen.shape).astype(np.float32)
     cloud = prepare_scan(seen + eye.astype(np.float32), eye, config)
     # a single return says nothing about a direction, where a lidar would have several
-    return ScanInput(cloud, np.repeat(seen, 2, axis=0), pose_from(np.eye(3), eye))
+    return ObservedScan.of(cloud, np.repeat(seen, 2, axis=0), pose_from(np.eye(3), eye))
 
 
 def _rearranged(points: Points, changed: float) -> Points:

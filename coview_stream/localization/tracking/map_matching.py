@@ -11,11 +11,11 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
+from coview_stream.localization.evidence.observation import Evidence, ObservedScan
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
 from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.register import ScanInput, register_and_verify
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
@@ -45,7 +45,7 @@ class MapMatch:
     T_map_body: Pose
     covariance: Floats
     innovation: float = 0.0
-    scan: ScanInput | None = None
+    scan: ObservedScan | None = None
     target: LocalMap | None = None
     rivals: tuple[Rival, ...] = ()
     moves_place: bool = False
@@ -80,7 +80,7 @@ class MapMatcher:
 
     def match(
         self,
-        scan: ScanInput,
+        scan: ObservedScan,
         belief: Estimate,
         target: LocalMap,
         scales: tuple[float, ...],
@@ -103,30 +103,31 @@ class MapMatcher:
         if information is None:
             return _failed(belief, "what is believed so far has a covariance without an inverse")
         prior = Prior(T_start, information)
-        found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
-        seen = self.place.observe(scan, found.T_map_odom)
-        rivals = find_rivals(self.place, scan, found.T_map_odom, target, settings, beside) if beside else []
+        registration = register(scan.cloud, T_start, target, settings, scales, prior, scan.body)
+        T_map_odom = T_start if registration is None else registration.T_map_source
+        seen, evidence = self.place.observe(scan, T_map_odom), scan.evidence(self.base_map.field, T_map_odom)
+        rivals = find_rivals(self.place, scan, T_map_odom, target, settings, beside) if beside else []
         seen = replace(seen, rival=max([0.0, *(rival.ratio for rival in rivals)]))
-        cause, reason = self._judge(seen, found.evidence)
-        if found.registration is None:
+        cause, reason = self._judge(seen, evidence)
+        if registration is None:
             if cause is RejectionReason.VERIFIED:
-                return _failed(belief, "too few points have a partner in the map", found.evidence, seen)
-            return MapMatch.without_registration(MatchVerdict(cause, reason, found.evidence, None, seen), belief)
-        tilt = tilt_of(found.T_map_odom)
+                return _failed(belief, "too few points have a partner in the map", evidence, seen)
+            return MapMatch.without_registration(MatchVerdict(cause, reason, evidence, None, seen), belief)
+        tilt = tilt_of(T_map_odom)
         if tilt > acceptance.max_tilt:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
-            T_map_body = found.T_map_odom @ scan.T_odom_body
-            own = remove_prior(T_map_body, found.registration.information, belief.T_map_body, information, settings)
+            T_map_body = T_map_odom @ scan.T_odom_body
+            own = remove_prior(T_map_body, registration.information, belief.T_map_body, information, settings)
             covariance = registration_covariance(own.information, settings)
             innovation = graph.innovation(own.T_map_body, covariance)
         except InputError as error:
-            return _failed(belief, str(error), found.evidence, seen)
-        verdict = MatchVerdict(cause, reason, found.evidence, innovation, seen)
+            return _failed(belief, str(error), evidence, seen)
+        verdict = MatchVerdict(cause, reason, evidence, innovation, seen)
         return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target, tuple(rivals))
 
     def match_widely(
-        self, first: MapMatch, scan: ScanInput, belief: Estimate, target: LocalMap, graph: PoseGraph
+        self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, graph: PoseGraph
     ) -> list[MapMatch]:
         """Match again, from a wide belief and from the best rival of a match, and hold all against each other.
 

@@ -16,14 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.background import Background
 from coview_stream.localization.evidence.chance_places import observe_with_background
 from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
-from coview_stream.localization.evidence.observed_scan import ObservedScan
-from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
 _SPREAD = 0.05  # standard deviation of the share q that is as the map has it, from one registration to the next
@@ -56,7 +56,7 @@ class Observation:
 class _Around(NamedTuple):
     """Background around a pose (4, 4) where a scan was observed."""
 
-    scan: ScanInput
+    scan: ObservedScan
     T_map_odom: Pose
     background: Background
 
@@ -66,33 +66,26 @@ class PlaceEvidence:
 
     def __init__(self, base_map: BaseMap) -> None:
         self._base_map = base_map
-        self._seen: tuple[ScanInput, ObservedScan] | None = None  # the newest
-        self._around: _Around | None = None  # likewise
+        self._around: _Around | None = None  # the newest
         self.clear()
 
     def clear(self) -> None:
         """Forget what is known: the place is another."""
         self._known = np.full(NUISANCES, 1.0 / np.prod(NUISANCES))
 
-    def observe(self, scan: ScanInput, T_map_odom: Pose) -> Observation:
+    def observe(self, scan: ObservedScan, T_map_odom: Pose) -> Observation:
         """Return what a scan, put there by a pose (4, 4), says of it; changes nothing."""
         likelihoods = self._likelihoods(scan, T_map_odom[None])
         return Observation(float(self._ratios(likelihoods)[0]), likelihoods[0])
 
-    def ratios(self, scan: ScanInput, T_map_odom: Floats) -> Floats:
+    def ratios(self, scan: ObservedScan, T_map_odom: Floats) -> Floats:
         """Return the log-likelihood ratios (P,) of poses (P, 4, 4) against chance around the first."""
         return self._ratios(self._likelihoods(scan, T_map_odom))
 
-    def look_around(self, scan: ScanInput, T_map_odom: Pose, poses: Floats) -> tuple[Floats, Floats]:
+    def look_around(self, scan: ObservedScan, T_map_odom: Pose, poses: Floats) -> tuple[Floats, Floats]:
         """Move poses (H, 4) to the best near each: where to, and log-likelihood ratios (H,) as around (4, 4)."""
-        moved, observed, _ = self.seen(scan).few.look_up(self._base_map.field, poses, "near")
-        return moved, self._ratios(log_likelihoods(observed, self._background(scan, T_map_odom)))
-
-    def seen(self, scan: ScanInput) -> ObservedScan:
-        """Return a scan as it is observed; that of the newest is kept."""
-        if self._seen is None or self._seen[0] is not scan:
-            self._seen = scan, ObservedScan.of(scan)
-        return self._seen[1]
+        observed = scan.few.look_up(self._base_map.field, poses, Move.NEAR)
+        return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
 
     def learn(self, observation: Observation) -> None:
         """Learn the nuisances from a registration that is believed; not from others, or a wrong place became usual."""
@@ -100,17 +93,17 @@ class PlaceEvidence:
         posterior = self._presumed() * np.exp(likelihoods - likelihoods.max())
         self._known = posterior / posterior.sum()
 
-    def _likelihoods(self, scan: ScanInput, T_map_odom: Floats) -> Floats:
+    def _likelihoods(self, scan: ObservedScan, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (P, Q, D, L) of poses (P, 4, 4) against chance around the first."""
         background = self._background(scan, T_map_odom[0])
-        seen = self.seen(scan)
-        return log_likelihoods(seen.few.look_up(self._base_map.field, seen.poses(T_map_odom), "no")[1], background)
+        observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NONE)
+        return log_likelihoods(observed.shares, background)
 
-    def _background(self, scan: ScanInput, T_map_odom: Pose) -> Background:
+    def _background(self, scan: ObservedScan, T_map_odom: Pose) -> Background:
         """Return the background around a pose (4, 4); that of the newest is kept."""
         around = self._around
         if around is None or around.scan is not scan or not np.array_equal(around.T_map_odom, T_map_odom):
-            _, background = observe_with_background(self._base_map.field, self.seen(scan), T_map_odom[None])
+            _, background = observe_with_background(self._base_map.field, scan, T_map_odom[None])
             self._around = around = _Around(scan, T_map_odom, background)
         return around.background
 

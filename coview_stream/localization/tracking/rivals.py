@@ -15,8 +15,9 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.register import ScanInput, register
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.slip import matters, off_by
@@ -43,7 +44,7 @@ class Rival:
 
 def find_rivals(
     place: PlaceEvidence,
-    scan: ScanInput,
+    scan: ObservedScan,
     T_map_odom: Pose,
     target: LocalMap,
     config: RegistrationConfig,
@@ -59,8 +60,8 @@ def find_rivals(
         config: of the registration.
         count: so many at most; where more than one is asked for, other headings are tried, too.
     """
-    seen, T_odom_body = place.seen(scan), scan.T_odom_body
-    here = seen.poses(T_map_odom[None])[0]
+    T_odom_body = scan.T_odom_body
+    here = scan.poses(T_map_odom[None])[0]
     poses, ratios = place.look_around(scan, T_map_odom, rings(here, _TURNED if count > 1 else _STRAIGHT))
     level = config.gravity_sigma**-2
     cloud = scan.cloud.every(_EVERY)
@@ -72,7 +73,7 @@ def find_rivals(
         if not np.isfinite(ratios[best]):
             break
         taken.append(poses[best])
-        start = seen.transforms(poses[best][None])[0]
+        start = scan.transforms(poses[best][None])[0]
         settings = (config, scales or config.search[-1:], Prior(start, upright), T_odom_body[:3, 3])
         other = register(cloud, start, target, *settings)
         if other is None:

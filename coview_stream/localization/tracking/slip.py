@@ -15,7 +15,7 @@ import numpy as np
 
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
 from coview_stream.geometry.transforms import Pose, boxminus, inverse
-from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
 
@@ -51,7 +51,7 @@ class Dispute:
         self._begun = -math.inf  # metres driven where it began
 
     def settle(
-        self, scan: ScanInput, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
+        self, scan: ObservedScan, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
     ) -> Pose | None:
         """Return the pose ``T_map_body`` (4, 4) that must be the right one, as odometry has slipped; None: undecided.
 

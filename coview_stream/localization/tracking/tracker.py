@@ -14,6 +14,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle, transform, yaw_of
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
@@ -22,7 +23,6 @@ from coview_stream.localization.registration.covariance import (
 from coview_stream.localization.registration.ground_offset import GroundOffset
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.tracking.displacement_check import DisplacementCheck
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
@@ -196,7 +196,7 @@ class Tracker:
         if seen < _MIN_POINTS:
             verdict = MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register")
             return MapMatch.without_registration(verdict, belief)
-        scan = ScanInput(points, cloud, T_odom_body)
+        scan = ObservedScan.of(points, cloud, T_odom_body)
         match = self._matcher.match(scan, belief, target, self.config.registration.track, self._graph)
         limit, tries = self.config.acceptance.max_innovation, [match]
         if newest_only or not match.verdict.verified or match.innovation > limit:
@@ -244,7 +244,9 @@ class Tracker:
 
     # ---- inside
 
-    def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput, tries: list[MapMatch]) -> MapMatch:
+    def _against_odometry(
+        self, match: MapMatch, belief: Estimate, scan: ObservedScan, tries: list[MapMatch]
+    ) -> MapMatch:
         """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
         Where the two places are so near that either is good enough, what the lidar sees is believed, without a pose

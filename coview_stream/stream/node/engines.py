@@ -64,7 +64,7 @@ class TrackEngine:
     kernels = ("transform_unique", "nearest", "align_planes")
     # of robots that have a place to be tracked from, which takes a search longer than it does to load them
     later_kernels: tuple[str, ...] = (
-        "crop_points", "match_points", "match_rays", "sort_beams", "field_scores",
+        "crop_points", "field_scores",
     )  # fmt: skip
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:

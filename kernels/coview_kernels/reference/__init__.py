@@ -9,7 +9,6 @@ from __future__ import annotations
 from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.crop import crop_points
 from coview_kernels.reference.distinct import distinct_poses
-from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores, structure_at
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
@@ -31,12 +30,9 @@ __all__ = [
     "field_scores",
     "height_columns",
     "lowest_heights",
-    "match_points",
-    "match_rays",
     "nearest",
     "offsets_near",
     "polar_bin",
-    "sort_beams",
     "station_bins",
     "structure_at",
     "transform_unique",

@@ -6,30 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I8, I32
+from coview_kernels.arrays import F32, I8, I32
 from coview_kernels.cells import CELL, Cells, cell_numbers, grid_frame
-
-LOWEST = np.float32(-1e6)
-"""Height of a cell of the raster that has no point, metres."""
 
 
 class Cut(NamedTuple):
-    """What to cut out of a map, and what to make of it."""
+    """The circle to cut out of a map, metres; its edge is outside."""
 
     x: float
     y: float
     radius: float
-    """Metres around (x, y), exclusive."""
-    every: int
-    """Of so many points, in the map's order, one is in the sample."""
-    cell: float
-    """Edge of the raster's cells, metres."""
-
-    def raster(self, low: F64, high: F64) -> tuple[F64, tuple[int, int]]:
-        """Lower corner (2,) and shape of the raster for points between two corners: two cells of margin."""
-        corner = low[:2] - 2 * self.cell
-        last = np.floor((high[:2] - corner) * (1.0 / self.cell)).astype(np.int64)
-        return corner, (int(last[0]) + 3, int(last[1]) + 3)
 
 
 class Crop(NamedTuple):
@@ -40,13 +26,7 @@ class Crop(NamedTuple):
     normals: F32
     """(K, 3), as long as the planarity around each point."""
     cells: Cells
-    """Of these points, with the order that they have."""
-    sample: F32
-    """(S, 3) one of so many points."""
-    top: F32
-    """(H, W) height of the highest point in each cell of the raster, rows along x; ``LOWEST`` where there is none."""
-    corner: F64
-    """(2,) x and y of its first cell's corner."""
+    """Of these points, in their order."""
 
 
 def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
@@ -59,10 +39,6 @@ def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
     if not len(near):
         return None
     low, high = near.min(axis=0).astype(np.float64), near.max(axis=0).astype(np.float64)
-    corner, shape = cut.raster(low, high)
-    top = np.full(shape, LOWEST)
-    i, j = np.floor((near[:, :2] - corner) * (1.0 / cut.cell)).astype(np.int64).T
-    np.maximum.at(top, (i, j), near[:, 2])
     frame = grid_frame(low, high, CELL)
     number = cell_numbers(near, frame)
     order = np.argsort(number, kind="stable")
@@ -71,5 +47,4 @@ def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
     rows[:, :3], rows[:, 3] = near[order].view(np.int32), np.arange(len(near))
     planes = normals[wanted[order]].astype(np.float32)
     planes /= 127.0
-    cells = Cells(frame, starts, rows.reshape(-1))
-    return Crop(rows.view(np.float32)[:, :3], planes, cells, near[:: cut.every], top, corner)
+    return Crop(rows.view(np.float32)[:, :3], planes, Cells(frame, starts, rows.reshape(-1)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.observation import Share
 
 CHANCE = np.array([0.2, 0.15, 0.1, 0.55])  # on, near, under an edge, unexplained
 PASSED = 0.08

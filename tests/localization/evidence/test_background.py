@@ -7,7 +7,7 @@ import pytest
 from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation, places_of_their_own, what_was_seen_before
 
 from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, outcomes, scatter
-from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.observation import Share
 
 NOTHING = np.empty((0, len(Share)), dtype=np.float32)
 

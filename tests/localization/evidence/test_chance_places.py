@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.background import Most, estimate_background, scatter
 from coview_stream.localization.evidence.chance_places import chance_places, observe_with_background
-from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
+from coview_stream.localization.evidence.observation import ObservedScan, Share
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput
 
 T_MAP_ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])
 
@@ -21,7 +21,7 @@ def seen(world_drive):
     config, cloud = LocalizerConfig(), world_drive.clouds[4]
     T = inverse(T_MAP_ODOM) @ world_drive.T_map_body[4]
     points = prepare_scan(voxelized(cloud, T, config.keyframe), T[:3, 3], config.registration)
-    return ObservedScan.of(ScanInput(points, cloud, T))
+    return ObservedScan.of(points, cloud, T)
 
 
 def test_chance_places_lie_around_at_all_sides():
@@ -39,13 +39,13 @@ def test_background_is_what_the_places_around_the_first_pose_explain(world_map, 
     away[:2, 3] += [0.9, -0.7]
     both = np.stack([T_MAP_ODOM, away])
     observed, background = observe_with_background(world_map.field, seen, both)
-    chance = seen.few.look_up(world_map.field, chance_places(seen.poses(both)[0]), "no")[1]
+    chance = seen.few.look_up(world_map.field, chance_places(seen.poses(both)[0]), Move.NONE).shares
     expected = estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
     np.testing.assert_allclose(background.structure, expected.structure)
     assert background.passed == pytest.approx(expected.passed)
     assert background.ground == pytest.approx(expected.ground)
     assert background.number == pytest.approx(expected.number)
-    np.testing.assert_array_equal(observed, seen.few.look_up(world_map.field, seen.poses(both), "no")[1])
+    np.testing.assert_array_equal(observed, seen.few.look_up(world_map.field, seen.poses(both), Move.NONE).shares)
     assert observed[0, Share.NEAR] > observed[1, Share.NEAR] > chance[:, Share.NEAR].mean()
     other, _ = observe_with_background(world_map.field, seen, both[::-1])
     np.testing.assert_array_equal(other, observed[::-1])

@@ -15,7 +15,7 @@ from scipy.stats import beta
 from coview_stream.localization.evidence import likelihood
 from coview_stream.localization.evidence.background import Background, estimate_background, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios, nuisance_prior
-from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.observation import Share
 from coview_stream.localization.evidence.posterior import posterior
 
 BACKGROUND = Background(CHANCE, PASSED, (1.5, 1.5), (30.0, 12.0))

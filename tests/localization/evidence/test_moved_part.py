@@ -11,9 +11,8 @@ import coview_kernels as kernels
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, find_moved_part
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 RISK = 1e-4
@@ -22,7 +21,7 @@ RISK = 1e-4
 def scan_of(drive, frame: int) -> ObservedScan:
     T, cloud = inverse(ODOM) @ drive.T_map_body[frame], drive.clouds[frame]
     points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return ObservedScan.of(ScanInput(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T))
+    return ObservedScan.of(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +95,7 @@ def test_masks_of_points_are_what_is_counted(world_map, seen):
     moved = pose + np.array([2.0, 1.0, 0.0, 0.1])
     for at in (pose, moved):
         points = seen.many.points
-        counts = kernels.field_scores(world_map.field, points, at, refine=False)
+        counts = kernels.field_scores(world_map.field, points, at, kernels.Move.NONE)
         left = kernels.unexplained(world_map.field, points.structure, at[0])
         assert abs(int(left.sum()) - int(counts.structure[0] - counts.covered[0])) <= 4
         near = kernels.near_structure(world_map.field, points.structure, at[0])

@@ -10,7 +10,7 @@ from se3 import exp_se3
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
@@ -148,16 +148,6 @@ def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
         assert inside.sum() == wanted.sum()
         assert len(found.points) == len(found.normals)
     assert len(fake.asked) == len(set(fake.asked)) <= 9
-
-
-def test_crop_has_the_edges_and_the_sample_of_its_points(target):
-    """What comes of a crop while it is cut is what would come of its points."""
-    found = LocalMaps(FakeMap(target.points, target.normals), radius=6.0).around(np.zeros(3))
-    same = LocalMap(np.ascontiguousarray(found.points), found.normals)
-    np.testing.assert_array_equal(found.edges.values, same.edges.values)
-    np.testing.assert_array_equal(found.edges.corner, same.edges.corner)
-    assert found.sample.shape == same.sample.shape
-    assert kernels.nearest(same.grid, found.sample, 0.1)[0].max() == 0
 
 
 def test_local_map_cache_drops_the_oldest(target):

@@ -6,8 +6,8 @@ import numpy as np
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.refinement import Candidate

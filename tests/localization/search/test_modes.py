@@ -14,9 +14,9 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search import modes
 from coview_stream.localization.search.modes import Modes, find_modes
 from coview_stream.localization.search.request import SearchRequest
@@ -47,7 +47,7 @@ def look(row_map, points, x, reach, start):
     near = points[np.linalg.norm(points[:, :2] - truth[:2, 3], axis=1) < reach]
     cloud = transform(inverse(truth), near).astype(np.float32)
     T_odom_body = inverse(T_MAP_ODOM) @ truth
-    scan = ScanInput(
+    scan = ObservedScan.of(
         prepare_scan(voxelized(cloud, T_odom_body, CONFIG.keyframe), T_odom_body[:3, 3], CONFIG.registration),
         cloud, T_odom_body,
     )  # fmt: skip

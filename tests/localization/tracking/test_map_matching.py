@@ -10,11 +10,12 @@ import pytest
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.registration import register as registration
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput, register
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
+from coview_stream.localization.tracking import map_matching
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
@@ -30,10 +31,10 @@ def scan(world_drive):
     return scan_of(world_drive.clouds[4], world_drive.T_map_body[4])
 
 
-def scan_of(cloud, truth) -> ScanInput:
+def scan_of(cloud, truth) -> ObservedScan:
     T_odom_body = inverse(T_MAP_ODOM) @ truth
     points = voxelized(cloud, T_odom_body, CONFIG.keyframe)
-    return ScanInput(prepare_scan(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
+    return ObservedScan.of(prepare_scan(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
 
 
 def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
@@ -113,7 +114,7 @@ def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
     truth, whole = world_drive.T_map_body[4], register
-    monkeypatch.setattr(registration, "register", lambda *given: replace(whole(*given), information=bad))
+    monkeypatch.setattr(map_matching, "register", lambda *given: replace(whole(*given), information=bad))
     found = matched(world_map, scan, Estimate(truth, TIGHT))
     assert_no_hold(found, truth)
     assert found.verdict.evidence is not None  # it is as good as ever, and does not help
@@ -136,10 +137,6 @@ def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
     scales = CONFIG.registration.track
     found = MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, pose_graph)
     assert found.verdict.cause is RejectionReason.OFF_MAP
-
-
-def test_range_image_of_a_scan_is_computed_once(scan):
-    assert scan.range_image is scan.range_image
 
 
 # ---- held against what lies metres beside

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coview_stream.localization.evidence.likelihood import NUISANCES
-from coview_stream.localization.registration.verification import Evidence
+from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation
 

@@ -12,9 +12,8 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.chance_places import observe_with_background
 from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
-from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 
 T_MAP_ODOM = pose_from(rot_z(1.3), [-4.0, 11.0, 0.6])
@@ -27,10 +26,10 @@ def scans(world_drive):
     return [scan_of(world_drive.clouds[k], world_drive.T_map_body[k]) for k in range(6)]
 
 
-def scan_of(cloud, truth) -> ScanInput:
+def scan_of(cloud, truth) -> ObservedScan:
     config, T = LocalizerConfig(), inverse(T_MAP_ODOM) @ truth
     points = prepare_scan(voxelized(cloud, T, config.keyframe), T[:3, 3], config.registration)
-    return ScanInput(points, cloud, T)
+    return ObservedScan.of(points, cloud, T)
 
 
 @pytest.fixture
@@ -68,7 +67,7 @@ def test_right_pose_is_told_from_chance(place, scans):
 
 def test_without_knowledge_it_is_the_even_sum_over_the_nuisances(world_map, place, scans):
     found = place.observe(scans[2], T_MAP_ODOM)
-    observed, background = observe_with_background(world_map.field, ObservedScan.of(scans[2]), T_MAP_ODOM[None])
+    observed, background = observe_with_background(world_map.field, scans[2], T_MAP_ODOM[None])
     # but that shares near the ends have fewer neighbours to have come from
     even = logsumexp(log_likelihoods(observed, background)[0]) - np.log(np.prod(NUISANCES))
     assert found.ratio == pytest.approx(even, abs=0.1)
@@ -82,26 +81,27 @@ def test_scan_of_another_world_speaks_against_the_place(place, scans, elsewhere,
         assert place.observe(scan_of(cloud, world_drive.T_map_body[5]), T_MAP_ODOM).ratio < -5.0
 
 
-def test_scan_that_fits_in_part_speaks_for_a_place_only_where_that_is_usual(world_map, scans):
+def test_scan_that_fits_in_part_speaks_for_a_place_only_where_that_is_usual(world_map, world_drive, scans):
     """A new robot does not know how much of the site has changed; one that drives through it does."""
     fresh, unchanged, changed = (PlaceEvidence(world_map) for _ in range(3))
-    for scan in scans[:5]:
+    rearranged = [gone(scan, cloud, 0.75) for scan, cloud in zip(scans, world_drive.clouds, strict=False)]
+    for scan, other in zip(scans[:5], rearranged, strict=False):
         unchanged.learn(unchanged.observe(scan, T_MAP_ODOM))
-        changed.learn(changed.observe(gone(scan, 0.75), T_MAP_ODOM))
-    now = gone(scans[5], 0.75)
+        changed.learn(changed.observe(other, T_MAP_ODOM))
+    now = rearranged[5]
     assert fresh.observe(now, T_MAP_ODOM).ratio > 1.0
     assert changed.observe(now, T_MAP_ODOM).ratio > fresh.observe(now, T_MAP_ODOM).ratio
     assert unchanged.observe(now, T_MAP_ODOM).ratio < -1.0
     assert unchanged.observe(scans[5], T_MAP_ODOM).ratio > fresh.observe(scans[5], T_MAP_ODOM).ratio > 5.0
 
 
-def gone(scan, share):
+def gone(scan, frame, share):
     """The scan with what stands in a sector, a share of all directions, half a dozen metres off."""
     points = scan.cloud.points.copy()
     off = points - scan.T_odom_body[:3, 3].astype(np.float32)
     turn = np.arctan2(off[:, 1], off[:, 0]) / (2 * np.pi) + 0.5
     points[(turn < share) & scan.cloud.above] += np.float32([3.1, 5.3, 0.0])
-    return replace(scan, cloud=replace(scan.cloud, points=points))
+    return ObservedScan.of(replace(scan.cloud, points=points), frame, scan.T_odom_body)
 
 
 # ---- what is learned
@@ -183,7 +183,7 @@ def test_place_holds_against_the_better_of_chance_and_its_rival():
 
 def test_poses_are_moved_to_the_best_near_them(place, scans):
     scan = scans[3]
-    here = place.seen(scan).poses(T_MAP_ODOM[None])
+    here = scan.poses(T_MAP_ODOM[None])
     poses, ratios = place.look_around(scan, T_MAP_ODOM, here + np.array([0.3, -0.2, 0.0, 0.0]))
     assert np.linalg.norm(poses[0, :2] - here[0, :2]) < 0.2
     assert ratios[0] == pytest.approx(place.observe(scan, T_MAP_ODOM).ratio, abs=2.0)

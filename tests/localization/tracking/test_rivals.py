@@ -8,9 +8,10 @@ from small_world import pose_error
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput, register
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.rivals import _beside, find_rivals, rings
 from coview_stream.localization.tracking.slip import matters, off_by
@@ -24,7 +25,7 @@ def scan(world_drive):
     truth = world_drive.T_map_body[4]
     T = inverse(T_MAP_ODOM) @ truth
     points = voxelized(world_drive.clouds[4], T, CONFIG.keyframe)
-    return ScanInput(prepare_scan(points, T[:3, 3], CONFIG.registration), world_drive.clouds[4], T), truth
+    return ObservedScan.of(prepare_scan(points, T[:3, 3], CONFIG.registration), world_drive.clouds[4], T), truth
 
 
 def rivals(world_map, scan, off, count=1):

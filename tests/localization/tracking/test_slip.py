@@ -7,8 +7,8 @@ import pytest
 from trackers import on_the_way, refused
 
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.slip import Dispute, matters, off_by
@@ -26,7 +26,7 @@ def scan(world_map, world_drive):
     level = truth.copy()
     level[:3, 3] = 0.0  # gravity aligned
     points = voxelized(cloud, level, config.keyframe)
-    return ScanInput(prepare_scan(points, level[:3, 3], config.registration), cloud, level), truth
+    return ObservedScan.of(prepare_scan(points, level[:3, 3], config.registration), cloud, level), truth
 
 
 RISK = 1e-4

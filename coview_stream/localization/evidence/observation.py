@@ -1,0 +1,316 @@
+"""Observation of the map by a scan at a pose: shares of the scan's points that the likelihood field explains.
+
+A point above the ground is explained (map structure in its cell or within half a metre, or a roof edge above it, as a
+survey from above shows no walls), unexplained, or outside the survey. A point on the ground lies on the map's ground or
+not, or is outside the survey. A point that a ray passed through is free in the map, or contradicts it.
+
+:class:`Share` names the seven shares that the likelihood compares. :class:`Evidence` is their summary for people, from
+which causes of loss and the protection level follow. A right pose scores 0.3 to 0.95, a wrong one up to 0.7 on a road
+that looks the same all along: the score alone decides nothing (docs/integrity.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import lru_cache
+
+import numpy as np
+
+import coview_kernels as kernels
+from coview_kernels import Move
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Points, Pose, norms
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+
+_FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
+_PATCH = 4.0  # metres: points of one patch are looked up in turn, as they lie in the same memory
+_OFFSET = 1 << 15  # keeps patch numbers positive
+_MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
+_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
+
+# free space
+_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
+_MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
+_MIN_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
+_BEAM = math.radians(2.0)  # cell of the range image
+_COLUMNS = math.ceil(2.0 * math.pi / _BEAM) + 1  # one more than a turn, for rounding
+_CELLS = _COLUMNS * (math.ceil(math.pi / _BEAM) + 1)
+_BEAM_HITS = 2  # returns in a cell; fewer say nothing
+_MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
+_SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, before a ray counts as having passed
+_MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle
+_FLOOR_RADIUS = 10.0  # metres around the sensor in which its ground is looked for
+_FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
+_MIN_FLOOR_POINTS = 20
+_SAMPLES = 6000  # points in the space around the robot; the ones that rays passed through are looked up
+_DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
+_LAYERS = 2  # cells that a surface fills on the way through it
+_VOXEL = 0.5  # metres between neighbouring points of a scan
+
+
+class Share(IntEnum):
+    """Columns of an observation: shares of the scan's points of a kind."""
+
+    ON = 0
+    """Structure points in a half-metre cell with map structure."""
+    NEAR = 1
+    """Structure points within about half a metre of map structure; includes ON."""
+    EDGE = 2
+    """Structure points that are not near, but below a roof edge."""
+    COVERED = 3
+    """Structure points in the surveyed area."""
+    GROUND = 4
+    """Ground points on the map's ground."""
+    COVERED_GROUND = 5
+    """Ground points in the surveyed area."""
+    PASSED = 6
+    """Points passed by rays that are map structure."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Shares in [0, 1] of a scan that a pose explains; a wrong place fails each in another way.
+
+    Attributes:
+        near: structure (> 1 m above the ground) within half a metre of map structure; 0 for fewer than 60 points.
+        covered: structure that is near, or below a roof edge of the map.
+        ground: ground points on the map's ground.
+        free_space: map structure in sight of the robot that its rays met rather than passed through.
+        inside: points in the surveyed area; the other shares leave out the rest.
+    """
+
+    near: float
+    covered: float
+    ground: float
+    free_space: float
+    inside: float
+
+    @property
+    def score(self) -> float:
+        """Square root of the product of the four shares that can contradict a pose, in [0, 1]."""
+        return float(np.sqrt(self.near * self.covered * self.ground * self.free_space))
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Observations of the map at H poses.
+
+    Attributes:
+        poses: (H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians.
+        shares: (H, 7), columns as in :class:`Share`.
+        parts: (H, 5), columns as the fields of :class:`Evidence`.
+    """
+
+    poses: Floats
+    shares: Floats32
+    parts: Floats
+
+    @property
+    def scores(self) -> Floats32:
+        """(H,) :attr:`Evidence.score` of each pose."""
+        near, covered, ground, free_space, _ = self.parts.T
+        return np.asarray(np.sqrt(near * covered * ground * free_space), dtype=np.float32)
+
+    def evidence(self, row: int) -> Evidence:
+        """Return the evidence for one of the poses."""
+        return Evidence(*self.parts[row].tolist())
+
+
+@dataclass(frozen=True)
+class ScanPart:
+    """A sample of a scan's points to look up.
+
+    Attributes:
+        points: of each kind, relative to the body, axes of the odometry frame, metres.
+        weights: how many of the scan's structure, ground and free points each sampled one stands for.
+    """
+
+    points: kernels.FieldScan
+    weights: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int]) -> ScanPart:
+        """Take at most ``counts`` points of each kind."""
+        samples = [_evenly(points, count) for points, count in zip(kinds, counts, strict=True)]
+        structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, samples, strict=True))
+        return cls(kernels.FieldScan(*samples), (structure, low, free))
+
+    def look_up(self, field: kernels.FieldMap, poses: Floats, move: Move) -> Observations:
+        """Observe the map from poses (H, 4), as in :class:`Observations`, each moved as far as ``move`` allows first.
+
+        ``Move.NEAR`` is as far as odometry drifts between keyframes.
+        """
+        scores = kernels.field_scores(field, self.points, poses, move)
+        return Observations(scores.pose, self._shares(scores), self._parts(scores))
+
+    def _shares(self, scores: kernels.FieldScores) -> Floats32:
+        structure, low, free = (max(len(p), 1) for p in (self.points.structure, self.points.low, self.points.free))
+        columns = (
+            scores.on / structure, scores.near / structure, (scores.covered - scores.near) / structure,
+            scores.structure / structure, scores.grounded / low, scores.low / low, scores.passed / free,
+        )  # fmt: skip
+        return np.column_stack(columns).astype(np.float32)
+
+    def _parts(self, scores: kernels.FieldScores) -> Floats:
+        high, flat, free = self.weights
+        structure, low, near = scores.structure * high, scores.low * flat, scores.near * high
+        surveyed = np.maximum(scores.structure, 1)
+        few = structure < _MIN_STRUCTURE
+        ground = (scores.grounded * flat + 0.5 * _PSEUDO) / (low + _PSEUDO)
+        passed = scores.passed * free * _points_passed()
+        total = len(self.points.structure) * high + len(self.points.low) * flat
+        columns = (
+            np.where(few, 0.0, scores.near / surveyed), np.where(few, 0.0, scores.covered / surveyed), ground,
+            (near + 0.5 * _PSEUDO) / (near + passed + _PSEUDO), (structure + low) / max(total, 1.0),
+        )  # fmt: skip
+        return np.column_stack(columns)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedScan:
+    """A scan to be registered, with samples of it for the field: few points for many poses, many for the best.
+
+    Attributes:
+        cloud: the points to register, odometry frame, metres.
+        T_odom_body: (4, 4) odometry of the newest frame.
+        few: a sample.
+        many: one of four times as many points.
+        patches: numbers of four-metre patches that its structure fills, and of cubes that its free space does: the
+            most observations that can be independent.
+        filled: (F,) numbers of those patches, comparable between scans of one odometry frame.
+    """
+
+    cloud: RegistrationCloud
+    T_odom_body: Pose
+    few: ScanPart
+    many: ScanPart
+    patches: tuple[float, float]
+    filled: Ints
+
+    @classmethod
+    def of(cls, cloud: RegistrationCloud, frame: Points, T_odom_body: Pose) -> ObservedScan:
+        """Sample a scan; ``frame`` (N, 3) is its newest frame, body frame, metres, for the rays."""
+        body = T_odom_body[:3, 3]
+        points = cloud.points - body.astype(np.float32)
+        order = _by_patch(points)
+        points, high, above = points[order], cloud.high[order], cloud.above[order]
+        free = (RangeImage.of(frame).passed_points() @ T_odom_body[:3, :3].T).astype(np.float32)
+        kinds = points[high], points[~above], free[_by_patch(free)]
+        filled = _filled(kinds[0][:, :2] + body[:2])
+        patches = float(len(filled)), float(len(_filled(kinds[2])))
+        return cls(cloud, T_odom_body, ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY), patches, filled)
+
+    @property
+    def body(self) -> Floats:
+        """(3,) position of the body in the odometry frame, metres."""
+        return np.asarray(self.T_odom_body[:3, 3])
+
+    def evidence(self, field: kernels.FieldMap, T_map_odom: Pose) -> Evidence:
+        """Return the evidence for a pose (4, 4); its tilt against gravity is left out."""
+        return self.many.look_up(field, self.poses(T_map_odom[None]), Move.NONE).evidence(0)
+
+    def poses(self, T_map_odom: Floats) -> Floats:
+        """Return the poses (H, 4), as in :class:`Observations`, at which level transforms (H, 4, 4) put the scan."""
+        turned = T_map_odom[:, :3, :3] @ self.body + T_map_odom[:, :3, 3]
+        return np.column_stack([turned, np.arctan2(T_map_odom[:, 1, 0], T_map_odom[:, 0, 0])])
+
+    def transforms(self, poses: Floats) -> Floats:
+        """Return the level ``T_map_odom`` (H, 4, 4) that put the scan at poses (H, 4)."""
+        T = np.tile(np.eye(4), (len(poses), 1, 1))
+        cos, sin = np.cos(poses[:, 3]), np.sin(poses[:, 3])
+        T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
+        T[:, :3, 3] = poses[:, :3] - T[:, :3, :3] @ self.body
+        return T
+
+
+def surroundings(scans: Sequence[ObservedScan]) -> float:
+    """Return how many times the surroundings of one scan all of them together have seen; 1 if all are the same."""
+    mean = float(np.mean([len(scan.filled) for scan in scans]))
+    return max(1.0, len(np.unique(np.concatenate([scan.filled for scan in scans]))) / max(mean, 1.0))
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """Nearest return of one frame by direction, in cells of 2 degrees.
+
+    Attributes:
+        nearest: (C,) metres; -inf where there are too few returns to say anything.
+        floor: height of the ground relative to the sensor, metres, not above it.
+    """
+
+    nearest: Floats32
+    floor: float
+
+    @classmethod
+    def of(cls, cloud: Points) -> RangeImage:
+        """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
+        rays = cls.rays(cloud)
+        ranges = norms(rays)
+        far = ranges > _MIN_RANGE
+        cells = _directions(rays[far], ranges[far])
+        nearest = np.full(_CELLS, np.inf, dtype=np.float32)
+        np.minimum.at(nearest, cells, ranges[far])
+        nearest[np.bincount(cells, minlength=_CELLS) < _BEAM_HITS] = -np.inf
+        return cls(nearest, _floor_below(rays))
+
+    @staticmethod
+    def rays(cloud: Points) -> Points:
+        """Return the points of a frame (N, 3) that :meth:`of` uses: it makes the same image of them alone."""
+        return cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
+
+    def passed_points(self) -> Floats:
+        """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground."""
+        points, ranges, cells = _samples()
+        beyond = ranges + _MARGIN
+        passed: Bools = (beyond > _MIN_RANGE) & (beyond < self.nearest[cells] - (_SLACK + _SLACK_SLOPE * beyond))
+        return points[passed & (points[:, 2] > self.floor + _MIN_HEIGHT)]
+
+
+def _evenly(points: Points, count: int) -> Points:
+    """Return at most ``count`` points, spread evenly over all in their order."""
+    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
+
+
+def _filled(points: Points | Floats) -> Ints:
+    """Return the distinct numbers of the patches, or cubes, that points (N, 2) or (N, 3) lie in."""
+    cell = np.floor(points * (1.0 / _PATCH)).astype(np.int64) + _OFFSET
+    return np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16)))
+
+
+def _by_patch(points: Points) -> Ints:
+    x, y = np.floor(points[:, :2] / np.float32(_PATCH)).T
+    return np.asarray(np.lexsort((x, y)))
+
+
+def _floor_below(cloud: Points) -> float:
+    """Height of the ground relative to the sensor: a low percentile of the points near it, never above it."""
+    x, y = cloud[:, 0], cloud[:, 1]
+    near = cloud[:, 2][x * x + y * y < _FLOOR_RADIUS**2]
+    return min(0.0, float(np.percentile(near, _FLOOR_PERCENTILE))) if len(near) >= _MIN_FLOOR_POINTS else 0.0
+
+
+def _directions(points: Points | Floats, ranges: Floats32 | Floats) -> Ints:
+    """Return the cell (N,) of each point (N, 3), body frame: row by row upwards, turning left from straight behind."""
+    turn = ((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
+    rise = ((np.arcsin(np.clip(points[:, 2] / ranges, -1.0, 1.0)) + 0.5 * np.pi) / _BEAM).astype(np.int64)
+    return np.asarray(rise * _COLUMNS + turn)
+
+
+@lru_cache(maxsize=1)
+def _samples() -> tuple[Floats, Floats, Ints]:
+    """Return points (N, 3), evenly in the space around the sensor, their ranges and cells of direction."""
+    rng = np.random.default_rng(20240)
+    radius, turn = _RANGE * np.sqrt(rng.random(_SAMPLES)), 2.0 * np.pi * rng.random(_SAMPLES)
+    height = rng.uniform(*_DEPTH, _SAMPLES)
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+    ranges = norms(points)
+    return points, ranges, _directions(points, ranges)
+
+
+def _points_passed() -> float:
+    """Return the number of scan points on the surface that one passed sample stands for."""
+    volume = np.pi * _RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES
+    return float(volume / (_LAYERS * 0.5) / _VOXEL**2)

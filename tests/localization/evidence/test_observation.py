@@ -1,0 +1,236 @@
+"""Observations: shares of a scan that the map explains at a pose, looked up and counted by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_kernels import Move
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.observation import ObservedScan, RangeImage, ScanPart, Share, surroundings
+from coview_stream.localization.registration.prepare_scan import prepare_scan
+
+ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
+CONFIG = LocalizerConfig().registration
+
+
+@pytest.fixture(scope="module")
+def scan(world_drive):
+    """A frame of the small world, with odometry in a frame of its own."""
+    T = inverse(ODOM) @ world_drive.T_map_body[0]
+    cloud = world_drive.clouds[0]
+    points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    return ObservedScan.of(prepare_scan(points, T[:3, 3], CONFIG), cloud, T)
+
+
+@pytest.fixture(scope="module")
+def truth(scan):
+    return scan.poses(ODOM[None])
+
+
+def beside(truth, count=60):
+    rng = np.random.default_rng(2)
+    return truth + np.column_stack([rng.uniform(-12, 12, (count, 2)), np.zeros(count), rng.uniform(-3, 3, count)])
+
+
+# ---- shares
+
+
+def test_shares_are_shares(world_map, scan, truth):
+    for part in (scan.few, scan.many):
+        for move in Move:
+            seen = part.look_up(world_map.field, beside(truth), move)
+            assert seen.poses.shape == (60, 4)
+            assert seen.shares.shape == (60, len(Share))
+            assert ((seen.shares >= 0) & (seen.shares <= 1)).all()
+            assert ((seen.parts >= 0) & (seen.parts <= 1)).all()
+            assert (seen.shares[:, Share.ON] <= seen.shares[:, Share.NEAR]).all()
+            explained = seen.shares[:, Share.NEAR] + seen.shares[:, Share.EDGE]
+            assert (explained <= seen.shares[:, Share.COVERED] + 1e-6).all()
+            assert (seen.shares[:, Share.GROUND] <= seen.shares[:, Share.COVERED_GROUND]).all()
+
+
+def test_right_place_explains_nearly_all(world_map, scan, truth):
+    seen = scan.many.look_up(world_map.field, truth, Move.NEAR)
+    (row,) = seen.shares
+    assert row[Share.NEAR] > 0.9
+    assert row[Share.ON] > 0.5
+    assert row[Share.COVERED] > 0.9
+    assert row[Share.GROUND] > 0.8 * row[Share.COVERED_GROUND]
+    assert row[Share.PASSED] < 0.02
+    assert seen.scores[0] > 0.8
+    others = scan.many.look_up(world_map.field, beside(truth), Move.NONE).shares
+    assert np.median(others[:, Share.NEAR]) < 0.6
+    assert others[:, Share.PASSED].mean() > 2 * row[Share.PASSED]
+
+
+@pytest.mark.parametrize("away", [300.0, 5e4])
+def test_nothing_is_covered_off_the_map(world_map, scan, truth, away):
+    for move in Move:
+        seen = scan.few.look_up(world_map.field, truth + np.array([away, -away, 0.0, 0.0]), move)
+        assert not seen.shares.any()
+        assert not seen.scores.any()
+        assert seen.evidence(0).inside == 0.0
+
+
+def test_shares_are_those_counted_by_hand(world_map, scan, truth):
+    """Half-metre cells of the map's structure, written out, and the level ground."""
+    part = scan.many
+    (shares,) = part.look_up(world_map.field, truth, Move.NONE).shares
+    x, y, z, yaw = truth[0]
+    T = pose_from(rot_z(yaw), [x, y, z])
+    placed, low, free = (
+        points @ T[:3, :3].T + T[:3, 3] for points in (part.points.structure, part.points.low, part.points.free)
+    )
+    cloud = np.asarray(world_map.points, dtype=np.float64)
+    filled = set(map(tuple, np.floor(cloud[cloud[:, 2] > 0.5] / 0.5).astype(int)))
+    on = np.array([tuple(cell) in filled for cell in np.floor(placed / 0.5).astype(int)])
+    assert shares[Share.ON] == pytest.approx(on.mean(), abs=0.12)
+    passed = np.array([tuple(cell) in filled for cell in np.floor(free / 0.5).astype(int)])
+    assert shares[Share.PASSED] == pytest.approx(passed.mean(), abs=0.02)
+    inside = (np.abs(low[:, :2]) < 33.0).all(axis=1)
+    assert shares[Share.COVERED_GROUND] == pytest.approx(inside.mean(), abs=0.1)
+    level = inside & (np.abs(low[:, 2]) < 0.15)  # the small world's ground is a plane at zero
+    assert shares[Share.GROUND] == pytest.approx(level.mean(), abs=0.1)
+
+
+def test_few_and_many_points_say_the_same(world_map, scan, truth):
+    poses = np.concatenate([truth, beside(truth)])
+    few, many = (part.look_up(world_map.field, poses, Move.NONE).shares for part in (scan.few, scan.many))
+    assert np.abs(few - many).mean() < 0.04
+    assert len(scan.few.points.structure) < len(scan.many.points.structure)
+
+
+def test_pose_is_moved_to_the_best_near_it(world_map, scan, truth):
+    off = truth + np.array([[1.5, -1.0, 0.0, np.radians(4.0)]])
+    moved = scan.few.look_up(world_map.field, off, Move.FAR)
+    stayed = scan.few.look_up(world_map.field, off, Move.NONE)
+    np.testing.assert_allclose(stayed.poses, off, atol=1e-4)
+    assert np.abs(moved.poses - truth)[0, :2].max() < 0.4
+    assert moved.shares[0, Share.NEAR] > stayed.shares[0, Share.NEAR] + 0.1
+
+
+def test_poses_and_transforms_are_inverse(scan):
+    rng = np.random.default_rng(0)
+    T = np.array([pose_from(rot_z(rng.uniform(-3, 3)), rng.uniform(-50, 50, 3)) for _ in range(20)])
+    poses = scan.poses(T)
+    np.testing.assert_allclose(scan.transforms(poses), T, atol=1e-9)
+    np.testing.assert_allclose(poses[:, :3], T[:, :3, :3] @ scan.body + T[:, :3, 3])
+
+
+def test_part_takes_no_more_points_than_asked_for_and_knows_how_many_each_stands_for():
+    rng = np.random.default_rng(0)
+    kinds = tuple(rng.uniform(-9, 9, (count, 3)).astype(np.float32) for count in (1000, 30, 0))
+    part = ScanPart.of(kinds, (100, 100, 100))
+    assert [len(p) for p in (part.points.structure, part.points.low, part.points.free)] == [100, 30, 0]
+    assert part.weights == (10.0, 1.0, 0.0)
+
+
+def test_empty_scan_observes_nothing(world_map, truth):
+    nothing = np.empty((0, 3), dtype=np.float32)
+    seen = ScanPart.of((nothing,) * 3, (9, 9, 9)).look_up(world_map.field, truth, Move.NONE)
+    assert not seen.shares.any()
+    assert seen.scores.tolist() == [0.0]
+
+
+def test_scans_from_one_place_see_the_surroundings_of_one_and_those_from_afar_of_several(scan, world_drive):
+    away = scan.T_odom_body.copy()
+    away[0, 3] += 500.0
+    moved = replace(scan.cloud, points=scan.cloud.points + np.float32([500.0, 0.0, 0.0]))
+    other = ObservedScan.of(moved, world_drive.clouds[0], away)
+    assert surroundings([scan, scan]) == 1.0
+    assert surroundings([scan, other]) == pytest.approx(2.0, abs=0.1)
+    assert surroundings([scan, other, other]) == pytest.approx(2.0, abs=0.1)
+
+
+# ---- evidence
+
+
+@pytest.fixture(scope="module")
+def evidence(world_map, world_drive):
+    """Evidence for the third frame at a pose off by ``dx, dy, degrees``, as a function."""
+    T, zero = world_drive.T_map_body[2], pose_from(np.eye(3), -world_map.origin)
+    cloud = prepare_scan(small_world.in_map(world_drive, 3), T[:3, 3], CONFIG)
+    scan = ObservedScan.of(cloud, world_drive.clouds[2], T)
+
+    def at(dx=0.0, dy=0.0, degrees=0.0):
+        moved = pose_from(rot_z(np.radians(degrees)), T[:3, 3] + [dx, dy, 0]) @ pose_from(np.eye(3), -T[:3, 3])
+        return scan.evidence(world_map.field, zero @ moved)
+
+    return at
+
+
+def test_true_pose_scores_high(evidence):
+    right = evidence()
+    assert right.score > 0.7
+    assert right.near > 0.9
+    assert right.ground > 0.8
+    assert right.free_space > 0.85
+    assert right.inside > 0.9
+
+
+@pytest.mark.parametrize(
+    "offset", [(3, 0, 0), (-2, -2, 0), (0, 5, 0), (0, 0, 15), (0, 0, 180), (0, 0, -90), (9, 7, 40)]
+)
+def test_wrong_pose_scores_low(evidence, offset):
+    assert evidence(*offset).score < 0.6 * evidence().score
+
+
+def test_scan_beyond_the_survey_is_not_inside(evidence):
+    assert evidence(45, 0, 0).inside < 0.6 < evidence().inside
+
+
+def test_little_structure_scores_zero(world_map, scan):
+    cloud = scan.cloud
+    rows = np.concatenate([np.flatnonzero(cloud.high)[:50], np.flatnonzero(~cloud.high)])
+    bare = replace(cloud, points=cloud.points[rows], above=cloud.above[rows], height=cloud.height[rows])
+    sparse = ObservedScan.of(bare, np.empty((0, 3), np.float32), scan.T_odom_body).evidence(world_map.field, ODOM)
+    assert sparse.ground > 0.8
+    assert sparse.near == sparse.covered == sparse.score == 0.0
+
+
+# ---- rays
+
+
+def fan(distance, repeat=1):
+    """Returns at equal range within 30 degrees of the heading, 0.5 degrees apart, and the ground 1.5 m below."""
+    a, e = (np.radians(v.ravel()) for v in np.meshgrid(np.arange(-30, 30, 0.5), np.arange(-5, 10, 0.5)))
+    rays = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    turn = np.radians(np.arange(0.0, 360.0))
+    ground = np.column_stack([5 * np.cos(turn), 5 * np.sin(turn), np.full_like(turn, -1.5)])
+    return np.repeat(np.concatenate([distance * rays, ground]), repeat, axis=0).astype(np.float32)
+
+
+def test_rays_pass_through_the_space_before_their_returns_and_no_other():
+    points = RangeImage.of(fan(20.0)).passed_points()
+    ahead = points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.radians(32.0)]
+    assert len(ahead) == len(points) > 50
+    ranges = np.linalg.norm(points, axis=1)
+    assert 1.0 < ranges.min() < 6.0
+    assert 16.0 < ranges.max() < 20.0
+    assert points[:, 2].min() > -1.5 + 0.8  # well above the ground
+
+
+def test_frame_without_returns_passes_through_nothing():
+    assert len(RangeImage.of(np.empty((0, 3), np.float32)).passed_points()) == 0
+
+
+def test_single_returns_say_nothing_about_a_direction():
+    axis = np.radians(np.arange(1.0, 360.0, 2.0))
+    alone = np.column_stack([20 * np.cos(axis), 20 * np.sin(axis), np.ones_like(axis)]).astype(np.float32)
+    assert len(RangeImage.of(alone).passed_points()) == 0
+    assert len(RangeImage.of(np.repeat(alone, 2, axis=0)).passed_points()) > 10
+
+
+@pytest.mark.parametrize("count", [20_000, 32_769, 150_001])
+def test_rays_of_a_frame_make_the_same_range_image(count):
+    cloud = np.random.default_rng(1).normal(0.0, 15.0, (count, 3)).astype(np.float32)
+    rays = RangeImage.rays(cloud)
+    assert len(rays) <= 32_768
+    whole, thinned = RangeImage.of(cloud), RangeImage.of(np.ascontiguousarray(rays))
+    np.testing.assert_array_equal(whole.nearest, thinned.nearest)
+    assert whole.floor == thinned.floor
