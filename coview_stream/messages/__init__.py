@@ -3,7 +3,7 @@
 ============  ===========================================  ===================================================
 codec         in                                           out
 ============  ===========================================  ===================================================
-``xyz``       clouds: float32 rows, stamp beside them      the same
+``xyz``       clouds: float32 rows, stamp attached         the same
 ``xyzi``      the same with a fourth column                the same
 ``json``      odometry, poses                              odometry, poses
 ``cdr``       PointCloud2, Odometry,                       the same
@@ -12,10 +12,10 @@ codec         in                                           out
 ``keelson``   the same, each in a core.Envelope            PointCloud; FrameTransform, each in a core.Envelope
 ============  ===========================================  ===================================================
 
-Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4 and map the body into odometry or map.
-For any bytes, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too
-large, :class:`EncodingError` if no codec knows the encoding or it cannot carry what the message needs). An ``option``
-or ``hint`` that names no codec of that kind of message is a :class:`ConfigError`.
+Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4, odometry <- body or map <- body.
+For any bytes, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too large,
+:class:`EncodingError` if no codec knows the encoding or can carry this kind of message). An ``option`` or ``hint``
+that names no codec for this kind of message is a :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ _PREPARE: Mapping[str, Callable[[], object]] = {
 def decode_cloud(
     sample: Sample, option: str | None = None, hint: str | None = None, max_payload: int = MAX_PAYLOAD
 ) -> CloudMessage:
-    """Read a lidar frame; ``sequence`` is set where the attachment is rmw_zenoh's."""
+    """Read a lidar frame; ``sequence`` is set if the attachment is rmw_zenoh's."""
     message = _decode("cloud", CLOUD_CODECS, sample, option, hint, max_payload)
     _, sequence = read_attachment(sample.attachment)
     return message if sequence is None else replace(message, sequence=sequence)
@@ -138,7 +138,7 @@ def encode_location(message: LocationMessage, name: str) -> Encoded:
 
 
 def prepare(*names: str) -> None:
-    """Import now what the named codecs need, so that no frame waits 0.25 s for it."""
+    """Import the libraries of the named codecs now; otherwise the first frame waits 0.25 s."""
     for name in names:
         _PREPARE.get(name, lambda: None)()
 

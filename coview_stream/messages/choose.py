@@ -12,7 +12,7 @@ from coview_stream.messages.types import Sample
 
 MessageKind = Literal["cloud", "odometry", "pose"]
 
-# the codecs that a MIME type may stand for; the first if no schema is named
+# codecs of a MIME type; the first one if no schema is named
 _MIMES: dict[str, tuple[str, ...]] = {
     "": (),
     "application/octet-stream": ("xyz", "xyzi"),
@@ -24,8 +24,8 @@ _MIMES: dict[str, tuple[str, ...]] = {
     "application/json": ("json",),
     "text/json": ("json",),
 }
-_MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # without a schema they say nothing
-_WITHOUT_SCHEMA = ("application/json", "text/json")  # what follows is a charset or the like
+_MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # meaningless without a schema
+_WITHOUT_SCHEMA = ("application/json", "text/json")  # parameters are a charset or the like
 _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "xyz": ("xyz", ("cloud",)),
     "xyzi": ("xyzi", ("cloud",)),
@@ -38,7 +38,7 @@ _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
 }
 _KEELSON: dict[str, tuple[MessageKind, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
-# of CDR two bytes name the encoding, and two are options: the padding that ends the message. Its codec names XCDR2
+# CDR: two bytes of encoding, two of options (padding at the end); the codec refuses XCDR2 by name
 _MAGIC = re.compile(rb"(?P<cdr>\0[\0\1\6-\x0b]\0[\0-\3])|(?P<json>\{)")
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
@@ -46,7 +46,7 @@ _MAX_ENCODING = 256  # characters
 
 
 def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option: str | None, hint: str | None) -> str:
-    """Choose one of the codecs ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
+    """Choose one of the codecs ``names``; ConfigError for an unknown option or hint, EncodingError if none fits."""
     for setting, name in (("option", option), ("hint", hint)):
         if name is not None and name not in names:
             raise ConfigError(f"encoding {setting} {name!r} for {kind}; it must be one of {', '.join(names)}")
@@ -64,7 +64,7 @@ def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option:
 
 @lru_cache(maxsize=256)
 def _claims(kind: MessageKind, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
-    """Return the codecs that the encoding allows, best first (none: it says nothing), and the one of the key or ''."""
+    """Return the codecs that the encoding allows, best first (empty: any), and the codec of the key or ''."""
     mime, _, parameters = encoding.partition(";")
     mime = mime.strip().lower()
     if len(encoding) > _MAX_ENCODING or mime not in _MIMES:
@@ -105,8 +105,8 @@ def _by_key(kind: MessageKind, key: str) -> str:
 
 
 def _by_magic(sample: Sample) -> str:
-    if found := _MAGIC.match(sample.payload):
-        return str(found.lastgroup)
+    if magic := _MAGIC.match(sample.payload):
+        return str(magic.lastgroup)
     raise EncodingError(
         f"{sample.key}: no encoding is set, and the payload is neither CDR nor JSON; set one, or name it by option"
     )

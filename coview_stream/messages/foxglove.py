@@ -1,4 +1,9 @@
-"""Foxglove's protobuf schemas: PointCloud, PoseInFrame and FrameTransform; rows of points are little-endian."""
+"""Foxglove's protobuf schemas: PointCloud, PoseInFrame, FrameTransform and LocationFix.
+
+The top level of a message is split by our own parser of the wire format, with every size checked. The schema classes
+would copy a cloud's data once more, and build an object for each of the millions of empty fields that a hostile
+payload can announce.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +20,25 @@ from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, w
 from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
 
-_FIXED = {1: 8, 5: 4}
-_LENGTH = 2
+_ENCODING = "application/protobuf;foxglove."
+_LIBRARY = "foxglove-schemas-protobuf>=0.3"
+_KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+_NUMBERS = {kind: number for number, kind in _KINDS.items()}
+_DATA = 6  # number of PointCloud.data
+_ROTATION = 5  # number of FrameTransform.rotation; PoseInFrame has fewer fields
+_LENGTH, _FIXED = 2, {1: 8, 5: 4}  # wire types: with a length, of fixed sizes
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One field on the wire; offsets in bytes from the start of the message.
+    """One field on the wire.
 
     Attributes:
         number: of the field.
-        sized: whether it has a length.
-        start: offset of its tag.
-        value: offset of its value, after the length.
-        end: offset of what follows.
+        sized: whether a length precedes the value.
+        start: offset of the tag, bytes from the start of the message.
+        value: offset of the value, after its length.
+        end: offset behind the value.
     """
 
     number: int
@@ -40,7 +50,7 @@ class Entry:
 
 def wire_entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
     """List the top-level fields in order; MessageError if they overrun the payload or are more than ``limit``."""
-    found: list[Entry] = []
+    fields: list[Entry] = []
     position = 0
     while position < len(payload):
         start = position
@@ -58,10 +68,10 @@ def wire_entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
             raise MessageError("the payload is no protobuf message")
         if position > len(payload) or tag < 8:
             raise MessageError("the protobuf message is truncated or malformed")
-        found.append(Entry(tag >> 3, kind == _LENGTH, start, value, position))
-        if len(found) > limit:
+        fields.append(Entry(tag >> 3, kind == _LENGTH, start, value, position))
+        if len(fields) > limit:
             raise MessageError(f"the protobuf message has more than {limit} fields")
-    return found
+    return fields
 
 
 def _varint(payload: bytes | memoryview, position: int) -> tuple[int, int]:
@@ -74,7 +84,7 @@ def _varint(payload: bytes | memoryview, position: int) -> tuple[int, int]:
 
 
 def split_field(payload: bytes | memoryview, number: int, limit: int) -> tuple[bytes, memoryview]:
-    """Cut a message into all but the sized field ``number``, and a view on that field's last value."""
+    """Return a message without the sized field ``number``, and a view on that field's last value."""
     view = memoryview(payload)
     rest: list[memoryview] = []
     value = view[:0]
@@ -101,26 +111,22 @@ def _packed(value: int) -> bytes:
 
 
 def wire_timestamp(seconds: int, nanos: int) -> bytes:
-    """Write a google.protobuf.Timestamp; varints are of 64 bits, negative ones in two's complement."""
+    """Write a google.protobuf.Timestamp; varints have 64 bits, negative ones in two's complement."""
     return b"\x08" + _packed(seconds % 2**64) + b"\x10" + _packed(nanos)
-
-
-_ENCODING = "application/protobuf;foxglove."
-_KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
-_NUMBERS = {kind: number for number, kind in _KINDS.items()}
-_DATA = 6  # PointCloud.data
-_ROTATION = 5  # FrameTransform.rotation; PoseInFrame ends before
 
 
 @lru_cache(maxsize=1)
 def schemas() -> Any:
-    """Import the schema classes, on first use: it takes 50 ms."""
+    """Import the schema classes on first use, in about 50 ms."""
     require_library("google.protobuf.message", "protobuf>=5", "Foxglove messages")
     names = ("FrameTransform", "PointCloud", "PoseInFrame")
     package = "foxglove_schemas_protobuf"
-    wanted = "foxglove-schemas-protobuf>=0.3"
-    found = (require_library(f"{package}.{name}_pb2", wanted, "Foxglove messages") for name in names)
-    return SimpleNamespace(**{name: getattr(module, name) for name, module in zip(names, found, strict=True)})
+    return SimpleNamespace(
+        **{
+            name: getattr(require_library(f"{package}.{name}_pb2", _LIBRARY, "Foxglove messages"), name)
+            for name in names
+        }
+    )
 
 
 def _parse(schema: Any, payload: bytes) -> Any:
@@ -143,7 +149,7 @@ def _pose(p: Any, q: Any) -> Pose:
 
 
 def read_cloud(payload: bytes | memoryview) -> CloudMessage:
-    """Read a PointCloud and apply its ``pose``, if set, to the points; they are a view where packed and unmoved."""
+    """Read a PointCloud and apply its ``pose``, if set; packed points without a pose stay a view."""
     head, data = split_field(payload, _DATA, MAX_FIELDS)
     cloud = _parse(schemas().PointCloud, head)
     fields = tuple((f.name, _KINDS[f.type], f.offset) for f in cloud.fields if f.type in _KINDS)
@@ -161,7 +167,7 @@ def read_cloud(payload: bytes | memoryview) -> CloudMessage:
 
 
 def read_pose(payload: bytes | memoryview) -> tuple[int, Pose, str]:
-    """Read stamp, pose and parent frame of a PoseInFrame or a FrameTransform, told apart by their fields."""
+    """Read stamp, pose and parent frame of a PoseInFrame or a FrameTransform, distinguished by their fields."""
     numbers = {entry.number for entry in wire_entries(payload, MAX_FIELDS)}
     if _ROTATION in numbers:
         moved = _parse(schemas().FrameTransform, bytes(payload))
@@ -182,17 +188,8 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read what :func:`decode_odometry` does; what the schema cannot say is NaN or empty."""
+    """Read a PoseInFrame or FrameTransform; fields that the schema lacks are NaN or empty."""
     return bare_pose(*read_pose(sample.payload))
-
-
-def _fill(message: Any, stamp_ns: int, position: Any, quaternion: Any, T: Pose) -> bytes:
-    message.timestamp.seconds, message.timestamp.nanos = stamp_split(stamp_ns)
-    row = pose_to_tum(T).tolist()
-    for part, names, values in ((position, "xyz", row[:3]), (quaternion, "xyzw", row[3:])):
-        for name, value in zip(names, values, strict=True):
-            setattr(part, name, value)
-    return bytes(message.SerializeToString())
 
 
 def write_cloud(message: CloudMessage, frame_id: str = "base_link") -> bytes:
@@ -217,6 +214,15 @@ def _in_frame(stamp_ns: int, T: Pose, frame_id: str) -> Encoded:
     return Encoded(payload, _ENCODING + "PoseInFrame")
 
 
+def _fill(message: Any, stamp_ns: int, position: Any, quaternion: Any, T: Pose) -> bytes:
+    message.timestamp.seconds, message.timestamp.nanos = stamp_split(stamp_ns)
+    row = pose_to_tum(T).tolist()
+    for part, names, values in ((position, "xyz", row[:3]), (quaternion, "xyzw", row[3:])):
+        for name, value in zip(names, values, strict=True):
+            setattr(part, name, value)
+    return bytes(message.SerializeToString())
+
+
 def encode_cloud(message: CloudMessage) -> Encoded:
     """Write a foxglove.PointCloud."""
     return Encoded(write_cloud(message), _ENCODING + "PointCloud")
@@ -234,9 +240,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
 
 def encode_location(message: LocationMessage) -> Encoded:
     """Write a foxglove.LocationFix."""
-    module: Any = require_library(
-        "foxglove_schemas_protobuf.LocationFix_pb2", "foxglove-schemas-protobuf>=0.3", "Foxglove messages"
-    )
+    module: Any = require_library("foxglove_schemas_protobuf.LocationFix_pb2", _LIBRARY, "Foxglove messages")
     fix = module.LocationFix(
         frame_id="base_link",
         latitude=message.latitude,
@@ -246,4 +250,4 @@ def encode_location(message: LocationMessage) -> Encoded:
         position_covariance_type=3,  # known
     )
     fix.timestamp.seconds, fix.timestamp.nanos = stamp_split(message.stamp_ns)
-    return Encoded(fix.SerializeToString(), "application/protobuf;foxglove.LocationFix")
+    return Encoded(fix.SerializeToString(), _ENCODING + "LocationFix")

@@ -1,7 +1,7 @@
-"""Keelson (RISE, maritime): a ``core.Envelope`` with one of Foxglove's messages inside.
+"""Keelson (RISE, maritime): a ``core.Envelope`` around one of Foxglove's messages.
 
-Envelope: field 1 ``enclosed_at`` (google.protobuf.Timestamp), field 2 ``payload`` (bytes). The stamp that counts is the
-inner message's: when it was enclosed is no sensor time.
+Field 1 of the envelope is ``enclosed_at`` (google.protobuf.Timestamp), field 2 ``payload`` (bytes). Only the inner
+message's stamp is used: ``enclosed_at`` is not a sensor time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _open(envelope: bytes) -> memoryview:
 
 
 def _close(stamp_ns: int, payload: bytes) -> Encoded:
-    """Enclose in an envelope, dated with the sensor's time: a codec has no clock."""
+    """Write an envelope; it carries the sensor's time because a codec has no clock."""
     enclosed_at = wire_timestamp(*stamp_split(stamp_ns))
     envelope = sized_field(_ENCLOSED_AT, enclosed_at) + sized_field(_PAYLOAD, payload)
     return Encoded(envelope, _ENCODING)
@@ -44,7 +44,7 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read what :func:`decode_odometry` does; what the schema cannot say is NaN or empty."""
+    """Read a PoseInFrame or FrameTransform in an envelope; fields that the schema lacks are NaN or empty."""
     return bare_pose(*foxglove.read_pose(_open(sample.payload)))
 
 

@@ -1,10 +1,9 @@
-"""Points in packed rows of fields, as PointCloud2 and foxglove.PointCloud have them, read and written.
+"""Packed rows of point fields, as in PointCloud2 and foxglove.PointCloud, read and written.
 
-Fields of the usual lidar drivers say when and by which beam each point was measured. The meaning of a time follows from
-its type and size:
+Lidar drivers add fields for the time and the beam of each point. The type and size of a time decide its meaning:
 
 ================================  =========  ==================================================
-name, and who writes it           type       meaning
+name and driver                   type       meaning
 ================================  =========  ==================================================
 ``time`` (Velodyne)               float32    seconds after the stamp
 ``t`` (Ouster)                    uint32     nanoseconds after the stamp
@@ -12,11 +11,11 @@ name, and who writes it           type       meaning
 ``timestamp`` (Hesai, RoboSense)  float64    seconds on the stamp's clock
 ``timestamp`` (Livox driver 2)    float64    nanoseconds on the stamp's clock
 ``time_offset``, others above     float64    seconds after the stamp, if on no clock near the stamp
-``ring``, ``line``, ``channel``   any        number of the beam; floats too, if they are whole
+``ring``, ``line``, ``channel``   any        number of the beam; whole floats too
 ================================  =========  ==================================================
 
-Any of the time names may carry any of these types (int32 as uint32). Times farther than 1 s from the stamp, or spanning
-more than 1 s, are dropped: no times are better than wrong ones.
+Any time name may have any of these types (int32 as uint32). Times farther than 1 s from the stamp, or spanning more
+than 1 s, are dropped: no times are better than wrong ones.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ from coview_stream.messages.validation import check_points
 TIME_NAMES = ("time", "t", "time_offset", "offset_time", "timestamp")
 RING_NAMES = ("ring", "line", "channel")
 MAX_FIELDS = 256
-"""Fields of a point beyond which a message is refused as an attack, set by hand; real ones have four to ten."""
+"""A message with more fields is refused as hostile; real ones have four to ten."""
 
 _KNOWN = frozenset(("x", "y", "z", *TIME_NAMES, *RING_NAMES))
-_MAX_SWEEP = 1.0  # seconds, set by hand: no lidar frame lasts longer
+_MAX_SWEEP = 1.0  # seconds; no lidar frame lasts longer
 
 Field = tuple[str, str, int]
 """Name, NumPy type such as ``<f4``, and offset in bytes from the start of a point."""
@@ -47,7 +46,7 @@ Field = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Table:
-    """Points in a buffer, in rows.
+    """Points in a buffer, in rows of fields.
 
     Attributes:
         data: the buffer.
@@ -55,7 +54,7 @@ class Table:
         step: bytes from one point to the next.
         width: points in a row.
         height: rows.
-        row_step: bytes from one row to the next; of no account with one row.
+        row_step: bytes from one row to the next; not used with one row.
     """
 
     data: memoryview | bytes | npt.NDArray[np.uint8]
@@ -66,7 +65,7 @@ class Table:
     row_step: int = 0
 
     def column(self, field: Field, count: int = 1) -> npt.NDArray[Any]:
-        """Return (N, count) of ``count`` neighbouring values in every point; a view where strides allow it."""
+        """Return (N, count) neighbouring values of every point; a view where strides allow it."""
         _, kind, offset = field
         strides = (self.row_step, self.step, np.dtype(kind).itemsize)
         shape = (self.height, self.width, count)
@@ -75,12 +74,12 @@ class Table:
 
 
 def read_table(table: Table, stamp_ns: int) -> CloudMessage:
-    """Read the cloud in a table; packed float32 x y z stay a view. MessageError if the fields do not fit the data."""
+    """Read the cloud in a table; packed float32 x y z stay a view. MessageError if fields and data disagree."""
     known = _known_fields(table)
     if not table.width * table.height:
         return CloudMessage(stamp_ns, np.zeros((0, 3), np.float32))
     _check_extent(table)
-    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite; some NaN signal
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; some NaN signal
         return _read(table, known, stamp_ns)
 
 
@@ -150,21 +149,21 @@ def write_table(message: CloudMessage) -> Table:
 
 
 def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
-    """Return (N,) seconds after ``stamp_ns``, 0 where a point is not finite; None if they make no sense."""
+    """Return (N,) seconds after ``stamp_ns``, 0 where a point is not finite; None if implausible."""
     measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
     complete = bool(measured.all())
     if not measured.any():
         return None
     for candidate in _meanings(values, stamp_ns):
-        seen = candidate if complete else candidate[measured]
-        low, high = float(seen.min()), float(seen.max())  # NaN fails the comparisons below
+        valid = candidate if complete else candidate[measured]
+        low, high = float(valid.min()), float(valid.max())  # NaN fails the comparisons below
         if low >= -_MAX_SWEEP and high <= _MAX_SWEEP and high - low <= _MAX_SWEEP:
             return candidate if complete else np.where(measured, candidate, 0.0)
     return None
 
 
 def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
-    """Return seconds after the stamp in every sense that the type allows, likeliest first."""
+    """Return seconds after the stamp in each meaning that the type allows, likeliest first."""
     seconds = values.astype(np.float64)
     if values.dtype.kind in "ui":
         return [1e-9 * seconds] if values.dtype.itemsize == 4 else []
@@ -174,8 +173,8 @@ def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
 
 
 def rings_from(values: npt.NDArray[Any]) -> npt.NDArray[np.uint16] | None:
-    """Return (N,) beam numbers; None if they are no whole numbers in the uint16 range."""
-    if values.dtype.kind == "f" and not np.array_equal(values, np.trunc(values)):  # NaN fails it as well
+    """Return (N,) beam numbers; None if not whole or outside the uint16 range."""
+    if values.dtype.kind == "f" and not np.array_equal(values, np.trunc(values)):  # false for NaN too
         return None
     if len(values) and (values.min() < 0 or values.max() > np.iinfo(np.uint16).max):
         return None

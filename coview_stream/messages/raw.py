@@ -1,7 +1,7 @@
-"""Raw layouts, which a microcontroller can send without a library: little-endian float32 rows, the stamp beside them.
+"""Raw layouts for senders without a library, such as microcontrollers: little-endian float32 rows.
 
-``xyz``: 12 bytes a point. ``xyzi``: 16 bytes, the fourth number (intensity) is skipped. Attachment: see
-:func:`coview_stream.messages.validation.read_attachment`.
+``xyz`` takes 12 bytes a point; ``xyzi`` takes 16, the fourth number (intensity) is skipped. The stamp is in the
+attachment: :func:`coview_stream.messages.validation.read_attachment`.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ def decode_xyz(sample: Sample) -> CloudMessage:
 
 
 def decode_xyzi(sample: Sample) -> CloudMessage:
-    """Read rows x, y, z, intensity; the last is skipped."""
+    """Read rows x, y, z, intensity; the intensity is skipped."""
     return _decode(sample, 4)
 
 
 def encode_xyz(message: CloudMessage) -> Encoded:
-    """Write the points only: times, rings and sequence have no place in this layout."""
+    """Write the points; this layout carries no times, rings or sequence."""
     return _encode(message, "xyz", message.points)
 
 
 def encode_xyzi(message: CloudMessage) -> Encoded:
-    """Write the points as :func:`encode_xyz` does, with an intensity of zero."""
+    """Write the points with an intensity of zero."""
     rows = np.zeros((len(message.points), 4), np.float32)
     rows[:, :3] = message.points
     return _encode(message, "xyzi", rows)

@@ -1,6 +1,6 @@
 """ROS 2 messages as CDR with its 4-byte encapsulation header, through rosbags.
 
-Both byte orders are read, little-endian is written. The layouts of these types are the same from Humble to Rolling.
+Both byte orders are read, little-endian is written. These types have the same layout from Humble to Rolling.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 
 @lru_cache(maxsize=1)
 def store() -> Any:
-    """Import the message types and generate their code, on first use: it takes 0.25 s."""
+    """Import the message types and generate their code on first use, in about 0.25 s."""
     typesys = require_library("rosbags.typesys", "rosbags>=0.11", "ROS 2 messages")
-    found = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for name in (CLOUD, ODOMETRY, POSE):
-        found.get_msgdef(name)
-    return found
+        types.get_msgdef(name)
+    return types
 
 
 def _check_encapsulation(payload: bytes, name: str) -> None:
-    """Check the first two bytes, which name the encoding; the two after them are options, which a reader ignores."""
+    """Check the first two bytes, the encoding; the next two are options that a reader ignores."""
     kind = int.from_bytes(payload[:2], "big")
     if len(payload) < 4:
         raise MessageError(f"not a {name} in CDR: truncated")
@@ -49,15 +49,15 @@ def _check_encapsulation(payload: bytes, name: str) -> None:
             "(data representation XCDR1 in the writer's QoS)"
         )
     if kind not in (0, 1):
-        what = "a parameter list (PL_CDR)" if kind in (2, 3) else f"encapsulation 0x{kind:04x}"
-        raise MessageError(f"not a {name} in CDR: {what}; publish plain CDR")
+        encoding = "a parameter list (PL_CDR)" if kind in (2, 3) else f"encapsulation 0x{kind:04x}"
+        raise MessageError(f"not a {name} in CDR: {encoding}; publish plain CDR")
 
 
 def _read(payload: bytes, name: str) -> Any:
     _check_encapsulation(payload, name)
     try:
         return store().deserialize_cdr(memoryview(payload), name)
-    except Exception as error:  # generated code on hostile bytes; what it raises differs between versions
+    except Exception as error:  # generated code on hostile bytes raises different errors in different versions
         raise MessageError(f"not a {name} in CDR: {type(error).__name__}: {str(error)[:80]}") from error
 
 
@@ -71,7 +71,7 @@ def _pose(message: Any) -> Pose:
 
 
 def _refuse_many_fields(payload: bytes) -> None:
-    """Check the number of PointFields before parsing: rosbags would build millions of objects for a hostile one."""
+    """Check the number of PointFields before parsing: rosbags would build an object for each of millions."""
     _check_encapsulation(payload, CLOUD)
     order = "<" if payload[1:2] == b"\1" else ">"
     try:
@@ -84,7 +84,7 @@ def _refuse_many_fields(payload: bytes) -> None:
 
 
 def decode_cloud(sample: Sample) -> CloudMessage:
-    """Read a PointCloud2 of any layout. The points are a view on a little-endian payload where packed float32 x y z."""
+    """Read a PointCloud2 of any layout; packed little-endian float32 x y z stay a view on the payload."""
     _refuse_many_fields(sample.payload)
     cloud = _read(sample.payload, CLOUD)
     order = ">" if cloud.is_bigendian else "<"
@@ -100,14 +100,14 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read a PoseWithCovarianceStamped; what the type cannot say is NaN or empty."""
+    """Read a PoseWithCovarianceStamped; fields that the type lacks are NaN or empty."""
     message = _read(sample.payload, POSE)
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     return bare_pose(_stamp(message), _pose(message), message.header.frame_id, covariance)
 
 
 def new(type_name: str, /, **fields: Any) -> Any:
-    """Return a message of a type by its fields."""
+    """Return a message of a ROS type with these fields."""
     return store().types[type_name](**fields)
 
 
@@ -118,7 +118,7 @@ def write(message: Any, name: str) -> Encoded:
 
 
 def header(stamp_ns: int, frame_id: str) -> Any:
-    """Return a std_msgs/Header; MessageError where the stamp exceeds its seconds."""
+    """Return a std_msgs/Header; MessageError if the stamp exceeds its 32-bit seconds."""
     sec, nanosec = stamp_split(stamp_ns)
     if not -(2**31) <= sec < 2**31:
         raise MessageError(f"stamp {stamp_ns} ns exceeds the 32-bit seconds of a ROS header")
@@ -157,7 +157,7 @@ def encode_cloud(message: CloudMessage) -> Encoded:
 
 
 def encode_odometry(message: OdometryMessage) -> Encoded:
-    """Write an Odometry ``odom`` <- ``base_link``; covariances and velocities are zero: not known."""
+    """Write an Odometry ``odom`` <- ``base_link``; zero covariances and velocities mean unknown."""
     zero = dict.fromkeys("xyz", 0.0)
     twist = new(
         "geometry_msgs/msg/Twist",
@@ -177,13 +177,13 @@ def encode_odometry(message: OdometryMessage) -> Encoded:
 
 
 def encode_pose(message: PoseMessage) -> Encoded:
-    """Write a PoseWithCovarianceStamped in the map frame; covariance order x, y, z, roll, pitch, yaw, as there."""
+    """Write a PoseWithCovarianceStamped in the map frame; covariance order x, y, z, roll, pitch, yaw."""
     head = header(message.stamp_ns, message.frame_id)
     return write(new(POSE, header=head, pose=_pose_out(message.T_map_body, message.covariance)), POSE)
 
 
 def encode_location(message: LocationMessage) -> Encoded:
-    """Write a sensor_msgs/NavSatFix in CDR; its service is none of a satellite (0)."""
+    """Write a sensor_msgs/NavSatFix; service 0: no satellite system."""
     status = new("sensor_msgs/msg/NavSatStatus", status=0, service=0)
     fix = new(
         "sensor_msgs/msg/NavSatFix",

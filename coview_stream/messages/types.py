@@ -1,4 +1,4 @@
-"""Messages as plain data; :mod:`coview_stream.messages` turns them into bytes and back."""
+"""Messages as plain data; :mod:`coview_stream.messages` encodes and decodes them."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from coview_stream.geometry.transforms import Points, Pose, yaw_of
 
 @dataclass(frozen=True)
 class Sample:
-    """One message as it came over a transport.
+    """One message as received from a transport.
 
     Attributes:
         key: the key it was published on.
         payload: its bytes.
         encoding: MIME type with its schema (``type;schema``), empty if the sender set none.
-        attachment: bytes beside the payload, None if there are none.
-        size: bytes of a payload that was too large to be taken in; ``payload`` is empty then. None otherwise.
+        attachment: bytes sent with the payload, None if there are none.
+        size: bytes of a payload that was too large to receive (``payload`` is empty then); None otherwise.
     """
 
     key: str
@@ -43,12 +43,12 @@ class Sample:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A message ready to be published.
+    """A message ready to publish.
 
     Attributes:
         payload: its bytes.
         encoding: MIME type with its schema, empty for none.
-        attachment: bytes beside the payload, None for none.
+        attachment: bytes to send with the payload, None for none.
     """
 
     payload: bytes
@@ -62,10 +62,10 @@ class CloudMessage:
 
     Attributes:
         stamp_ns: sensor time, nanoseconds.
-        points: (N, 3) float32 body frame (x forward, z up), metres; may hold NaN rows; may be a read-only view.
-        times: (N,) float64 seconds after ``stamp_ns`` (before it: negative) at which each point was measured; None if
-            the sender gave none.
-        rings: (N,) which beam measured each point; None if the sender gave none.
+        points: (N, 3) float32 body frame (x forward, z up), metres; may have NaN rows; may be a read-only view.
+        times: (N,) float64 measurement time of each point, seconds after ``stamp_ns`` (negative: before); None if the
+            sender gave none.
+        rings: (N,) beam of each point; None if the sender gave none.
         sequence: the sender's running number; None if it has none.
     """
 
@@ -76,7 +76,7 @@ class CloudMessage:
     sequence: int | None = None
 
     def limited(self, max_points: int) -> CloudMessage:
-        """Return the frame with every n-th point only, if it has more than ``max_points``."""
+        """Return the frame thinned to every n-th point if it has more than ``max_points``."""
         step = -(-len(self.points) // max_points)
         if step <= 1:
             return self
@@ -100,18 +100,18 @@ class OdometryMessage:
 
 @dataclass(frozen=True, eq=False)
 class PoseMessage:
-    """One published pose, what :meth:`RobotClient.poses` yields. Two are equal only if they are the same object.
+    """One published pose, as yielded by :meth:`RobotClient.poses`. Equality is identity.
 
     Attributes:
-        stamp_ns: sensor time that the pose holds at, nanoseconds.
+        stamp_ns: sensor time of the pose, nanoseconds.
         robot: name.
-        state: always ``TRACKING`` from our node; kept for readers.
+        state: always ``TRACKING`` from our node.
         T_map_body: (4, 4) float64 map <- body, metres.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, m2 and rad2.
-        confidence: probability, in [0, 1], that the robot is at this place and not at another or none; NaN where a
-            format has none.
+        confidence: probability, in [0, 1], that the robot is at this place and not elsewhere; NaN where a format has
+            none.
         map_sha256: hash of the base map that the pose refers to.
-        age: seconds of sensor time since the lidar frame that last corrected it.
+        age: seconds of sensor time since the last lidar frame that corrected the pose.
         frame_id: name of the map frame, for formats that carry one.
         protection: metres and degrees that the error exceeds at most once in a thousand; None where a format has none.
         T_map_odom: (4, 4) map <- odometry, for users of transforms; None where a format has none.
@@ -131,8 +131,8 @@ class PoseMessage:
 
     @property
     def stamp(self) -> float:
-        """Seconds of sensor time that the pose holds at, to a microsecond; :attr:`stamp_ns` is exact."""
-        return int(self.stamp_ns) / 1_000_000_000  # of integers: correctly rounded
+        """Sensor time of the pose, seconds, to a microsecond; :attr:`stamp_ns` is exact."""
+        return int(self.stamp_ns) / 1_000_000_000  # integer division: correctly rounded
 
     @property
     def position(self) -> Floats:
@@ -155,7 +155,7 @@ class PoseMessage:
         return stddev_of(self.covariance)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data with the fields of the native JSON message, null where the pose's format does not carry one."""
+        """Fields of the native JSON message as plain data, null where the pose's format lacks one."""
         return {
             "stamp_ns": int(self.stamp_ns),
             "robot": self.robot,
@@ -177,14 +177,14 @@ class PoseMessage:
 
 @dataclass(frozen=True, eq=False)
 class HypothesesMessage:
-    """Places that a search for one robot considers, none of which is known to be right.
+    """Places that a search for one robot considers; none is certain.
 
     Attributes:
         stamp_ns: sensor time of the keyframe, nanoseconds.
         robot: name.
-        places: (K, 6) float64, the most probable first: x, y, z (metres) and yaw (radians) of the body in the map's
-            frame, posterior probability, log-likelihood ratio against chance.
-        none: probability that the robot is at no place of the map.
+        places: (K, 6) float64, most probable first: x, y, z (metres) and yaw (radians) of the body in the map frame,
+            posterior probability, log-likelihood ratio against chance.
+        none: probability that the robot is nowhere on the map.
         map_sha256: hash of the base map.
         maps: of several maps, the name of the one that each place is on, in whose frame it is; empty of one map.
     """
@@ -199,7 +199,7 @@ class HypothesesMessage:
 
 @dataclass(frozen=True, eq=False)
 class LocationMessage:
-    """Where a robot is on Earth (WGS 84).
+    """A robot's location on Earth (WGS 84).
 
     Attributes:
         stamp_ns: sensor time, nanoseconds.
@@ -208,7 +208,7 @@ class LocationMessage:
         height: metres; see :class:`coview_stream.clouds.reference_system.GeoReference`.
         heading: radians, clockwise from true north.
         covariance: (3, 3) east, north, up, m2.
-        confidence: as of the pose.
+        confidence: of the pose; NaN if unknown.
     """
 
     stamp_ns: int

@@ -15,33 +15,33 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages.types import PoseMessage
 
 MAX_PAYLOAD = 64 * 2**20
-"""Bytes of the largest payload that is decoded; set by hand."""
+"""Bytes of the largest payload that is decoded."""
 
 MAX_POINTS = 4_000_000
-"""Points of the largest cloud that is decoded; set by hand."""
+"""Points of the largest cloud that is decoded."""
 
 _NANO = 1_000_000_000
 
 
 class OversizedError(MessageError):
-    """A message is larger than the node takes; it is counted apart from malformed ones."""
+    """A message exceeds the node's limits; counted separately from malformed messages."""
 
 
 def check_size(payload: bytes, limit: int = MAX_PAYLOAD, size: int | None = None) -> None:
-    """Refuse a payload of more than ``limit`` bytes, or of ``size`` bytes that a transport left (OversizedError)."""
+    """Raise OversizedError for more than ``limit`` bytes, or for ``size`` bytes that a transport left out."""
     if size is not None or len(payload) > limit:
         size = len(payload) if size is None else size
         raise OversizedError(f"{size} bytes; at most {limit} are taken: send fewer points or fields")
 
 
 def check_points(count: int) -> None:
-    """Refuse a cloud of more than :data:`MAX_POINTS` (OversizedError)."""
+    """Raise OversizedError for more than :data:`MAX_POINTS`."""
     if count > MAX_POINTS:
         raise OversizedError(f"a cloud of {count} points; at most {MAX_POINTS} are taken: thin it out")
 
 
 def stamp_from(value: object) -> int:
-    """Check that ``value`` is a whole number of nanoseconds in the int64 range, and return it (else MessageError)."""
+    """Return ``value`` if it is a whole number of nanoseconds in the int64 range, else raise MessageError."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise MessageError(f"the stamp is of type {type(value).__name__}; write a whole number of nanoseconds")
     if not -(2**63) <= value < 2**63:
@@ -50,21 +50,21 @@ def stamp_from(value: object) -> int:
 
 
 def stamp_join(seconds: int, nanos: int) -> int:
-    """Join a stamp of two parts to nanoseconds, ``nanos`` in [0, 1e9); MessageError if they are out of range."""
+    """Join seconds and ``nanos``, in [0, 1e9), to nanoseconds; MessageError if out of range."""
     if not 0 <= nanos < _NANO:
         raise MessageError(f"the stamp has {nanos} nanoseconds beside its seconds; they must be below 1e9")
     return stamp_from(seconds * _NANO + nanos)
 
 
 def stamp_split(stamp_ns: int) -> tuple[int, int]:
-    """Split into seconds and nanoseconds, the latter in [0, 1e9)."""
+    """Split a stamp into seconds and nanoseconds in [0, 1e9)."""
     return divmod(stamp_ns, _NANO)
 
 
 def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
-    """Return the pose of x y z (metres) and qx qy qz qw; MessageError if not finite, absurdly far, or no rotation.
+    """Return the pose of x y z (metres) and qx qy qz qw; MessageError if not finite, too far, or no rotation.
 
-    The norm of the quaternion may be off by 1e-2 (float32 senders); it is normalised.
+    The quaternion is normalised; its norm may be off by 1e-2 (float32 senders).
     """
     if not all(map(math.isfinite, (*position, *quaternion))):
         raise MessageError("the pose is not finite")
@@ -89,9 +89,9 @@ def _pose(x: float, y: float, z: float, a: float, b: float, c: float, w: float) 
 
 
 def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
-    """Read the stamp in ns and the running number beside a payload; None for what is absent or not understood.
+    """Read stamp (ns) and sequence number of a payload; None where absent or not understood.
 
-    8 bytes: int64 LE ns. 33 bytes: as rmw_zenoh writes it, int64 LE number, int64 LE ns, 0x10 and 16 bytes of gid.
+    8 bytes: int64 LE ns. 33 bytes, rmw_zenoh's: int64 LE number, int64 LE ns, 0x10 and 16 bytes of gid.
     """
     if attachment is not None and len(attachment) == 8:
         return int.from_bytes(attachment, "little", signed=True), None
@@ -102,6 +102,6 @@ def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
 
 
 def bare_pose(stamp_ns: int, T: Pose, frame_id: str, covariance: Floats | None = None) -> PoseMessage:
-    """Return the message of a format that carries a pose and little else: what it leaves out is NaN or empty."""
+    """Return the message of a format that carries little but a pose; missing fields are NaN or empty."""
     unknown = np.full((6, 6), np.nan) if covariance is None else covariance
     return PoseMessage(stamp_ns, "", "TRACKING", T, unknown, math.nan, "", math.nan, frame_id)
