@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.cloud_head import CloudHead, read_head
-from coview_stream.clouds.cloud_paths import expand_cloud_paths
-from coview_stream.clouds.files import read_cloud
+from coview_stream.clouds.files import expand_cloud_paths, read_cloud
 from coview_stream.clouds.reference_system import flaw_of_name, flaw_of_system, unchecked_system
 from coview_stream.errors import CloudError, ConfigError, MapError, warn
 from coview_stream.geometry.arrays import Reals

@@ -21,9 +21,8 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
     Raises:
         ConfigError: the window is none. CloudError: a file cannot be fetched, or is no COPC file and a window is given.
     """
-    from coview_stream.clouds.cloud_paths import expand_cloud_paths
-    from coview_stream.clouds.copc import Window, fetch_cloud
-    from coview_stream.clouds.http_file import is_web_address
+    from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address
+    from coview_stream.clouds.files import expand_cloud_paths
 
     wanted = None if window is None else Window.parse(window)
     if wanted is None and not any(map(is_web_address, given)):

@@ -1,4 +1,4 @@
-"""Heads of cloud files, and whether several belong to one site: looked at before any of them is read whole."""
+"""Heads of cloud files, and whether several files belong to one site: checked before any is read whole."""
 
 from __future__ import annotations
 
@@ -11,33 +11,32 @@ import numpy as np
 
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import check_format
-from coview_stream.clouds.las import check_las, las_system
-from coview_stream.clouds.las_header import read_las_header
+from coview_stream.clouds.las import read_header, system_of
 from coview_stream.clouds.reference_system import same_system, short_name
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Bools, Floats
 
 MAX_GAP = 1000.0
-"""Metres between tiles of one site, set by hand; a lake or a field may lie between them."""
+"""Metres between tiles of one site; a lake or a field may lie between them."""
 
 FAR_GAP = 10_000.0
-"""Metres between files that are never one site, set by hand; two maps cost less than what lies between."""
+"""Metres between files that are never one site."""
 
 MAX_AREA = 50e6
-"""Square metres of the box around a site: the rasters of a build, cells of 0.5 m, have a limit there."""
+"""Square metres of the box around a site: the limit of a build's rasters, cells of 0.5 m."""
 
-_SAMPLED_POINTS = 100_000  # of a cloud, to see how far it extends; set by hand
-_STRAY = 0.5  # per cent of the points at either end that may lie anywhere; set by hand
+_SAMPLED_POINTS = 100_000  # of a cloud, to measure its extent
+_STRAY = 0.5  # per cent of the points at either end that do not count for the extent
 
 
 @dataclass(frozen=True, eq=False)
 class CloudHead:
-    """What is known of a cloud file.
+    """Facts about a cloud file.
 
     Attributes:
         path: of the file.
         crs: reference system, as :attr:`Cloud.crs`.
-        low, high: (3,) float64 corners of its extent, metres; None where the format tells them only with its points.
+        low, high: (3,) float64 corners of its extent, metres; None if the format does not state them.
     """
 
     path: Path
@@ -47,7 +46,7 @@ class CloudHead:
 
 
 def read_head(path: str | os.PathLike[str]) -> CloudHead:
-    """Check what can be checked of a file without reading its points.
+    """Check a file as far as possible without reading its points.
 
     Raises:
         CloudError: as of :func:`~coview_stream.clouds.files.read_cloud`.
@@ -55,14 +54,14 @@ def read_head(path: str | os.PathLike[str]) -> CloudHead:
     path = Path(path)
     if check_format(path) != "LAS":
         return CloudHead(path)
-    check_las(path)
-    header = read_las_header(path)
-    known = header.points > 0 and bool(np.isfinite([header.low, header.high]).all())
-    return CloudHead(path, las_system(path), header.low if known else None, header.high if known else None)
+    header = read_header(path)
+    low, high = header.mins, header.maxs
+    stated = header.point_count > 0 and bool(np.isfinite([low, high]).all())
+    return CloudHead(path, system_of(path, header), low if stated else None, high if stated else None)
 
 
 def extent_in_words(cloud: Cloud) -> str:
-    """Return how far a cloud extends, but for stray points: ``902 x 750 x 24 m``."""
+    """Return a cloud's extent without stray points: ``902 x 750 x 24 m``."""
     low, high = _extent(cloud)
     return " x ".join(f"{metres:.3g}" if metres < 100 else f"{metres:.0f}" for metres in high - low) + " m"
 
@@ -74,10 +73,10 @@ def _extent(cloud: Cloud) -> Floats:
 
 
 def head_of(path: Path, cloud: Cloud) -> CloudHead:
-    """Return the head of a file that was read; a few stray points do not count for its extent.
+    """Return the head of a file that was read, its extent without stray points.
 
     Raises:
-        CloudError: it extends farther than a map can.
+        CloudError: the extent exceeds that of a map.
     """
     low, high = _extent(cloud)
     wide = high - low
@@ -91,13 +90,13 @@ def head_of(path: Path, cloud: Cloud) -> CloudHead:
 
 
 def check_together(heads: Sequence[CloudHead]) -> str | None:
-    """Check that files can be one site, as far as their heads tell.
+    """Check by their heads that files can be one site.
 
     Returns:
-        What is unusual about them, as a sentence; None if nothing is.
+        A sentence about an unusual gap between them; None if there is none.
 
     Raises:
-        CloudError: two are in different reference systems, or so far apart that no map holds them; it names both.
+        CloudError: two are in different reference systems, or too far apart for a map; it names both.
     """
     stated = [head for head in heads if head.crs is not None]
     for head in stated[1:]:
@@ -118,25 +117,25 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
     far = ~near if near.sum() >= (~near).sum() else near
     one, other, gap = _nearest(low, high, far)
     wide = high.max(axis=0) - low.min(axis=0)
-    what = f"{boxes[one][0]} lies {gap / 1000:.1f} km from {boxes[other][0]}, the nearest of the other files"
+    apart = f"{boxes[one][0]} lies {gap / 1000:.1f} km from {boxes[other][0]}, the nearest of the other files"
     if gap > FAR_GAP or wide[0] * wide[1] > MAX_AREA:
         raise CloudError(
-            f"{what}; they cannot be one map: leave out what does not belong, bring all into one reference system and "
+            f"{apart}; they cannot be one map: leave out what does not belong, bring all into one reference system and "
             "unit, or build a map for each site"
         )
-    return f"{what}; the map holds both, and nothing between"
+    return f"{apart}; the map holds both, and nothing between"
 
 
 def _connected(low: Floats, high: Floats) -> Bools:
-    """Find the boxes (N, 2) that hang together with the first, with gaps below :data:`MAX_GAP`."""
+    """Find the boxes (N, 2) that are connected to the first by gaps below :data:`MAX_GAP`."""
     reached = np.zeros(len(low), dtype=bool)
     reached[0] = True
     fresh = [0]
     while fresh:
         at = fresh.pop()
-        found = np.flatnonzero(~reached & (_gaps(low, high, at) < MAX_GAP))
-        reached[found] = True
-        fresh += found.tolist()
+        neighbours = np.flatnonzero(~reached & (_gaps(low, high, at) < MAX_GAP))
+        reached[neighbours] = True
+        fresh += neighbours.tolist()
     return reached
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,69 +13,65 @@ from coview_stream.clouds.reference_system import flaw_of_system
 from coview_stream.errors import CloudError, require_library
 from coview_stream.geometry.arrays import Floats
 
-CHUNK = 500_000
-"""Points that are read at a time, set by hand."""
-
+_CHUNK = 500_000  # points read at a time
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _INVALID = {_CARTESIAN: "cartesianInvalidState", _SPHERICAL: "sphericalInvalidState"}
 
 
 def require_pye57() -> Any:
-    """Return pye57; DependencyError where it is not installed."""
+    """Return pye57; DependencyError if it is not installed."""
     return require_library("pye57", "pye57>=0.4", "E57 files")
 
 
-def decode(path: Path, make: Callable[[str | None], CloudBuilder]) -> CloudBuilder:
-    """Read a file, chunk by chunk, in this process, into ``make`` of its reference system.
+def decode(path: Path, builder: CloudBuilder) -> None:
+    """Read a file chunk by chunk in this process into a builder, with its reference system.
 
-    Points that the scanner calls invalid are dropped and counted.
+    Points that the scanner marks as invalid are dropped and counted.
 
     Raises:
-        CloudError: the file is damaged, or not in metres. DependencyError: there is no pye57.
+        CloudError: the file is damaged, or not in metres. DependencyError: pye57 is missing.
     """
     pye57 = require_pye57()
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
     try:
         file = pye57.E57(str(path))
-        crs = _reference_system(file)
-        builder = make(crs)
-        extent = np.array([[np.inf] * 3, [-np.inf] * 3])
+        builder.crs = _reference_system(file)
         for index in range(file.scan_count):
             for points, dropped in _scan(file, index):
                 if len(points):
-                    extent = np.stack(
-                        [np.minimum(extent[0], points.min(axis=0)), np.maximum(extent[1], points.max(axis=0))]
-                    )
+                    low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
                 builder.add(points, np.zeros(len(points), np.uint8), dropped)
     except (CloudError, MemoryError):
         raise
-    except Exception as error:  # the library's own, which derive from none of Python's but Exception
+    except Exception as error:  # pye57 raises exceptions of its own
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise CloudError(f"{path}: damaged or truncated E57 ({reason}); export the file again") from error
-    flaw = flaw_of_system(crs, {}, *extent) if np.isfinite(extent).all() else None
+    flaw = flaw_of_system(builder.crs, {}, low, high) if np.isfinite([low, high]).all() else None
     if flaw is not None:
         raise CloudError(f"{path}: {flaw}")
-    return builder
 
 
 def _reference_system(file: Any) -> str | None:
     try:
-        text = str(file.root["coordinateMetadata"].value()).strip()
+        return str(file.root["coordinateMetadata"].value()).strip() or None
     except Exception:  # absent, or no text
         return None
-    return text or None
 
 
-def _scan(file: Any, index: int) -> Any:
-    """Yield the points (N, 3) of a scan in the file's frame, chunk by chunk, and how many were invalid."""
+def _scan(file: Any, index: int) -> Iterator[tuple[Floats, int]]:
+    """Yield a scan's points (N, 3) in the file's frame and the number of invalid ones, chunk by chunk."""
     header = file.get_header(index)
     names = next((kind for kind in (_CARTESIAN, _SPHERICAL) if set(kind) <= set(header.point_fields)), None)
     if names is None:
         raise ValueError(f"scan {index} has neither cartesian nor spherical coordinates")
     invalid = _INVALID[names]
     fields = [*names, *([invalid] if invalid in header.point_fields else [])]
-    values, buffers = file.make_buffers(fields, CHUNK)
-    rotation, translation = _pose(header)
+    values, buffers = file.make_buffers(fields, _CHUNK)
+    rotation, translation = np.eye(3), np.zeros(3)
+    if header.has_pose():
+        rotation = np.asarray(header.rotation_matrix, dtype=np.float64)
+        translation = np.asarray(header.translation, dtype=np.float64)
     reader = header.points.reader(buffers)
     while (count := reader.read()) > 0:
         columns = [np.asarray(values[name][:count], dtype=np.float64) for name in names]
@@ -86,14 +82,8 @@ def _scan(file: Any, index: int) -> Any:
         yield points @ rotation.T + translation, int(count - valid.sum())
 
 
-def _pose(header: Any) -> tuple[Floats, Floats]:
-    if not header.has_pose():
-        return np.eye(3), np.zeros(3)
-    return np.asarray(header.rotation_matrix, dtype=np.float64), np.asarray(header.translation, dtype=np.float64)
-
-
 def _cartesian(spherical: Floats) -> Floats:
-    """Return (N, 3) x, y, z of ranges, azimuths and elevations (N, 3), metres and radians."""
-    reach, azimuth, elevation = spherical.T
-    flat = reach * np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), reach * np.sin(elevation)], axis=1)
+    """Return (N, 3) x, y, z of (N, 3) ranges (metres), azimuths and elevations (radians)."""
+    distance, azimuth, elevation = spherical.T
+    flat = distance * np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)

@@ -1,50 +1,40 @@
-"""Point cloud files: read and written by suffix, complete or not there."""
+"""Point cloud files: found by name, read and written by suffix; written files are complete or not there."""
 
 from __future__ import annotations
 
+import glob
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.clouds import las
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.clouds.cloud import LOCAL_LIMIT, Cloud
+from coview_stream.clouds.cloud import LOCAL_LIMIT, Cloud, CloudBuilder
+from coview_stream.clouds.decode import decode_in_child
 from coview_stream.clouds.e57 import require_pye57
-from coview_stream.clouds.las import read_las, require_laspy
-from coview_stream.clouds.laz_process import read_in_child
-from coview_stream.clouds.npy_bin import read_bin, read_npy
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
-from coview_stream.clouds.text import TEXT_SUFFIXES, read_text
+from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Reals
 
+_FORMATS = {
+    ".las": "LAS", ".laz": "LAS", ".pcd": "PCD", ".ply": "PLY", ".npy": "NPY", ".bin": "KITTI bin", ".e57": "E57",
+    **dict.fromkeys(TEXT_SUFFIXES, "text"),
+}  # fmt: skip
+_WHOLE_READERS: dict[str, Callable[[Path], Cloud]] = {
+    "PCD": read_pcd, "PLY": read_ply, "NPY": read_npy, "KITTI bin": read_bin, "text": read_text,
+}  # fmt: skip
 
-def read_e57(path: Path) -> Cloud:
-    """Read an E57 file, in a process of its own; CloudError where it is damaged, DependencyError without pye57."""
-    require_pye57()
-    return read_in_child(path)
-
-
-_READERS: dict[str, tuple[str, Callable[[Path], Cloud]]] = {
-    ".las": ("LAS", read_las),
-    ".laz": ("LAS", read_las),
-    ".pcd": ("PCD", read_pcd),
-    ".ply": ("PLY", read_ply),
-    ".npy": ("NPY", read_npy),
-    ".bin": ("KITTI bin", read_bin),
-    ".e57": ("E57", read_e57),
-    **dict.fromkeys(TEXT_SUFFIXES, ("text", read_text)),
-}
-
-CLOUD_SUFFIXES = frozenset(_READERS)
+CLOUD_SUFFIXES = frozenset(_FORMATS)
 """Suffixes, lower case with their dot, that ``read_cloud`` accepts."""
 
-_ANY_TEXT = frozenset({".txt", ".csv"})
-"""Suffixes of which a file in a folder may be anything: stamps, poses, notes."""
+_ANY_TEXT = frozenset({".txt", ".csv"})  # in a folder such files may be stamps, poses or notes
 
 _MAGIC = (
     (b"LASF", "LAS"),
@@ -65,26 +55,70 @@ _LAS_SCALE = 0.001  # metres
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a file in a folder is a cloud by its suffix; hidden files are not, nor .txt and .csv."""
+    """Return whether a file in a folder is a cloud by its suffix; not hidden files, .txt and .csv."""
     name = Path(path).name
     return Path(name).suffix.lower() in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
 
 
+def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """Return the files that names, folders and patterns (``tiles/*.laz``) mean, in natural order within each.
+
+    A folder means the clouds directly in it, by their suffix, without hidden and unfinished (``.part``) files. A named
+    file is returned whatever its suffix, for its reader to judge.
+
+    Raises:
+        CloudError: a folder or a pattern holds no cloud.
+    """
+    out: list[Path] = []
+    for path in map(Path, given):
+        if path.is_dir():
+            files = sorted(filter(is_cloud_name, path.iterdir()), key=natural_key)
+            if not files:
+                raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {_instead(path)}")
+            out += files
+        elif not path.exists() and glob.has_magic(str(path)):  # the shell has not expanded it
+            names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern
+            files = sorted(map(Path, names), key=natural_key)
+            out += [file for file in files if is_cloud_name(file) and file.is_file()]
+            if not any(map(is_cloud_name, files)):
+                raise CloudError(f"{path}: no cloud has such a name; check the pattern")
+        else:
+            out.append(path)
+    return out
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Return a sorting key that puts ``tile2`` before ``tile10``."""
+    parts = re.split(r"(\d+)", str(path))
+    return tuple((1, int(part), "") if k % 2 else (0, 0, part) for k, part in enumerate(parts))
+
+
+def _instead(folder: Path) -> str:
+    within = next(
+        (sub for sub in sorted(folder.iterdir()) if sub.is_dir() and any(map(is_cloud_name, sub.iterdir()))), None
+    )
+    return "name another folder, or the files" if within is None else f"did you mean {within}?"
+
+
 def check_format(path: Path) -> str:
-    """Return the format that a file's suffix names; CloudError where it is not there, or its first bytes disagree."""
+    """Return the format that a file's suffix names.
+
+    Raises:
+        CloudError: the file is missing, empty or a directory, or its first bytes are of another format.
+    """
     suffix = path.suffix.lower()
     head = _head(path)
-    if suffix not in _READERS:
+    if suffix not in _FORMATS:
         known = ", ".join(sorted(CLOUD_SUFFIXES))
         raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
-    name = _READERS[suffix][0]
-    found = sniff(head)
-    # raw float rows and text have no magic: anything that is not recognisably something else may be one
-    silent = found is None and (suffix == ".bin" or (name == "text" and b"\0" not in head))
-    if found != name and not silent:
-        what = f"is {found}" if found else f"does not begin like {name}"
-        remedy = "unpack it" if found in ("zip", "gzip") else "rename it, or get the real file"
-        raise CloudError(f"{path}: named {suffix} but its content {what}; {remedy}")
+    name = _FORMATS[suffix]
+    content = sniff(head)
+    # raw float rows and text have no magic
+    unmarked = content is None and (suffix == ".bin" or (name == "text" and b"\0" not in head))
+    if content != name and not unmarked:
+        reason = f"is {content}" if content else f"does not begin like {name}"
+        remedy = "unpack it" if content in ("zip", "gzip") else "rename it, or get the real file"
+        raise CloudError(f"{path}: named {suffix} but its content {reason}; {remedy}")
     return name
 
 
@@ -92,21 +126,47 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Read LAS, LAZ (COPC too), E57, PCD, PLY, NPY, text or KITTI ``.bin``; metres, in the file's own frame.
 
     The suffix names the format and the first bytes must agree with it. Rows that are not finite are dropped
-    and counted, so are LAS points that are withheld or labelled as noise.
+    and counted, as are LAS points that are withheld or labelled as noise.
 
     Raises:
         CloudError: the file is missing, a directory, empty, truncated, of another or unsupported format, or
             holds no usable point. The message names the file and the remedy.
     """
     path = Path(path)
-    check_format(path)
-    reader = _READERS[path.suffix.lower()][1]
+    reader = _WHOLE_READERS.get(check_format(path))
     try:
-        return reader(path)
+        if reader is not None:
+            return reader(path)
+        builder = CloudBuilder()
+        stream_cloud(path, builder)
+        return builder.finish(os.fspath(path))
     except OSError as error:
         raise CloudError(f"{path}: cannot be read ({error.strerror or error}); check the disk") from error
     except MemoryError as error:
         raise CloudError(f"{path}: does not fit into memory; split it into tiles") from error
+
+
+def stream_cloud(path: Path, builder: CloudBuilder) -> str | None:
+    """Pass a file's points to a builder, raw, float64 metres; return its reference system, if stated.
+
+    LAS, LAZ and E57 come in chunks of a million points; other formats are read whole first.
+
+    Raises:
+        CloudError: as of :func:`read_cloud`, but not for a file without points.
+    """
+    kind = check_format(path)
+    if kind in _WHOLE_READERS:
+        cloud = read_cloud(path)
+        builder.add(cloud.map_points(), cloud.classification, cloud.dropped)
+        return cloud.crs
+    # a missing library is reported here, not from the child
+    require = las.require_laspy if kind == "LAS" else require_pye57
+    require()
+    if kind == "E57" or las.is_compressed(path):
+        decode_in_child(path, builder)
+    else:
+        las.decode(path, builder)
+    return builder.crs
 
 
 def _head(path: Path) -> bytes:
@@ -142,9 +202,9 @@ def sniff(head: bytes) -> str | None:
 
 
 def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
-    """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), as the suffix says.
+    """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), in the format of the suffix.
 
-    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 where ``origin`` moves the
+    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 if ``origin`` moves the
     points beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
 
     Raises:
@@ -169,30 +229,28 @@ def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLi
         raise CloudError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
 
 
-def _pcd(stream: BinaryIO, rows: Reals, _: Path) -> None:
+def _write_pcd(stream: BinaryIO, rows: Reals, _: Path) -> None:
     size = rows.dtype.itemsize
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\n"
         f"SIZE {size} {size} {size}\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\n"
         f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
     )
-    stream.write(header.encode("ascii"))
-    stream.write(rows.tobytes())
+    stream.write(header.encode("ascii") + rows.tobytes())
 
 
-def _ply(stream: BinaryIO, rows: Reals, _: Path) -> None:
+def _write_ply(stream: BinaryIO, rows: Reals, _: Path) -> None:
     kind = "double" if rows.dtype.itemsize == 8 else "float"
     axes = "".join(f"property {kind} {axis}\n" for axis in "xyz")
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{axes}end_header\n"
-    stream.write(header.encode("ascii"))
-    stream.write(rows.tobytes())
+    stream.write(header.encode("ascii") + rows.tobytes())
 
 
-def _npy(stream: BinaryIO, rows: Reals, _: Path) -> None:
+def _write_npy(stream: BinaryIO, rows: Reals, _: Path) -> None:
     np.save(stream, rows, allow_pickle=False)
 
 
-def _bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
+def _write_bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
     if rows.dtype.itemsize == 8:
         raise CloudError(f"{path}: float32 rows cannot hold coordinates beyond 10 km; write PCD, PLY or LAZ")
     padded = np.zeros((len(rows), 4), "<f4")
@@ -200,25 +258,25 @@ def _bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
     stream.write(padded.tobytes())
 
 
-def _las(stream: BinaryIO, rows: Reals, path: Path) -> None:
-    laspy = require_laspy()
+def _write_las(stream: BinaryIO, rows: Reals, path: Path) -> None:
+    laspy = las.require_laspy()
     if not np.isfinite(rows).all():
         raise CloudError(f"{path}: LAS cannot hold NaN or infinite coordinates; drop those rows first")
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, _LAS_SCALE)
     header.offsets = np.floor(rows.min(axis=0)).astype(np.float64) if len(rows) else np.zeros(3)
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = rows.astype(np.float64).T
-    las.write(stream, do_compress=path.suffix.lower() == ".laz")
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = rows.astype(np.float64).T
+    data.write(stream, do_compress=path.suffix.lower() == ".laz")
 
 
 _WRITERS: dict[str, Callable[[BinaryIO, Reals, Path], None]] = {
-    ".pcd": _pcd,
-    ".ply": _ply,
-    ".npy": _npy,
-    ".bin": _bin,
-    ".las": _las,
-    ".laz": _las,
+    ".pcd": _write_pcd,
+    ".ply": _write_ply,
+    ".npy": _write_npy,
+    ".bin": _write_bin,
+    ".las": _write_las,
+    ".laz": _write_las,
 }
 
 WRITABLE_SUFFIXES = frozenset(_WRITERS)

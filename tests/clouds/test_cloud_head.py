@@ -8,6 +8,7 @@ import pytest
 from coview_stream.clouds.cloud_head import check_together, head_of, read_head
 from coview_stream.clouds.files import read_cloud, write_cloud
 from coview_stream.errors import CloudError
+from tests.clouds.test_las import geo_keys, written
 
 POINTS = np.random.default_rng(1).uniform(0, (200, 100, 10), (1000, 3))
 
@@ -50,8 +51,6 @@ def test_local_cloud_and_tile_with_coordinates_are_refused_once_read(tmp_path):
 
 
 def test_different_systems_are_refused_with_both_names(tmp_path):
-    from tests.clouds.test_las_header import geo_keys, written
-
     there = np.add(POINTS, (5e5, 5.4e6, 0.0))
     codes = (25832, 25833)
     paths = [written(tmp_path / f"{code}.las", there, vlrs=[geo_keys(k3072=code)]) for code in codes]

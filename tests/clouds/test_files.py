@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from coview_stream.clouds import merge, read_cloud, write_cloud
+from coview_stream.clouds.files import expand_cloud_paths
 from coview_stream.clouds.pcd import lzf_decompress
 from coview_stream.errors import CloudError
 
@@ -141,46 +142,6 @@ def test_ply_ascii_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path).points, [[1, 2, 3], [4, 5, 6]])
 
 
-def test_las_drops_withheld_and_noise_points_and_keeps_classes(tmp_path: Path) -> None:
-    import laspy
-
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.01), UTM
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (POINTS[:5] + UTM).T
-    las.classification = np.array([2, 7, 6, 18, 1], np.uint8)
-    las.withheld = np.array([0, 0, 0, 0, 1], np.uint8)
-    las.write(tmp_path / "a.laz")
-    cloud = read_cloud(tmp_path / "a.laz")
-    assert cloud.dropped == 3
-    assert cloud.classification is not None
-    assert cloud.classification.tolist() == [2, 6]
-    np.testing.assert_allclose(cloud.map_points(), (POINTS[:5] + UTM)[[0, 2]], atol=6e-3)
-
-
-@pytest.mark.parametrize(
-    ("wkt", "unit"),
-    [
-        ('PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["US survey foot",0.3048]]', "feet"),
-        ('GEOGCS["WGS 84",UNIT["degree",0.017]]', "degrees"),
-        ('PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["metre",1]]', None),
-    ],
-)
-def test_las_must_be_in_metres(tmp_path: Path, wkt: str, unit: str | None) -> None:
-    import laspy
-    from laspy.vlrs.known import WktCoordinateSystemVlr
-
-    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
-    las.header.vlrs.append(WktCoordinateSystemVlr(wkt))
-    las.x, las.y, las.z = POINTS.astype(np.float64).T
-    las.write(tmp_path / "a.las")
-    if unit:
-        with pytest.raises(CloudError, match=unit):
-            read_cloud(tmp_path / "a.las")
-    else:
-        assert read_cloud(tmp_path / "a.las").crs == wkt
-
-
 def test_merge_rebases_in_float64(tmp_path: Path) -> None:
     for name, shift in (("a", 0.0), ("b", 12_345.678)):
         write_cloud(tmp_path / f"{name}.npy", POINTS, origin=UTM + shift)
@@ -190,3 +151,39 @@ def test_merge_rebases_in_float64(tmp_path: Path) -> None:
     np.testing.assert_allclose(merged.map_points(), expected, rtol=0, atol=2e-3)
     with pytest.raises(CloudError, match="at least one"):
         merge([])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("tile10.laz", "tile2.laz", "tile1.las", ".hidden.laz", "site.coview", "notes.txt", "tile3.laz.part"):
+        (tmp_path / "tiles" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "tiles" / name).touch()
+    return tmp_path / "tiles"
+
+
+def test_folder_means_its_clouds_in_natural_order(folder):
+    assert [path.name for path in expand_cloud_paths([folder])] == ["tile1.las", "tile2.laz", "tile10.laz"]
+
+
+def test_pattern_and_names_may_be_mixed(folder):
+    found = expand_cloud_paths([folder / "tile*.laz", folder / "tile1.las", folder / "none.laz"])
+    assert [path.name for path in found] == ["tile2.laz", "tile10.laz", "tile1.las", "none.laz"]
+
+
+def test_named_file_is_left_to_its_reader(folder):
+    assert expand_cloud_paths([folder / "notes.txt"]) == [folder / "notes.txt"]
+
+
+def test_folder_or_pattern_without_clouds_says_so(folder, tmp_path):
+    with pytest.raises(CloudError, match=r"holds no cloud .*did you mean .*tiles\?"):
+        expand_cloud_paths([tmp_path])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CloudError, match=r"holds no cloud .*name another folder"):
+        expand_cloud_paths([tmp_path / "empty"])
+    with pytest.raises(CloudError, match="no cloud has such a name"):
+        expand_cloud_paths([folder / "*.ply"])
+
+
+def test_file_whose_name_has_brackets_is_a_file(tmp_path):
+    (tmp_path / "scan[1].ply").touch()
+    assert expand_cloud_paths([tmp_path / "scan[1].ply"]) == [tmp_path / "scan[1].ply"]

@@ -31,7 +31,7 @@ from coview_stream.basemap.site.manifest import (
 )
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
 from coview_stream.basemap.tiles import Key
-from coview_stream.clouds.http_file import open_web_file
+from coview_stream.clouds.fetch import open_web_file
 from coview_stream.errors import CloudError, MapError, TransportError, require_library, warn
 
 _PIECE = 1 << 20

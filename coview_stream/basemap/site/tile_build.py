@@ -19,8 +19,8 @@ from coview_stream.basemap.stations import find_stations
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.cloud import CloudBuilder
+from coview_stream.clouds.files import stream_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
-from coview_stream.clouds.stream import stream_cloud
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points

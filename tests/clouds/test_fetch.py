@@ -14,8 +14,7 @@ import pytest
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud
-from coview_stream.clouds.copc import Window, fetch_cloud, is_copc
-from coview_stream.clouds.http_file import HttpFile, download
+from coview_stream.clouds.fetch import RangeFile, Window, download, fetch_cloud, is_copc
 from coview_stream.errors import CloudError, ConfigError
 from tests.clouds.copc_file import write_copc
 
@@ -135,11 +134,11 @@ def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> 
 def test_servers_and_files_that_cannot_be_used_are_named(
     server: str, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coview_stream.clouds.http_file._WAIT", 0.0)
+    monkeypatch.setattr("coview_stream.clouds.fetch._WAIT", 0.0)
     with pytest.raises(CloudError, match=r"none\.laz: the server answers 404"):
         fetch_cloud(f"{server}/none.laz", tmp_path)
     with pytest.raises(CloudError, match="cannot be reached"):
-        HttpFile("http://127.0.0.1:1/x.laz").read(10)
+        RangeFile("http://127.0.0.1:1/x.laz").read(10)
     with pytest.raises(CloudError, match="not an http"):
         download("ftp://127.0.0.1/x.laz", tmp_path / "x")
     Handler.ranges = False

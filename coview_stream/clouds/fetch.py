@@ -1,0 +1,240 @@
+"""Clouds of web servers, whole or by HTTP range requests, and windows of COPC files.
+
+A window's points are written to a LAS file, to be read like any other.
+"""
+
+from __future__ import annotations
+
+import http.client
+import math
+import os
+import shutil
+import time
+import urllib.error
+import urllib.request
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from coview_stream.clouds.decode import copy_window
+from coview_stream.clouds.las import require_laspy
+from coview_stream.errors import CloudError, ConfigError
+
+_TIMEOUT = 30.0  # seconds without a byte
+_TRIES = 4
+_WAIT = 0.5  # seconds before the second try, doubled before each further one
+_BLOCK = 1 << 16  # bytes of a request at least: a header, its records and a hierarchy are many small reads
+_ANSWERS = (http.client.NOT_MODIFIED, http.client.REQUESTED_RANGE_NOT_SATISFIABLE)
+_BUSY = (408, 425, 429, 500, 502, 503, 504)
+_FAILURES = (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError)
+_COPC_MARK = 377, b"copc"  # offset and user id of the first record of a COPC file
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle in the coordinates of a cloud file.
+
+    Attributes:
+        low: west and south, in the file's units.
+        high: east and north.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Check that it has an area (ConfigError)."""
+        if not all(map(math.isfinite, (*self.low, *self.high))) or not (
+            self.low[0] < self.high[0] and self.low[1] < self.high[1]
+        ):
+            raise ConfigError(f"window {self}: has no area; give X0,Y0,X1,Y1, the south-west corner first")
+
+    @classmethod
+    def parse(cls, text: str) -> Window:
+        """Return the window that ``X0,Y0,X1,Y1`` means; ConfigError for any other text."""
+        try:
+            x0, y0, x1, y1 = map(float, text.split(","))
+        except ValueError:
+            raise ConfigError(f"window {text!r}: give X0,Y0,X1,Y1 in the clouds' coordinates") from None
+        return cls((x0, y0), (x1, y1))
+
+    def __str__(self) -> str:
+        """Return ``X0,Y0,X1,Y1``."""
+        return ",".join(f"{value:.15g}" for value in (*self.low, *self.high))
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """Counts of a fetched file.
+
+    Attributes:
+        points: in the window.
+        nodes: chunks that were read.
+        received: bytes from a web server; 0 of a local file.
+        requests: to the web server.
+    """
+
+    points: int
+    nodes: int
+    received: int = 0
+    requests: int = 0
+
+
+def is_web_address(name: str | os.PathLike[str]) -> bool:
+    """Return whether a name is an address of a web server."""
+    return str(name).lower().startswith(("http://", "https://"))
+
+
+def is_copc(path: Path) -> bool:
+    """Return whether a local file is marked as COPC."""
+    at, mark = _COPC_MARK
+    try:
+        with path.open("rb") as file:
+            head = file.read(at + len(mark))
+    except OSError:
+        return False
+    return head.startswith(b"LASF") and head[at:] == mark
+
+
+def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | None = None) -> tuple[Path, Fetched]:
+    """Write a cloud of a web server, or a window of a COPC file, into a folder.
+
+    Args:
+        source: address of a cloud file; with a window, address or name of a COPC file.
+        folder: exists; existing files in it are kept.
+        window: part to write; None: the whole file.
+
+    Returns:
+        The new file, and counts; without a window only of bytes and requests.
+
+    Raises:
+        CloudError: it cannot be read, is no COPC file, or no point is in the window. OSError: it cannot be written.
+    """
+    name = PurePosixPath(unquote(urlsplit(str(source)).path)).name if is_web_address(source) else Path(source).name
+    if name in ("", ".", "..") or "\0" in name or os.sep in name:
+        raise CloudError(f"{source}: names no file")
+    if window is None:
+        target = _free(folder / name)
+        return target, Fetched(0, 0, download(str(source), target), 1)
+    require_laspy()
+    if not is_web_address(source) and not is_copc(Path(source)):
+        raise CloudError(f"{source}: not a COPC file; --window reads parts of COPC files (.copc.laz) only")
+    target = _free(folder / f"{name.split('.')[0] or 'cloud'}.las")
+    try:
+        return target, Fetched(**copy_window(str(source), window.low, window.high, target))
+    except CloudError:
+        target.unlink(missing_ok=True)
+        raise
+
+
+def _free(path: Path) -> Path:
+    number, name = 1, path
+    while name.exists():
+        number += 1
+        name = path.with_name(f"{number}_{path.name}")
+    return name
+
+
+def download(address: str, target: Path) -> int:
+    """Write a file of a web server to ``target``; return its size in bytes.
+
+    Raises:
+        CloudError: the server cannot be reached, lacks the file, or broke off. OSError: it cannot be written.
+    """
+    with open_web_file(urllib.request.Request(address)) as answer, target.open("wb") as file:
+        try:
+            shutil.copyfileobj(answer, file, 1 << 20)
+        except _FAILURES as error:
+            raise CloudError(f"{address}: broke off after {file.tell()} bytes ({error}); try again") from error
+        size, promised = file.tell(), answer.headers.get("Content-Length")
+    if promised is not None and promised.isdigit() and int(promised) != size:
+        raise CloudError(f"{address}: broke off after {size} of {promised} bytes; try again")
+    return size
+
+
+def open_web_file(request: urllib.request.Request) -> Any:
+    """Return the answer to a request; a busy server is tried again a few times.
+
+    Raises:
+        CloudError: not the address of a web server, or the server cannot be reached or lacks the file.
+    """
+    address = request.full_url
+    if not is_web_address(address):
+        raise CloudError(f"{address}: not an http:// or https:// address")
+    for left in reversed(range(_TRIES)):
+        try:
+            return urllib.request.urlopen(request, timeout=_TIMEOUT)
+        except urllib.error.HTTPError as error:
+            if error.code in _ANSWERS:
+                return error
+            if error.code not in _BUSY or not left:
+                raise CloudError(f"{address}: the server answers {error.code} {error.reason}; check it") from error
+        except _FAILURES as error:
+            if not left:
+                why = getattr(error, "reason", error)
+                raise CloudError(f"{address}: cannot be reached ({why}); check address and network") from error
+        time.sleep(_WAIT * 2 ** (_TRIES - 2 - left))
+    raise AssertionError("not reached")
+
+
+class RangeFile:
+    """A file of a web server, read by range requests; laspy's reader needs ``read``, ``seek``, ``tell`` and ``close``.
+
+    Attributes:
+        requests: made so far.
+        received: bytes so far.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Take an address; no request is made yet."""
+        self._address = address
+        self._at = 0
+        self._block, self._begin = b"", 0
+        self.requests = 0
+        self.received = 0
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a byte from the beginning, or from the current one."""
+        self._at = offset + (self._at if whence == os.SEEK_CUR else 0)
+        if whence == os.SEEK_END or self._at < 0:
+            raise OSError("can only be read from its beginning on")
+        return self._at
+
+    def tell(self) -> int:
+        """Return the offset of the next byte."""
+        return self._at
+
+    def read(self, size: int) -> bytes:
+        """Return ``size`` bytes, fewer at the end of the file.
+
+        Raises:
+            CloudError: the server cannot be reached, lacks the file, or serves no ranges.
+        """
+        begin = self._at - self._begin
+        if not (begin >= 0 and begin + size <= len(self._block)):
+            self._block, self._begin, begin = self._request(max(size, _BLOCK)), self._at, 0
+        piece = self._block[begin : begin + size]
+        self._at += len(piece)
+        return piece
+
+    def close(self) -> None:
+        """Drop the buffer."""
+        self._block = b""
+
+    def _request(self, size: int) -> bytes:
+        span = f"bytes={self._at}-{self._at + size - 1}"
+        with open_web_file(urllib.request.Request(self._address, headers={"Range": span})) as answer:
+            self.requests += 1
+            if answer.status == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+                return b""
+            if answer.status != http.client.PARTIAL_CONTENT:
+                raise CloudError(
+                    f"{self._address}: the server serves no parts of files; download it, or name it without --window"
+                )
+            try:
+                raw: bytes = answer.read(size)
+            except _FAILURES as error:
+                raise CloudError(f"{self._address}: broke off ({error}); try again") from error
+        self.received += len(raw)
+        return raw
