@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from coview_stream.cli.map_argument import local_map
 from coview_stream.cli.options import add_client_network
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.client.latest_queue import LatestQueue
     from coview_stream.stream.transport.transport import Transport
+    from coview_stream.viewers.session_feed import Topic
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
 
-# all set by hand
 _SILENCE = 3.0  # seconds without a first message after which the keys and endpoints are printed
 _REDRAW_PERIOD = 0.5  # seconds, on a terminal
 _PRINT_PERIOD = 1.0  # seconds, elsewhere
@@ -76,48 +76,32 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-class _Topic(NamedTuple):
-    """One key expression to subscribe to.
-
-    Attributes:
-        key: the expression.
-        poses: it carries poses; else statuses.
-        robot: whose; None if the keys of the samples say.
-        hint: codec of poses without an Encoding; None if there is no such rule.
-    """
-
-    key: str
-    poses: bool
-    robot: str | None = None
-    hint: str | None = None
-
-
-def _topics(args: argparse.Namespace) -> list[_Topic]:
-    from coview_stream.stream.transport.keys import check_prefix, robot_keys
+def _topics(args: argparse.Namespace) -> list[Topic]:
+    """Return the topics of poses and statuses."""
+    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.viewers.session_feed import topics_of_base, topics_of_robots
 
     if args.robot:
-        keys = [robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)]
-        poses = [_Topic(k.pose, True, k.robot, k.pose_hint) for k in keys]
-        return poses + [_Topic(k.status, False, k.robot) for k in keys]
-    if args.preset != "native":
+        topics = topics_of_robots([robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)])
+    elif args.preset != "native":
         raise ConfigError(f"--preset {args.preset} has no key for all robots' poses: name them with --robot")
-    base = check_prefix(args.base, "--base")
-    return [_Topic(f"{base}/*/out/pose", True), _Topic(f"{base}/*/out/status", False)]
+    else:
+        topics = topics_of_base(args.base)
+    return [topic for topic in topics if topic.kind in ("pose", "status")]
 
 
 class _Watch:
     """Display of samples on this thread; the network's threads deliver them."""
 
-    def __init__(self, args: argparse.Namespace, fleet: FleetTable, topics: list[_Topic], transport: Transport) -> None:
+    def __init__(self, args: argparse.Namespace, fleet: FleetTable, topics: list[Topic], transport: Transport) -> None:
         from coview_stream.stream.client.latest_queue import LatestQueue
 
         self._args, self._fleet, self._topics = args, fleet, topics
         self._transport = transport
-        self._queue: LatestQueue[tuple[float, _Topic, Sample]] = LatestQueue(_MAX_QUEUED)
+        self._queue: LatestQueue[tuple[float, Topic, Sample]] = LatestQueue(_MAX_QUEUED)
         self._terminal = sys.stdout.isatty() and not args.json
         self._lines_drawn = 0  # of the table
         self._unreadable_keys: set[str] = set()
-        self._depth = len(args.base.split("/"))
         for topic in topics:
             transport.subscribe(topic.key, self._receiver(topic), "all")
 
@@ -141,11 +125,11 @@ class _Watch:
         if self._queue.dropped:
             print(f"{self._queue.dropped} messages were not shown: the output is too slow", file=sys.stderr)
 
-    def _receiver(self, topic: _Topic) -> Callable[[Sample], None]:
+    def _receiver(self, topic: Topic) -> Callable[[Sample], None]:
         return lambda sample: self._queue.put((time.monotonic(), topic, sample))
 
-    def _show(self, arrived: float, topic: _Topic, sample: Sample) -> None:
-        read = self._pose if topic.poses else self._status
+    def _show(self, arrived: float, topic: Topic, sample: Sample) -> None:
+        read = self._pose if topic.kind == "pose" else self._status
         try:
             record = read(arrived, topic, sample)
         except MessageError as error:
@@ -156,7 +140,7 @@ class _Watch:
         if self._args.json:
             print(json.dumps({"key": sample.key, **record}), flush=True)
 
-    def _pose(self, arrived: float, topic: _Topic, sample: Sample) -> dict[str, Any]:
+    def _pose(self, arrived: float, topic: Topic, sample: Sample) -> dict[str, Any]:
         from coview_stream.messages import decode_pose
         from coview_stream.messages.json_messages import pose_record
 
@@ -164,15 +148,15 @@ class _Watch:
         self._fleet.add_pose(pose, arrived)
         return pose_record(pose, sample)
 
-    def _status(self, arrived: float, topic: _Topic, sample: Sample) -> dict[str, Any]:
+    def _status(self, arrived: float, topic: Topic, sample: Sample) -> dict[str, Any]:
         from coview_stream.messages.json_messages import read_status
 
         status = read_status(sample)
         self._fleet.add_status(self._robot(topic, sample), status, arrived)
         return status
 
-    def _robot(self, topic: _Topic, sample: Sample) -> str:
-        return topic.robot or sample.key.split("/")[self._depth]
+    def _robot(self, topic: Topic, sample: Sample) -> str:
+        return topic.robot or sample.key.split("/")[topic.depth]
 
     def _draw(self, now: float) -> None:
         if not self._terminal:

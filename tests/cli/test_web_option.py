@@ -13,7 +13,7 @@ import urllib.request
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.cli import demo_processes, main
+from coview_stream.cli import demo, main
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import TransportError
 
@@ -51,9 +51,9 @@ def test_a_demo_hands_its_page_to_the_node(monkeypatch, tmp_path):
         started.append(args)
         raise TransportError("not started")
 
-    monkeypatch.setattr(demo_processes, "_process", no_process)
+    monkeypatch.setattr(demo, "_process", no_process)
     with pytest.raises(TransportError, match="not started"):
-        demo_processes.record_live(tmp_path / "site.coview", tmp_path, tmp_path, web="127.0.0.1:8642")
+        demo.record_live(tmp_path / "site.coview", tmp_path, tmp_path, web="127.0.0.1:8642")
     assert started[0][0] == "serve"
     assert started[0][-1] == "--web=127.0.0.1:8642"
 
