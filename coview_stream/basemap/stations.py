@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 import coview_kernels as kernels
 from coview_stream.basemap.ground import ground_mask
@@ -113,6 +112,8 @@ def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, i
 
 
 def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], steps: int, area: float) -> Bools:
+    from scipy import ndimage  # not part of the robot's side
+
     row, col = np.divmod(column, shape[1])
     # crop to where this slab has candidates; one cell of border keeps neighbours inside
     row, col = row - row.min() + 1, col - col.min() + 1
@@ -148,6 +149,8 @@ def _squares(ground: Points, cell: float) -> Points:
 
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     """Find the squares of floors that lie above the base level of their cell and cover a quarter of it."""
+    from scipy import ndimage  # not part of the robot's side
+
     if not len(floors):
         return floors.reshape(0, 3)
     corner, shape, flat = cells(np.concatenate([floors, base]), cell)
