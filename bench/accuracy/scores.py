@@ -1,4 +1,4 @@
-"""Scores of a tracked drive: pure functions of what was said frame by frame and of the truth."""
+"""Scores of a tracked drive: pure functions of the localizer's answers and of the truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame
 
 @dataclass(frozen=True)
 class Track:
-    """What the localizer said, frame by frame (N)."""
+    """Answers of the localizer, frame by frame (N)."""
 
     stamps: Floats  # seconds
     states: Sequence[str]  # names; ``SKIPPED`` for a frame that it refused
@@ -33,7 +33,7 @@ class Track:
 
     @classmethod
     def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Track:
-        """Collect what was said at the ``stamps``; a frame that was refused has the reason in place of its fix."""
+        """Collect fixes at the ``stamps``; a refused frame has the reason in place of its fix."""
         poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
         levels = np.full((len(fixes), 2), np.nan)
         states, reasons = [], []
@@ -73,12 +73,12 @@ class Errors:
         return np.asarray((self.metres <= FALSE_METRES) & (self.degrees <= FALSE_DEGREES))
 
 
-def errors(told: Track, truth: Floats) -> Errors:
+def errors(track: Track, truth: Floats) -> Errors:
     """Compare with the true poses (N, 4, 4), map <- body."""
     twist = np.full((len(truth), 6), np.nan)
-    known = told.tracking
+    known = track.tracking
     if known.any():
-        poses, true = told.poses[known], truth[known]
+        poses, true = track.poses[known], truth[known]
         twist[known, :3] = poses[:, :3, 3] - true[:, :3, 3]
         apart = poses[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
         twist[known, 3:] = Rotation.from_matrix(apart).as_rotvec()
@@ -108,28 +108,28 @@ def losses(states: Sequence[str], reasons: Sequence[str]) -> list[str]:
     return [reason for before, state, reason in pairs if state == "LOST" != before]
 
 
-def score(told: Track, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
+def score(track: Track, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
     """All figures of one drive but coverage; metres, degrees, seconds, milliseconds; None where there is no pose.
 
     Args:
-        told: what was said.
+        track: answers of the localizer.
         truth: (N, 4, 4) map <- body.
         driven: (N,) metres.
-        events: what happened, the first frame of it and the first after it.
+        events: name, first frame, and first frame after it.
     """
-    error, known = errors(told, truth), told.tracking
-    right, hold = error.right, held(told.stamps)
+    error, known = errors(track, truth), track.tracking
+    right, hold = error.right, held(track.stamps)
     false = known & ~right
     before = np.r_[False, known[:-1]]  # stepping from a pose searches no map
-    reasons = losses(told.states, told.reasons)
+    reasons = losses(track.states, track.reasons)
     happened = []
-    for what, begin, end in events:
-        back = recovery(right, told.stamps, driven, end)
+    for name, begin, end in events:
+        back = recovery(right, track.stamps, driven, end)
         until = len(right) if back is None else end + int(right[end:].argmax()) + 1
         during = float(hold[begin:until][false[begin:until]].sum())
         seconds, metres = back or (None, None)
-        happened.append({"what": what, "recovery_s": seconds, "recovery_m": metres, "false_s": during})
-    steps = np.percentile(told.seconds[before] * 1e3, [50, 99]).tolist() if before.any() else (None, None)
+        happened.append({"what": name, "recovery_s": seconds, "recovery_m": metres, "false_s": during})
+    steps = np.percentile(track.seconds[before] * 1e3, [50, 99]).tolist() if before.any() else (None, None)
     return {
         "driven_m": float(driven[-1]),
         "right_percent": 100 * float(right.mean()),

@@ -1,9 +1,8 @@
-"""Whether a reported covariance is honest: how often the truth lies within what it promises."""
+"""Coverage of a reported covariance: how often the truth lies within its sigmas."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.stats import chi2
 from bench.accuracy.scores import Errors, Track
 from bench.harness.rows import number, table
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.report.style import TRUTH, draw_notice, figure
 
 FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
 PARTS = ("first minute", "later")
@@ -23,30 +21,27 @@ AXES: dict[str, tuple[int, ...]] = {
     "x": (0,), "y": (1,), "z": (2,), "roll": (3,), "pitch": (4,), "yaw": (5,),
     "x,y": (0, 1), "x,y,z": (0, 1, 2), "pose": (0, 1, 2, 3, 4, 5),
 }  # fmt: skip
-"""What coverage is judged of: one axis alone, or several by their squared Mahalanobis distance."""
+"""One axis alone, or several by their squared Mahalanobis distance."""
 
 WITHIN = 0.05  # share by which an observed coverage may differ from the nominal one
-
-_SHOWN = {"x,y": "#0072B2", "x,y,z": "#009E73", "yaw": "#D55E00"}
-_MIN_FRAMES = 20  # that make a curve
 
 Squares = dict[str, dict[str, Floats]]
 """Squared Mahalanobis distances of poses, by part of the time since a fix and by name of the axes."""
 
 
-def since_fix(told: Track) -> Floats:
+def since_fix(track: Track) -> Floats:
     """(N,) seconds since the fix that each pose goes back to, NaN where there is none.
 
     A fix is the first pose after a search (SEARCHING or LOST); a doubt in between does not end it.
     """
-    out = np.full(len(told.stamps), np.nan)
+    out = np.full(len(track.stamps), np.nan)
     fixed: float | None = None
-    for k, (state, known) in enumerate(zip(told.states, told.tracking, strict=True)):
+    for k, (state, known) in enumerate(zip(track.states, track.tracking, strict=True)):
         if state in ("SEARCHING", "LOST"):
             fixed = None
         elif known:
-            fixed = float(told.stamps[k]) if fixed is None else fixed
-            out[k] = told.stamps[k] - fixed
+            fixed = float(track.stamps[k]) if fixed is None else fixed
+            out[k] = track.stamps[k] - fixed
     return out
 
 
@@ -66,11 +61,11 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
     return out
 
 
-def spread(told: Track, error: Errors) -> Squares:
+def spread(track: Track, error: Errors) -> Squares:
     """Squared distances of all poses in the ``first minute`` after a fix and ``later``."""
-    age = since_fix(told)
+    age = since_fix(track)
     return {
-        part: {name: squares(error.twist[mask], told.covariances[mask], axes) for name, axes in AXES.items()}
+        part: {name: squares(error.twist[mask], track.covariances[mask], axes) for name, axes in AXES.items()}
         for part, mask in zip(PARTS, (age < FIRST_MINUTE, age >= FIRST_MINUTE), strict=True)
     }
 
@@ -108,47 +103,22 @@ def honest(part: dict[str, Any]) -> bool:
     return inside is not None and bool(np.all(np.abs(np.subtract(inside, NOMINAL)) <= WITHIN))
 
 
-def coverage_table(found: dict[str, dict[str, Any]]) -> str:
+def coverage_table(parts: dict[str, dict[str, Any]]) -> str:
     """Lay out shares in per cent, marked where out of their band; medians of squared distances are 1 if right."""
-    parts = (*PARTS, "all")
+    columns = (*PARTS, "all")
     head, counts = ["coverage, %", "promised"], ["poses", ""]
-    for part in parts:
+    for part in columns:
         head += [part, "median"]
-        counts += [str(found[part]["yaw"]["frames"]), ""]
+        counts += [str(parts[part]["yaw"]["frames"]), ""]
     rows = []
     for name in AXES:
         row = [name, _percent(NOMINAL)]
-        for each in (found[part][name] for part in parts):
-            mark = "" if each["inside"] is None or honest(each) else " !"
-            row += [_percent(each["inside"]) + mark, number(each["median_nees"], 2)]
+        for entry in (parts[part][name] for part in columns):
+            mark = "" if entry["inside"] is None or honest(entry) else " !"
+            row += [_percent(entry["inside"]) + mark, number(entry["median_nees"], 2)]
         rows.append(row)
     return table(head, [*rows, counts])
 
 
 def _percent(inside: Sequence[float] | None) -> str:
     return "-" if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
-
-
-def draw(spread: Squares, path: Path, title: str) -> None:
-    """Draw observed over nominal coverage for position and yaw, by part of the time (see :func:`pooled`)."""
-    nominal = np.linspace(0.0, 1.0, 201)
-    with figure(path, figsize=(9.6, 5.0), ncols=2, axes={"sharey": True}) as (drawing, both):
-        for axes, part, after in zip(both, PARTS, (" after a fix", ""), strict=True):
-            band = np.clip([nominal - WITHIN, nominal + WITHIN], 0.0, 1.0)
-            axes.fill_between(nominal, *band, color="#dddddd", linewidth=0, label="within 5 points")
-            axes.plot(nominal, nominal, color=TRUTH, linestyle="--", linewidth=1.0, label="as promised")
-            count = len(spread[part]["yaw"])
-            for name, colour in _SHOWN.items() if count >= _MIN_FRAMES else ():
-                ranked, dof = np.sort(spread[part][name]), len(AXES[name])
-                for at, style in ((nominal, {"linewidth": 1.8, "label": name}), (NOMINAL, {"marker": "o", "ls": ""})):
-                    observed = np.searchsorted(ranked, chi2.ppf(at, dof), side="right") / count
-                    axes.plot(at, observed, color=colour, markersize=5, **style)
-            if count < _MIN_FRAMES:
-                draw_notice(axes, "too few poses")
-            axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="promised share", aspect="equal")
-            axes.set_title(f"{part}{after}, {count} poses")
-            axes.set_xticks([0, 0.25, 0.5, *NOMINAL[:2]], ["0", ".25", ".5", "1$\\sigma$", "2$\\sigma$"])
-            axes.grid(True, color="#eeeeee", linewidth=0.6)
-        both[0].set_ylabel("observed share")
-        both[0].legend(fontsize=9, loc="lower right")
-        drawing.supxlabel(title, fontsize=8, color="#666666", family="DejaVu Sans Mono")

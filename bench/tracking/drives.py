@@ -1,6 +1,6 @@
-"""What happens to a robot while it is tracked: drives made of the frames of a simulated one.
+"""Drives with events, made of the frames of a simulated one.
 
-Frames and truth are the simulator's; odometry is drawn anew with a chosen drift and then jumps, starts again, is out of
+Frames and truth are the simulator's; odometry is drawn with a chosen drift and then jumps, starts again, is out of
 scale or stands still while the robot is carried.
 """
 
@@ -21,7 +21,7 @@ from coview_stream.sim.sensors import FRAME_PERIOD
 SEGMENT = 100.0  # metres over which drift is measured
 EVENT_AT = 90.0  # metres
 CLEAR, CLOTH, DUST = 0, 1, 2
-"""What lies over the sensor: nothing; a cloth at 0.5 to 0.9 m; so much that only 20 returns of a frame are left."""
+"""Cover of the sensor: nothing; a cloth at 0.5 to 0.9 m; so much that only 20 returns of a frame are left."""
 
 _DUST_POINTS = 20
 _MIN_GAP = 20.0  # metres in the gap that count as an event
@@ -30,7 +30,7 @@ _FIRST_STAMP = 1000.0
 
 
 class Event(NamedTuple):
-    """What happened, from the frame ``begin`` on; at the frame ``end`` it is over, and recovery begins."""
+    """Event from the frame ``begin`` on; at the frame ``end`` it is over, and recovery begins."""
 
     what: str
     begin: int
@@ -46,8 +46,8 @@ class Drive:
     truth: Floats  # (K, 4, 4) map <- body
     odometry: Floats  # (K, 4, 4) odom <- body
     driven: Floats  # (K,) metres on its own wheels up to each frame
-    cover: Ints  # (K,) what lies over the sensor
-    events: tuple[Event, ...] = ()  # what to recover from
+    cover: Ints  # (K,) cover of the sensor
+    events: tuple[Event, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -88,8 +88,8 @@ def drift_share(truth: Floats, odometry: Floats, over: float = SEGMENT) -> float
     errors = []
     for first in range(0, int(np.searchsorted(way, way[-1] - over)), 10):
         last = int(min(np.searchsorted(way, way[first] + over), len(way) - 1))
-        true, told = (inverse(T[first]) @ T[last] for T in (truth, odometry))
-        errors.append(float(np.linalg.norm(true[:3, 3] - told[:3, 3])) / over)
+        true, measured = (inverse(T[first]) @ T[last] for T in (truth, odometry))
+        errors.append(float(np.linalg.norm(true[:3, 3] - measured[:3, 3])) / over)
     return float(np.mean(errors))
 
 

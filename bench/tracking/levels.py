@@ -7,16 +7,17 @@ independent, as far as the world itself is not what they share.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import fdtri
+from scipy.stats import beta, f
 
 from bench.accuracy.scores import Errors, Track
 from bench.harness.rows import number, table
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, RISK, TAILS, axes_of
-from coview_stream.report.style import TRUTH, figure
 
 EVERY = 10.0
 """Metres of driving of which one pose counts."""
@@ -47,15 +48,15 @@ class Sample(NamedTuple):
     axes: Floats
 
     @classmethod
-    def of(cls, told: Track, error: Errors, driven: Floats) -> Sample:
+    def of(cls, track: Track, error: Errors, driven: Floats) -> Sample:
         """Pick them from a drive; (N,) metres ``driven`` at each frame."""
-        posed = np.flatnonzero(told.tracking)
+        posed = np.flatnonzero(track.tracking)
         rows = posed[np.unique(np.floor(driven[posed] / EVERY), return_index=True)[1]]
-        shape = [[axes_of(C[:3, :3]), axes_of(C[3:, 3:])] for C in told.covariances[rows]]
+        shape = [[axes_of(C[:3, :3]), axes_of(C[3:, 3:])] for C in track.covariances[rows]]
         spread = np.array(shape, dtype=np.float64).reshape(-1, 2, 2)
         errors = np.column_stack([error.metres[rows], error.degrees[rows]])
         sample = cls(errors, np.ones_like(errors), spread[:, :, 0], spread[:, :, 1])
-        return sample._replace(doubt=told.levels[rows] / sample.level(PRODUCT))
+        return sample._replace(doubt=track.levels[rows] / sample.level(PRODUCT))
 
     @classmethod
     def joined(cls, parts: Sequence[Sample]) -> Sample:
@@ -73,8 +74,6 @@ class Sample(NamedTuple):
 
     def level(self, tails: Tails) -> Floats:
         """(N, 2) metres and degrees that tails of the errors give: factor and degrees of freedom of each."""
-        from scipy.special import fdtri
-
         quantiles = [
             factor * np.sqrt(self.trace[:, k] * fdtri(self.axes[:, k], freedom, 1.0 - RISK))
             for k, (factor, freedom) in enumerate(tails)
@@ -88,8 +87,6 @@ class Sample(NamedTuple):
 
 def upper_bound(hits: int, of: int, confidence: float = 0.95) -> float:
     """Return the one-sided upper bound of a share after Clopper and Pearson; 1 of nothing."""
-    from scipy.stats import beta
-
     return 1.0 if hits >= of else float(beta.ppf(confidence, hits + 1, of - hits))
 
 
@@ -98,9 +95,6 @@ def tail(sample: Sample, part: int) -> tuple[float, float]:
 
     The model is that of :mod:`coview_stream.geometry.protection`: error^2 / trace, less the factor, is F distributed.
     """
-    from scipy.optimize import minimize
-    from scipy.stats import f
-
     error = sample.error[:, part] if part == 0 else np.radians(sample.error[:, part])
     square, axes = error**2 / sample.trace[:, part], sample.axes[:, part]
 
@@ -125,14 +119,14 @@ class Beyond(NamedTuple):
         return self.seconds > TO_ALERT[0] or self.metres > TO_ALERT[1]
 
 
-def beyond_alert_limit(told: Track, error: Errors, driven: Floats) -> list[Beyond]:
+def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[Beyond]:
     """Return the times that poses were given beyond the alert limit; (N,) metres ``driven`` at each frame."""
-    beyond = told.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
+    beyond = track.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
     edges = np.diff(np.r_[False, beyond, False].astype(int))
     out = []
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
         last = min(end, len(driven) - 1)  # where it is withdrawn, or the drive's end
-        seconds, metres = told.stamps[last] - told.stamps[begin], driven[last] - driven[begin]
+        seconds, metres = track.stamps[last] - track.stamps[begin], driven[last] - driven[begin]
         out.append(Beyond(float(seconds), float(metres)))
     return out
 
@@ -155,28 +149,3 @@ def level_table(samples: Mapping[str, Sample]) -> str:
             cells += [number(float(each), digits) for each in wide]
         rows.append(cells)
     return table(head, rows)
-
-
-def stanford(sample: Sample, path: Path, title: str) -> None:
-    """Draw the Stanford diagram: error against level, with the alert limit and the regions that they part."""
-    levels, above = sample.level(PRODUCT), sample.above(PRODUCT)
-    with figure(path, figsize=(10.4, 5.4), ncols=2) as (drawing, both):
-        for k, (axes, unit) in enumerate(zip(both, ("m", "degrees"), strict=True)):
-            low, high, limit = ALERT[k] / 1000, ALERT[k] * 10, ALERT[k]
-            error, level = (np.clip(each[:, k], low * 1.05, high / 1.05) for each in (sample.error, levels))
-            axes.fill_between([low, high], [low, low], [low, high], color="#F0E442", alpha=0.3, linewidth=0)
-            axes.fill_between([limit, high], [low, low], [limit, limit], color="#D55E00", alpha=0.45, linewidth=0)
-            axes.fill_between([low, high], [limit, limit], [high, high], color="#dddddd", linewidth=0)
-            axes.scatter(error, level, s=5, color="#0072B2", alpha=0.5, linewidths=0)
-            axes.plot([low, high], [low, high], color=TRUTH, linewidth=1.0)
-            axes.axhline(limit, color=TRUTH, linewidth=0.8, linestyle="--")
-            axes.axvline(limit, color=TRUTH, linewidth=0.8, linestyle="--")
-            axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
-            axes.set(xlabel=f"error, {unit}", ylabel=f"protection level, {unit}")
-            for x, y, said in (
-                (0.06, 0.68, "as promised"), (0.34, 0.06, "error > level:\nmisleading"), (0.77, 0.3, "HMI"),
-                (0.06, 0.9, "level > alert limit: unavailable"), (0.755, 0.02, f"alert limit {limit:g}"),
-            ):  # fmt: skip
-                axes.text(x, y, said, transform=axes.transAxes, fontsize=8)
-            axes.set_title(f"{unit}: {above[k]} of {len(error)} above their level")
-        drawing.supxlabel(title, fontsize=8, color="#666666", family="DejaVu Sans Mono")

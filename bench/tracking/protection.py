@@ -19,7 +19,7 @@ from bench.accuracy.scores import errors
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, number, table
 from bench.tracking import drives
-from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, stanford, tail, upper_bound
+from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, tail, upper_bound
 from bench.tracking.tracking import follow
 from bench.tracking.worlds import World, map_of, open_world
 from coview_stream.geometry.protection import RISK
@@ -53,10 +53,9 @@ FAMILIES = {
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add how many worlds, and the picture."""
+    """Add the worlds."""
     parser.add_argument("--worlds", type=int, default=WORLDS, metavar="N", help=f"of each family ({WORLDS})")
     parser.add_argument("--family", choices=tuple(FAMILIES), help="this one alone")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the Stanford diagram of the reported ones")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -88,9 +87,6 @@ def rows(asked: Namespace) -> Iterator[Row]:
             yield judged(f"protection/error > level, {unit}", said, f"<= {100 * RISK:g} %", holds, hits / max(of, 1))
         count = sum(each["misleading"] for each in some)
         yield judged("protection/beyond the alert limit", f"{count} in {metres / 1000:.1f} km", "0", not count, count)
-        if asked.plot:
-            drives_said = f"python -m bench protection: {len(some)} drives, one pose per 10 m, code {fingerprint()}"
-            stanford(sample, asked.plot, drives_said)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
@@ -115,11 +111,11 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
     def work() -> dict[str, Any]:
         recorded = open_world(below, world)
         drive = drives.start(recorded.truth, world.drift, world.seed)
-        told = follow(map_of(below, world, variant), recorded, drive)
-        error = errors(told, drive.truth)
-        sample = Sample.of(told, error, drive.driven)
+        track = follow(map_of(below, world, variant), recorded, drive)
+        error = errors(track, drive.truth)
+        sample = Sample.of(track, error, drive.driven)
         about = {"kind": world.kind, "variant": variant, "driven_m": float(drive.driven[-1])}
-        about["misleading"] = sum(each.misleading for each in beyond_alert_limit(told, error, drive.driven))
+        about["misleading"] = sum(each.misleading for each in beyond_alert_limit(track, error, drive.driven))
         return about | {"sample": sample.to_json()}
 
     return remembered(below / "protection-results" / f"{world.name}-{variant}.json", spec, work)

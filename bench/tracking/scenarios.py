@@ -1,4 +1,4 @@
-"""What ``python -m bench tracking`` measures: which worlds are driven through, and what befalls the robot there.
+"""Worlds and events of ``python -m bench tracking``.
 
 Seeds 5001 to 5010 are for reporting only: nothing is tuned on them. Calibrate on others: ``worlds(5100)``.
 """
@@ -51,7 +51,7 @@ _EVENTS: dict[str, tuple[Callable[[Drive], Drive], tuple[str, ...], float, str]]
     "reset": (drives.restarted, ("campus",), 0.01, "plain"),
     "scale": (drives.scaled, ("town", "forest"), 0.005, "plain"),
 }
-"""What befalls the robot, where, with which drift of its odometry, on which map."""
+"""Event, places, drift of odometry, map."""
 
 
 def worlds(seeds: int = SEEDS) -> tuple[World, ...]:

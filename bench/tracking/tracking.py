@@ -1,11 +1,10 @@
-"""How tracking holds, loses and recovers.
+"""Errors, covariance, loss and recovery of a tracked robot.
 
-Ten plain drives, and drives on which something happens to the robot (:mod:`bench.tracking.scenarios`). The truth only
-scores. NAME picks the scenarios whose names contain it; worlds, maps and answers stay in ``--work``, so that a run can
-be made in portions and an unchanged engine is not asked twice.
+Ten plain drives, and drives with an event (:mod:`bench.tracking.scenarios`). NAME picks the scenarios whose names
+contain it; worlds, maps and answers stay in ``--work``, so a run can be made in portions.
 
-Coverage is the share of the poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by
-itself, of several by their squared Mahalanobis distance. Protection levels are judged by one pose per ten metres.
+Coverage is the share of poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by itself,
+of several by their squared Mahalanobis distance. Protection levels are judged by one pose per ten metres.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import numpy as np
 from bench.accuracy.scores import Track, errors, score
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, number, table
-from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw, honest, pooled, shares, spread
+from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, honest, pooled, shares, spread
 from bench.tracking.drives import Drive, drift_share, seen
 from bench.tracking.levels import TO_ALERT, Sample, beyond_alert_limit, level_table
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
@@ -35,7 +34,7 @@ MAX_METRES, MAX_DEGREES, MAX_RECOVERY = 0.12, 0.35, 20.0
 """The targets: root mean squares over the plain drives, and metres driven after an event."""
 
 _JUDGED = ("x", "y", "z", "yaw", "x,y", "x,y,z")
-"""What the coverage target is about; roll, pitch and the whole pose are told."""
+"""What the coverage target is about; roll, pitch and the whole pose only inform."""
 
 _COLUMNS = {
     "drift %": ("drift_percent", 1), "driven m": ("driven_m", 0), "right %": ("right_percent", 1),
@@ -51,9 +50,8 @@ Figures = dict[str, Any]
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add which scenarios, and the picture."""
+    """Add the scenarios."""
     parser.add_argument("names", nargs="*", metavar="NAME", help="part of a scenario's name (all)")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the coverage")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"ten worlds after N ({SEEDS})")
 
 
@@ -76,11 +74,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
     found = shares(together)
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
     levels = level_table({name: Sample.joined(some) for name, some in samples.items()})
-    told = {"coverage": found, "protection": levels}
-    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", told)
+    details = {"coverage": found, "protection": levels}
+    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", details)
     yield from verdicts(drives, found, asked.quick)
-    if asked.plot:
-        draw(together, asked.plot, f"python -m bench tracking: {len(drives)} drives, code {fingerprint()}")
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
@@ -91,7 +87,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
         "coverage": coverage_table(together["coverage"]),
         "protection": together["protection"],
-        "events": "\n".join([*_events(drives)()]),
+        "events": "\n".join(_events(drives)),
     }
 
 
@@ -106,12 +102,12 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
     def work() -> dict[str, Any]:
         recorded = open_world(folder, scenario.world)
         drive = scenario.drive(recorded.truth)
-        told = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
+        track = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
         drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
         about = {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift}
-        error = errors(told, drive.truth)
-        parts, sample = spread(told, error), Sample.of(told, error, drive.driven)
-        beyond = beyond_alert_limit(told, error, drive.driven)
+        error = errors(track, drive.truth)
+        parts, sample = spread(track, error), Sample.of(track, error, drive.driven)
+        beyond = beyond_alert_limit(track, error, drive.driven)
         about |= {
             "misleading": sum(each.misleading for each in beyond),
             "beyond": len(beyond),
@@ -119,7 +115,7 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
             "alert_m": max((each.metres for each in beyond), default=None),
         }
         lists = {part: {name: values.tolist() for name, values in axes.items()} for part, axes in parts.items()}
-        figures = about | score(told, drive.truth, drive.driven, drive.events)
+        figures = about | score(track, drive.truth, drive.driven, drive.events)
         return {"figures": figures, "squares": lists, "sample": sample.to_json()}
 
     kept = remembered(folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json", spec, work)
@@ -128,7 +124,7 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
 
 
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
-    """Feed a drive to a new localizer, which is told frames and odometry and nothing else; write down what it says."""
+    """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
     localizer, seconds = Localizer(BaseMap.load(site)), np.zeros(len(drive))
     fixes: list[Fix | str] = []
     for k in range(len(drive)):
