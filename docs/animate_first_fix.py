@@ -23,7 +23,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.recordings import open_run
-from coview_stream.report.style import STATE_COLOURS, draw_base_map
+from coview_stream.report.plots import STATE_COLOURS, draw_base_map
 
 # set by hand
 EVERY, EVERY_AFTER = 3, 5  # frames of the run between two of the picture, and after the first fix

@@ -37,7 +37,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses
 from coview_stream.recordings.open_run import open_run
 from coview_stream.report.evaluation import MAX_STAMP_GAP, driven
-from coview_stream.sim.airborne_survey import Survey, airborne_survey, surface_of
+from coview_stream.sim.airborne import Survey, airborne_survey, surface_of
 
 SETS = ("riverside_a", "kitti04", "handheld_livox")
 CONDITIONS = (
@@ -50,7 +50,7 @@ MOST_METRES, MOST_DEGREES = 0.3, 1.0  # of every first fix
 _ASKED = ("pitch", "roll", "odo", "drift")  # conditions that LEAST_SHARE is asked of
 _ARROW = " > "
 _SPOILING = ("bench/accuracy/spoil.py", "bench/accuracy/conditions.py")
-_AIRBORNE = ("coview_stream/sim/airborne_survey.py", "coview_stream/clouds")
+_AIRBORNE = ("coview_stream/sim/airborne.py", "coview_stream/clouds")
 _NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 Runs = dict[str, dict[str, Any]]  # scores by code, "before" and "now"

@@ -31,9 +31,8 @@ from coview_stream.localization.offline import locate
 from coview_stream.recordings.open_run import open_run
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import SimulationConfig, simulate
-from coview_stream.sim.caster import Caster
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
-from coview_stream.sim.sensors import FRAME_PERIOD
+from coview_stream.sim.sensors import FRAME_PERIOD, Caster
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import trained_sensor
 from coview_stream.training.worlds import base_scan, draw_world

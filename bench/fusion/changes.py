@@ -21,9 +21,8 @@ from bench.harness.files import folder
 from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.filters import open3d
-from coview_stream.fusion.fuse import FuseConfig, Fused, fuse
+from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, Fused, fuse
 from coview_stream.fusion.localized_run import LocalizedRun, RunPair
-from coview_stream.fusion.records import GONE, NEW
 from coview_stream.fusion.sightings import REACH
 from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.localization.offline import locate, write

@@ -22,10 +22,9 @@ from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds import read_cloud
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.fusion.constraints import Registrar, overlapping
+from coview_stream.fusion.constraints import Registrar, overlapping, submaps_of
 from coview_stream.fusion.joint import adjust
 from coview_stream.fusion.localized_run import LocalizedRun, RunPair
-from coview_stream.fusion.submaps import submaps_of
 from coview_stream.geometry.arrays import Floats
 from coview_stream.localization.offline import locate, write
 from coview_stream.localization.registration.local_map import LocalMaps

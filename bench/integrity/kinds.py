@@ -17,10 +17,10 @@ from coview_stream.errors import CoViewError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.sim import KINDS, buildings
 from coview_stream.sim.airborne import airborne_scan
-from coview_stream.sim.caster import Caster
 from coview_stream.sim.kinds import Kind, Plot
 from coview_stream.sim.layout import grid_layout, loop_layout
 from coview_stream.sim.scenes import Scene, build_scene
+from coview_stream.sim.sensors import Caster
 from coview_stream.sim.vegetation import TreeMix
 
 MORE: dict[str, Kind] = {

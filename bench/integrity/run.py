@@ -21,11 +21,10 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.sim.caster import Caster
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.odometry import drive as poses_along
 from coview_stream.sim.scenes import Scene
-from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS
+from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster
 
 SPEED = 4.0
 SPEEDS = {"storey": 1.5}

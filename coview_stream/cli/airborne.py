@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.clouds import merge, read_cloud, write_cloud
     from coview_stream.clouds.files import WRITABLE_SUFFIXES
     from coview_stream.errors import CloudError
-    from coview_stream.sim.airborne_survey import Survey, airborne_survey
+    from coview_stream.sim.airborne import Survey, airborne_survey
 
     names = ("density", "swath", "noise", "porosity", "misaligned", "seed")
     survey = Survey(**{name: getattr(args, name) for name in names})

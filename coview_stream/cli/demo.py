@@ -162,8 +162,7 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.localization.offline import write
     from coview_stream.report.evaluation import evaluate, frame_errors
-    from coview_stream.report.plots import plot_errors, plot_map
-    from coview_stream.report.run_pictures import draw_run
+    from coview_stream.report.plots import draw_run, plot_errors, plot_map
 
     write(located, base_map, out)
     draw_run(located, base_map, out, truth[1][:, :3, 3])

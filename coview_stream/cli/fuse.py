@@ -42,9 +42,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.config.mount import Mount, parse_mount
     from coview_stream.errors import require_library
     from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
-    from coview_stream.fusion.fused_file import check_name, write_fused, write_trajectories
+    from coview_stream.fusion.fused_file import check_name, summary, write_fused, write_trajectories
     from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
-    from coview_stream.fusion.summary import summary
     from coview_stream.recordings.open_run import open_run
     from coview_stream.recordings.run import Run
 
@@ -99,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         kept = "adjusted" if joint.accepted else "as locate had them"
         print(f"{', '.join(names)}: trajectories of the runs, {kept}")
     if args.picture is not None:
-        from coview_stream.fusion.picture import draw_fused
+        from coview_stream.fusion.fused_file import draw_fused
 
         draw_fused(fused, args.picture, f"{args.map.stem} and {len(runs)} run{'s' * (len(runs) != 1)}")
     print(summary(fused, [str(pair.run) for pair in pairs], args.changes))

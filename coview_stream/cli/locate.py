@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         stamps, poses = [fix.stamp for fix in posed], [fix.T_map_body for fix in posed if fix.T_map_body is not None]
         export(trajectory_of(args.run_path.name, stamps, poses, geo), args.output, formats)
     if draws:
-        from coview_stream.report.run_pictures import draw_run
+        from coview_stream.report.plots import draw_run
 
         draw_run(located, base_map, args.output)
     print(summary(located))

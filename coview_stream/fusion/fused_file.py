@@ -14,9 +14,9 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.las import require_laspy
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.errors import CloudError, DependencyError, require_library, warn
-from coview_stream.fusion.fuse import Fused
+from coview_stream.fusion.fuse import GONE, NEW, RECORD, SAME, Fused
 from coview_stream.fusion.localized_run import LocalizedRun
-from coview_stream.fusion.records import RECORD
+from coview_stream.report.plots import MAX_BASE_POINTS, draw_base_map, figure, legend_below, map_figure_size
 
 SUFFIXES = (".laz", ".las", ".ply", ".pcd", ".npy")
 _SCALE = 0.001  # metres
@@ -146,3 +146,50 @@ def _plain(stream: BinaryIO, fused: Fused, path: Path) -> None:
 
 def _columns(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
     return np.stack([rows[name].astype("<f8") for name in RECORD.names or ()], axis=1)
+
+
+def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
+    """Say what each source brought, what of blind spots was filled and, if asked for, how much has changed."""
+    lines = [f"{'0 base map':<18} {len(fused.base_map.points):,} points"]
+    for k, (name, added) in enumerate(zip(names, fused.added, strict=True), start=1):
+        left = [
+            f"{count} frames {why}"
+            for count, why in ((added.without_pose, "without a pose left out"), (added.damaged, "damaged"))
+            if count
+        ]
+        told = ", ".join([f"{added.points:,} points of {added.frames} frames", *left])
+        lines.append(f"{f'{k} {name}':<18} {told}")
+    lines.append(f"{'blind spots':<18} about {fused.filled:,.0f} m2 of surface filled")
+    lines.append(f"{'moving':<18} {fused.moving:,} voxels that rays went through")
+    if changes:
+        lines.append(f"{'new':<18} {int((fused.change == NEW).sum()):,} points")
+        lines.append(f"{'gone':<18} {int((fused.base_change == GONE).sum()):,} points of the base map")
+    return "\n".join(lines)
+
+
+_ADDED, _NEW, _GONE = "#56B4E9", "#009E73", "#D55E00"
+_MOST = 200_000  # points drawn of a kind; set by hand
+
+
+def draw_fused(fused: Fused, path: Path, title: str) -> None:
+    """Draw it.
+
+    Raises:
+        InputError: the picture cannot be written. DependencyError: matplotlib is missing.
+    """
+    base_map = fused.base_map
+    base = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
+    gone = np.asarray(base_map.points[np.flatnonzero(fused.base_change == GONE)])
+    kinds = (
+        (f"added by runs: {int((fused.change == SAME).sum()):,} points", fused.points[fused.change == SAME], _ADDED),
+        (f"new: {int((fused.change == NEW).sum()):,}", fused.points[fused.change == NEW], _NEW),
+        (f"gone: {len(gone):,}", gone, _GONE),
+    )
+    with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
+        shift = draw_base_map(axes, base)
+        for label, points, colour in kinds:
+            if len(points):
+                some = points[:: -(-len(points) // _MOST)] + base_map.origin - shift
+                axes.scatter(some[:, 0], some[:, 1], s=0.5, color=colour, linewidths=0, label=label, rasterized=True)
+        axes.set_title(title)
+        legend_below(drawing, axes)

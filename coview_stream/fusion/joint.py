@@ -20,9 +20,17 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import require_library
-from coview_stream.fusion.constraints import AGREE, Constraint, Registrar, off_by, overlapping
+from coview_stream.fusion.constraints import (
+    AGREE,
+    Constraint,
+    Registrar,
+    Submap,
+    off_by,
+    overlapping,
+    path_of,
+    submaps_of,
+)
 from coview_stream.fusion.localized_run import LocalizedRun
-from coview_stream.fusion.submaps import Submap, path_of, submaps_of
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, Poses, along_body, along_map, boxminus, interpolate, inverse
 from coview_stream.localization.registration.local_map import LocalMaps

@@ -11,7 +11,7 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.localization.search.ambiguity import FARTHEST, Ambiguity
-from coview_stream.report.style import (
+from coview_stream.report.plots import (
     MAX_BASE_POINTS,
     draw_base_map,
     draw_notice,

@@ -15,10 +15,10 @@ import torch
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 from coview_stream.training.batches import draw_batch
-from coview_stream.training.dataset import WorldViews
 from coview_stream.training.losses import Losses, losses
 from coview_stream.training.networks import VIEWS, PlaceNet
-from coview_stream.training.training_config import TrainingConfig
+from coview_stream.training.recipe import TrainingConfig
+from coview_stream.training.worlds import WorldViews
 
 # set by hand
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises

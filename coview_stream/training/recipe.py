@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from coview_stream.config.checks import counts, positive
 from coview_stream.errors import ConfigError
 from coview_stream.sim.kinds import KINDS
-from coview_stream.training.dirt import TRAINED_DIRT
-from coview_stream.training.sensors import TRAINED_SENSORS
+from coview_stream.training.sensors import TRAINED_DIRT, TRAINED_SENSORS
 
 Range = tuple[float, float]
 
@@ -99,7 +99,7 @@ class Recipe:
         scale_error: drift of its odometry, a share.
         yaw_walk: drift of its odometry, degrees per square root of a metre.
         rays: maximum of beams cast for a submap, thinned evenly.
-        dirt: kinds of :data:`~coview_stream.training.dirt.TRAINED_DIRT` that drives have.
+        dirt: kinds of :data:`~coview_stream.training.sensors.TRAINED_DIRT` that drives have.
 
     Raises:
         ConfigError: a value out of its range, or an unknown kind or sensor.
@@ -172,3 +172,33 @@ def _require_within(name: str, value: Any, bounds: Range) -> None:
     ends = (value, value) if name in single else tuple(value)
     if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
         raise ConfigError(f"{name}: {value!r} is out of range; stay, smallest first, within {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Settings of the training loop; set by hand.
+
+    Attributes:
+        steps: number of batches.
+        pieces: maps (136 m) in a batch.
+        each: queries in every one.
+        rate: of AdamW at first; it falls along a cosine.
+        decay: AdamW's weight decay.
+        width: the encoder's channels at 1 m.
+        wrong: headings that compete with each query's true one.
+        seed: of the weights' start and of the batches.
+    """
+
+    steps: int = 600
+    pieces: int = 4
+    each: int = 5
+    rate: float = 3e-3
+    decay: float = 1e-4
+    width: int = 24
+    wrong: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts(self, "steps", "pieces", "each", "width", "wrong")
+        counts(self, "seed", minimum=0)
+        positive(self, "rate", "decay")

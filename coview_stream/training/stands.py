@@ -10,10 +10,9 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, join
 from coview_stream.sim.scenes import SceneState
 from coview_stream.training import tree_meshes
-from coview_stream.training.mesh_copies import MeshCopies, join_standing
 from coview_stream.training.recipe import Recipe
-from coview_stream.training.terrain import Terrain
-from coview_stream.training.trees import PATTERNS, Trees, draw_species, draw_stems, draw_trees, opened
+from coview_stream.training.tree_meshes import MeshCopies, join_standing
+from coview_stream.training.trees import PATTERNS, Terrain, Trees, draw_species, draw_stems, draw_trees, opened
 
 _STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range; set by hand
 

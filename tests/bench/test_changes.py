@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from bench.fusion.changes import _new, distance
-from coview_stream.fusion.fuse import Fused
-from coview_stream.fusion.records import NEW, SAME
+from coview_stream.fusion.fuse import NEW, SAME, Fused
 from coview_stream.sim.mesh import EMPTY, prism, rectangle
 from coview_stream.sim.scenes import SceneState
 

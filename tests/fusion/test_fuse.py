@@ -8,9 +8,8 @@ import small_world
 from small_world import Box
 
 from coview_stream.clouds.trajectory import write_tum
-from coview_stream.fusion.fuse import FuseConfig, fuse
+from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, fuse
 from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
-from coview_stream.fusion.records import GONE, NEW
 from coview_stream.geometry.transforms import transform
 from coview_stream.recordings.open_run import open_run
 

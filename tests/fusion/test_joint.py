@@ -8,9 +8,9 @@ import small_world
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.trajectory import write_tum
+from coview_stream.fusion.constraints import path_of, spaced
 from coview_stream.fusion.joint import Joint, Judgement, adjust
 from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
-from coview_stream.fusion.submaps import path_of, spaced
 from coview_stream.recordings.open_run import open_run
 
 pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
-from coview_stream.fusion import voxel_table
-from coview_stream.fusion.voxel_table import VoxelTable, cells_of, keys_of
+from coview_stream.fusion import sightings
+from coview_stream.fusion.sightings import VoxelTable, cells_of, keys_of
 
 
 def test_keys_go_there_and_back():
@@ -17,7 +17,7 @@ def test_keys_go_there_and_back():
 
 @pytest.mark.parametrize("buffer", [1, 1000])
 def test_points_of_a_voxel_are_averaged(monkeypatch, buffer):
-    monkeypatch.setattr(voxel_table, "_BUFFER", buffer)
+    monkeypatch.setattr(sightings, "_BUFFER", buffer)
     table = VoxelTable(0.5)
     table.add(np.array([[-0.1, 0.1, 3.1], [10.0, 0.0, 0.0]], dtype=np.float32), 5.0, 2)
     table.add(np.array([[-0.3, 0.3, 3.3]], dtype=np.float32), 4.0, 1)

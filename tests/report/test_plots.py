@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
-from coview_stream.report import plots, style
+from coview_stream.report import plots
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -39,7 +39,7 @@ def has_colour(picture, name):
 def test_map_plot_shows_base_map_and_stations(base, tmp_path):
     plots.plot_map(base, base[::100], tmp_path / "map.png")
     picture = pixels(tmp_path / "map.png")
-    assert has_colour(picture, style.STATE_COLOURS["TRACKING"])
+    assert has_colour(picture, plots.STATE_COLOURS["TRACKING"])
     grey = np.ptp(picture[:, :, :3], axis=2) < 0.01
     dark = grey & (np.abs(picture[:, :, 0] - 0.38) < 0.02)
     pale = grey & (np.abs(picture[:, :, 0] - 0.93) < 0.02)
@@ -54,8 +54,8 @@ def test_trajectory_is_coloured_by_state(base, tmp_path):
     line[:10] = np.nan
     plots.plot_trajectory(base, line, states, tmp_path / "t.png", truth=np.nan_to_num(line))
     picture = pixels(tmp_path / "t.png")
-    assert has_colour(picture, style.STATE_COLOURS["TRACKING"])
-    assert not has_colour(picture, style.STATE_COLOURS["LOST"])
+    assert has_colour(picture, plots.STATE_COLOURS["TRACKING"])
+    assert not has_colour(picture, plots.STATE_COLOURS["LOST"])
 
 
 def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, monkeypatch):
@@ -79,10 +79,10 @@ def test_false_poses_are_highlighted(tmp_path):
     distance, e_r = np.arange(50.0), np.full(50, 0.01)
     e_t = np.full(50, 0.05)
     plots.plot_errors(distance, e_t, e_r, tmp_path / "right.png")
-    assert not has_colour(pixels(tmp_path / "right.png"), style.STATE_COLOURS["LOST"])
+    assert not has_colour(pixels(tmp_path / "right.png"), plots.STATE_COLOURS["LOST"])
     e_t[20:25] = 40.0
     plots.plot_errors(distance, e_t, e_r, tmp_path / "false.png")
-    assert has_colour(pixels(tmp_path / "false.png"), style.STATE_COLOURS["LOST"])
+    assert has_colour(pixels(tmp_path / "false.png"), plots.STATE_COLOURS["LOST"])
 
 
 def test_error_plot_without_errors_shows_a_note(tmp_path, monkeypatch):
@@ -112,8 +112,8 @@ def test_descriptors_of_different_shape_are_refused(tmp_path):
 
 
 def test_utm_coordinates_get_a_rounded_plot_offset(base):
-    assert not style.base_shift(base).any()
-    shift = style.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0]))
+    assert not plots.base_shift(base).any()
+    shift = plots.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0]))
     assert shift.tolist() == [412_300.0, 5_318_800.0, 0.0]
 
 

@@ -8,7 +8,7 @@ from coview_stream.localization.offline import locate
 from coview_stream.localization.result import Fix
 from coview_stream.localization.state import State
 from coview_stream.recordings import open_run
-from coview_stream.report.run_pictures import draw_run
+from coview_stream.report.plots import draw_run
 
 
 @pytest.mark.slow

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.sim.config import SimulationConfig
 from coview_stream.sim.scenes import build_scene
-from coview_stream.sim.simulate import base_map, frames, trajectories
+from coview_stream.sim.simulate import SimulationConfig, base_map, frames, trajectories
 
 CONFIG = SimulationConfig(scene="town", sensor="os64", seed=11, size=120.0, length=3.0, density=6.0)
 

@@ -11,7 +11,7 @@ from nightly import nightly
 
 from coview_stream.clouds import read_cloud
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.sim.airborne_survey import Survey, airborne_survey, surface_of
+from coview_stream.sim.airborne import Survey, airborne_survey, surface_of
 
 SIZE, HEIGHT, EAVES = 6.0, 8.0, 1.5  # metres: half of a house, its walls, and how far the roof stands out
 STEP = 0.15  # metres between points

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from surface_distance import distance_to_surfaces
 
-from coview_stream.sim.caster import Caster
 from coview_stream.sim.mesh import EMPTY, Mesh, box, join, placed
 from coview_stream.sim.scenes import SceneState
-from coview_stream.sim.sensors import SENSORS
+from coview_stream.sim.sensors import SENSORS, Caster
 
 RNG = np.random.default_rng(0)
 

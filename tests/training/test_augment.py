@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image
-from coview_stream.training import augment
-from coview_stream.training.augment import augmented
+from coview_stream.training.batches import _fell, augmented
 
 HEIGHTS, TOP, SEEN, RELIEF = slice(0, LAYERS - 3), LAYERS - 3, LAYERS - 2, LAYERS - 1
 SHAPE = (LAYERS, 96, 80)
@@ -72,7 +71,7 @@ def test_one_fallen_tree_is_round(monkeypatch) -> None:
     rng.poisson = lambda mean: 1
     rng.integers = lambda high, size: np.array([20])
     rng.uniform = lambda low, high, size=None: np.array([2.0]) if size else 0.0
-    augment._fell(image, rng)
+    _fell(image, rng)
     y, x = np.indices((41, 41))
     np.testing.assert_array_equal(image[0] == 0, np.hypot(y - 20, x - 20) * CELL < 2.0)
     assert (image[SEEN:] == 9).all()

@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.descriptors.birds_eye_view import CELL, LAYERS
 from coview_stream.training.batches import PIECE, draw_batch
-from coview_stream.training.dataset import QUERY_CELLS, WorldViews
+from coview_stream.training.worlds import QUERY_CELLS, WorldViews
 
 SIDE = 400
 

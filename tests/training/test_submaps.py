@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from coview_stream.clouds.filters import voxel_grid
 from coview_stream.geometry.transforms import transform
-from coview_stream.sim.caster import Caster
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
-from coview_stream.training import dataset
+from coview_stream.sim.sensors import Caster
+from coview_stream.training.drives import RADIUS, VOXEL, _headings, _moments, _poses
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import trained_sensor
-from coview_stream.training.submaps import RADIUS, VOXEL, _headings, _moments, _poses
-from coview_stream.training.worlds import draw_world, drives, submaps
+from coview_stream.training.worlds import draw_world, drives, submaps, write_dataset
 
 TINY = Recipe(
     built=0.0, size=(80.0, 80.0), slope=(0.0, 5.0), stems=(150.0, 200.0), rays=6000, pulses=(3.0, 3.0),
@@ -101,7 +100,7 @@ class Pool:
 
 def test_interrupt_ends_dataset_writing(tmp_path, monkeypatch) -> None:
     pool = Pool()
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", pool)
+    monkeypatch.setattr("coview_stream.training.worlds.ProcessPoolExecutor", pool)
     with pytest.raises(KeyboardInterrupt):
-        dataset.write_dataset(tmp_path, range(5), TINY, workers=2)
+        write_dataset(tmp_path, range(5), TINY, workers=2)
     assert pool.shut == [{"wait": False, "cancel_futures": True}]

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import ConfigError
-from coview_stream.sim.caster import Caster
-from coview_stream.training.dirt import TRAINED_DIRT, DriveDirt
+from coview_stream.sim.sensors import Caster
 from coview_stream.training.recipe import Recipe
-from coview_stream.training.sensors import trained_sensor
+from coview_stream.training.sensors import TRAINED_DIRT, DriveDirt, trained_sensor
 from coview_stream.training.train import SMOKE, train_session
 from coview_stream.training.worlds import draw_world, submaps
 

@@ -10,13 +10,21 @@ from scipy.spatial import cKDTree
 
 from coview_stream.descriptors.birds_eye_view import LAYERS
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.training.dataset import QUERY_CELLS, WorldViews, read_world, world_views, write_dataset, write_world
-from coview_stream.training.paths import CLEARANCE, between_trees
+from coview_stream.training.drives import CLEARANCE, between_trees
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import INCLINATION, trained_sensor
 from coview_stream.training.stands import Stand, draw_stand
 from coview_stream.training.trees import PATTERNS, draw_stems
-from coview_stream.training.worlds import draw_world, submaps
+from coview_stream.training.worlds import (
+    QUERY_CELLS,
+    WorldViews,
+    draw_world,
+    read_world,
+    submaps,
+    world_views,
+    write_dataset,
+    write_world,
+)
 
 SMALL = Recipe(built=0.0, size=(100.0, 100.0), submaps=4, pulses=(8.0, 8.0), rays=40_000, standing=0.0)
 BARE = replace(

@@ -6,18 +6,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 from coview_stream.errors import ConfigError
-from coview_stream.sim.dirt.beams import Beams
-from coview_stream.sim.dirt.change import Seasons, Years
-from coview_stream.sim.dirt.glass import Glass
-from coview_stream.sim.dirt.ground_cover import Grass, Snow
-from coview_stream.sim.dirt.motion import Motion
-from coview_stream.sim.dirt.mounting import Mounting
-from coview_stream.sim.dirt.odometry_faults import Gravity, Miscalibration, Slip
-from coview_stream.sim.dirt.ranges import within
-from coview_stream.sim.dirt.reflectors import Reflectors
+from coview_stream.sim.dirt.optics import Beams, Dust, Glass, Rain, Reflectors
+from coview_stream.sim.dirt.robot import Gravity, Miscalibration, Motion, Mounting, Slip
+from coview_stream.sim.dirt.scene import Grass, Seasons, Snow, Traffic, Years
 from coview_stream.sim.dirt.survey import Density, Strips
-from coview_stream.sim.dirt.traffic import Traffic
-from coview_stream.sim.dirt.weather import Dust, Rain
+from coview_stream.sim.ranges import within
 
 REAL = "real"
 """Name of the preset with all kinds on."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from coview_stream.config.checks import require
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.sim.dirt.ranges import within
+from coview_stream.sim.ranges import within
 
 _PATCH = 70.0  # metres: wavelength of the density; set by hand
 _WAVES = 6  # that make it up; set by hand

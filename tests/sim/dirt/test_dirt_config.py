@@ -14,7 +14,7 @@ from coview_stream.errors import ConfigError
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import Dirt, SimulationConfig, parse_dirt, simulate
 from coview_stream.sim.dirt import KINDS_OF_DIRT, real
-from coview_stream.sim.dirt.streams import Stream, stream
+from coview_stream.sim.dirt.scan import Stream, stream
 from coview_stream.sim.dirt.survey import Density
 from coview_stream.sim.simulate import frames, scene_of, trajectories
 

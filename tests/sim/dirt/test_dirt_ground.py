@@ -7,8 +7,8 @@ import pytest
 from yard import yard
 
 from coview_stream.errors import ConfigError
-from coview_stream.sim.dirt.ground_cover import Cover, Grass, Snow
-from coview_stream.sim.dirt.surfaces import Surfaces
+from coview_stream.sim.dirt.scan import Surfaces
+from coview_stream.sim.dirt.scene import Cover, Grass, Snow
 
 RNG = np.random.default_rng
 

@@ -8,12 +8,8 @@ from yard import fan, standing, vlp16, yard
 
 from coview_stream.errors import ConfigError
 from coview_stream.sim.dirt import Dirt
-from coview_stream.sim.dirt.beams import Beams
-from coview_stream.sim.dirt.glass import Glass, windows
-from coview_stream.sim.dirt.reflectors import Reflectors
-from coview_stream.sim.dirt.scan import Scanner
-from coview_stream.sim.dirt.surfaces import Surfaces
-from coview_stream.sim.dirt.weather import Dust, Rain
+from coview_stream.sim.dirt.optics import Beams, Dust, Glass, Rain, Reflectors, windows
+from coview_stream.sim.dirt.scan import Scanner, Surfaces
 from coview_stream.sim.mesh import box, placed
 
 RNG = np.random.default_rng

@@ -11,9 +11,8 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim.dirt import Dirt
-from coview_stream.sim.dirt.motion import Motion, Track, beam_times
-from coview_stream.sim.dirt.recording import Recording
-from coview_stream.sim.dirt.scan import Scanner
+from coview_stream.sim.dirt.robot import Motion, Track, beam_times
+from coview_stream.sim.dirt.scan import Recording, Scanner
 from coview_stream.sim.mesh import box, placed
 
 WALLS = (placed(box(4, 60, 9), 14, 0), placed(box(60, 4, 9), 0, 14), placed(box(4, 60, 9), -14, 0))

@@ -10,8 +10,7 @@ from yard import standing, vlp16, yard
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import rotation_angle, transform, wrap_angle, yaw_of
 from coview_stream.sim.dirt import Dirt
-from coview_stream.sim.dirt.mounting import Mounting
-from coview_stream.sim.dirt.odometry_faults import Gravity, Miscalibration, Slip
+from coview_stream.sim.dirt.robot import Gravity, Miscalibration, Mounting, Slip
 from coview_stream.sim.dirt.scan import Scanner
 from coview_stream.sim.mesh import box, placed
 

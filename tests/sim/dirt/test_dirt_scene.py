@@ -8,16 +8,13 @@ from yard import standing, vlp16, yard
 
 from coview_stream.errors import ConfigError
 from coview_stream.sim.airborne import POROSITY, airborne_scan
-from coview_stream.sim.caster import Caster
-from coview_stream.sim.config import SimulationConfig
 from coview_stream.sim.dirt import Dirt
-from coview_stream.sim.dirt.change import Seasons, Years, aged, drawn_parts
-from coview_stream.sim.dirt.scan import Scanner
-from coview_stream.sim.dirt.surfaces import seasonal_caster
+from coview_stream.sim.dirt.scan import Scanner, seasonal_caster
+from coview_stream.sim.dirt.scene import Movers, Seasons, Traffic, Years, aged, drawn_parts, person
 from coview_stream.sim.dirt.survey import Density, Strips, Thinning, disagreement, spoilt_strips
-from coview_stream.sim.dirt.traffic import Movers, Traffic, person
 from coview_stream.sim.scenes import build_scene
-from coview_stream.sim.simulate import base_map
+from coview_stream.sim.sensors import Caster
+from coview_stream.sim.simulate import SimulationConfig, base_map
 
 RNG = np.random.default_rng
 

@@ -1,0 +1,230 @@
+"""Retro-reflectors: traffic signs so bright that beams beside them return from them too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
+from coview_stream.sim.ranges import within
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Range noise and divergence of a lidar's beams.
+
+    Attributes:
+        noise: of the range, metres per metre, one sigma, besides the sensor's constant noise.
+        divergence: full angle of the beam, milliradians.
+        pulse: metres within which two echoes of one beam are not told apart; their ranges mix.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    noise: float = 0.0007
+    divergence: float = 3.0
+    pulse: float = 0.8
+
+    def __post_init__(self) -> None:
+        within(self, noise=(0.0, 0.05), divergence=(0.0, 50.0), pulse=(0.0, 10.0))
+
+    def aside(self, rays: Floats, rng: np.random.Generator) -> Floats:
+        """Return (N, 3) unit rays elsewhere in the beams about (N, 3) unit rays."""
+        shift = rng.normal(size=rays.shape)
+        shift -= np.einsum("ij,ij->i", shift, rays)[:, None] * rays
+        shift *= (np.sqrt(rng.random(len(rays))) / np.linalg.norm(shift, axis=1))[:, None]
+        spread = rays + 0.5e-3 * self.divergence * shift
+        return np.asarray(spread / np.linalg.norm(spread, axis=1)[:, None])
+
+    def mixed(self, first: Floats, second: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Return (N,) ranges that beams with echoes at both of (N,) ranges give, and the second echo's share in each.
+
+        Echoes farther apart than the pulse stay apart, and the stronger wins.
+        """
+        share = rng.random(len(first))
+        with np.errstate(invalid="ignore"):
+            together = np.abs(second - first) < self.pulse
+        share = np.where(together, share, np.round(share))
+        share = np.where(np.isfinite(first), np.where(np.isfinite(second), share, 0.0), 1.0)
+        safe = [np.where(np.isfinite(each), each, 0.0) for each in (first, second)]
+        some = np.isfinite(first) | np.isfinite(second)
+        return np.where(some, (1 - share) * safe[0] + share * safe[1], np.inf), share
+
+
+@dataclass(frozen=True)
+class Rain:
+    """Rain: near drops return some beams, and far surfaces return fewer.
+
+    Attributes:
+        drops: share of the beams that meet a drop; they return from it where nothing is nearer.
+        reach: mean range of such a return, metres.
+        extinction: of the light, per metre.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    drops: float = 0.02
+    reach: float = 5.0
+    extinction: float = 0.006
+
+    def __post_init__(self) -> None:
+        within(self, drops=(0.0, 1.0), reach=(0.1, 100.0), extinction=(0.0, 1.0))
+
+    def returns(self, count: int, rng: np.random.Generator) -> Floats:
+        """Return (N,) ranges of the drops that beams meet, metres; inf where there is none."""
+        hit = rng.random(count) < self.drops
+        return np.where(hit, rng.exponential(self.reach, count), np.inf)
+
+
+@dataclass(frozen=True)
+class Dust:
+    """Dust cloud that the robot drags behind it, an ellipsoid that comes in gusts.
+
+    Attributes:
+        reach: mean way of a beam into the cloud, metres, in a gust of medium strength.
+        centre: of the cloud, metres behind the body.
+        size: half of its length, width and height, metres.
+        gusts: logarithm of the factor by which its thickness varies, one sigma.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    reach: float = 3.0
+    centre: float = 5.0
+    size: tuple[float, float, float] = (3.5, 2.0, 1.2)
+    gusts: float = 0.8
+
+    def __post_init__(self) -> None:
+        within(self, reach=(0.01, 1e3), centre=(0.0, 100.0), gusts=(0.0, 3.0))
+
+    def returns(self, origins: Floats, rays: Floats, height: float, rng: np.random.Generator) -> Floats:
+        """Return (N,) ranges at which beams (N, 3) from (N, 3), body frame, end in the dust, metres; inf elsewhere.
+
+        ``height`` is the body's above the ground, on which the cloud lies.
+        """
+        reach = self.reach * float(np.exp(self.gusts * rng.normal()))
+        middle = np.array([-self.centre, 0.0, self.size[2] - height])
+        o, d = (origins - middle) / self.size, rays / self.size
+        a, b, c = (d * d).sum(axis=1), (o * d).sum(axis=1), (o * o).sum(axis=1) - 1.0
+        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+        enters, leaves = np.maximum((-b - root) / a, 0.0), (-b + root) / a
+        ends = enters + rng.exponential(reach, len(rays))
+        return np.where((b * b > a * c) & (ends < leaves), ends, np.inf)
+
+
+# metres, set by hand
+_STOREY, _SILL, _LINTEL = 3.2, 0.7, 2.7
+_BAY, _FRAME = 3.0, 0.3
+_UPRIGHT = 0.3  # vertical part of a wall's unit normal, at most
+_STEP = 0.02  # beyond the pane, at which a ray goes on
+
+
+@dataclass(frozen=True)
+class Glass:
+    """Windows in the walls of some buildings.
+
+    Attributes:
+        share: of the buildings, that have them.
+        mirrors: probability that a window mirrors a beam.
+        passes: probability that it lets it pass; what is left returns from the pane.
+        strength: share of the light that comes back from what is seen in or behind the glass.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    share: float = 0.4
+    mirrors: float = 0.4
+    passes: float = 0.4
+    strength: float = 0.5
+
+    def __post_init__(self) -> None:
+        within(self, share=(0.0, 1.0), mirrors=(0.0, 1.0), passes=(0.0, 1.0 - self.mirrors), strength=(0.0, 1.0))
+
+
+class Panes(NamedTuple):
+    """Beams that go on at a window.
+
+    Attributes:
+        which: (K,) their indices among all beams.
+        origins: (K, 3) where they go on, scene frame, metres.
+        rays: (K, 3) where to, unit vectors.
+    """
+
+    which: Indices
+    origins: Floats32
+    rays: Floats32
+
+
+def windows(points: Floats, normals: Floats, height: Floats) -> Bools:
+    """Tell which of (N, 3) points on walls are panes: every storey has a row of windows.
+
+    ``normals`` (N, 3) are the walls' unit normals, ``height`` (N,) metres above the ground.
+    """
+    level = np.maximum(np.hypot(normals[:, 0], normals[:, 1]), 1e-6)
+    along = (points[:, 1] * normals[:, 0] - points[:, 0] * normals[:, 1]) / level
+    above, bay = np.mod(height, _STOREY), np.mod(along, _BAY)
+    pane = (above > _SILL) & (above < _LINTEL) & (bay > _FRAME) & (height > 0.0)
+    return np.asarray(pane & (np.abs(normals[:, 2]) < _UPRIGHT))
+
+
+def panes(glass: Glass, points: Floats, rays: Floats, normals: Floats, rng: np.random.Generator) -> tuple[Bools, Panes]:
+    """Return which of (N,) beams that meet a pane are not stopped by it, and how they go on.
+
+    ``points`` (N, 3), where they meet it, ``rays`` (N, 3) and ``normals`` (N, 3) are in the scene frame.
+    """
+    fate = rng.random(len(rays))
+    mirrored, passed = fate < glass.mirrors, (fate >= glass.mirrors) & (fate < glass.mirrors + glass.passes)
+    into = np.einsum("ij,ij->i", rays, normals)[:, None]
+    on = np.where(mirrored[:, None], rays - 2.0 * into * normals, rays)
+    goes_on = mirrored | passed
+    start = points + _STEP * on
+    which = np.flatnonzero(goes_on)
+    return goes_on, Panes(which, start[which].astype(np.float32), on[which].astype(np.float32))
+
+
+_LIMIT = 2.5  # times the width of the bloom; set by hand
+_NOISE = 0.03  # metres; a saturated receiver ranges worse than it should; set by hand
+
+
+@dataclass(frozen=True)
+class Reflectors:
+    """Blooming of retro-reflecting signs: a halo at the sign's range.
+
+    Attributes:
+        bloom: width of the halo, degrees, one sigma.
+        reach: metres within which a sign is bright enough.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    bloom: float = 0.8
+    reach: float = 40.0
+
+    def __post_init__(self) -> None:
+        within(self, bloom=(0.01, 10.0), reach=(0.0, 500.0))
+
+    def halo(self, rays: Floats, distance: Floats, signs: Bools, rng: np.random.Generator) -> Floats:
+        """Return (N,) ranges with those beams of (N, 3) unit ``rays`` put to a sign that leave close to one.
+
+        ``signs`` tells which of the (N,) distances are those of signs. What is nearer than the sign stays.
+        """
+        bright = signs & (distance < self.reach)
+        if not bright.any():
+            return distance
+        from scipy.spatial import cKDTree
+
+        width = np.radians(self.bloom)
+        apart, which = cKDTree(rays[bright]).query(rays, distance_upper_bound=_LIMIT * width)
+        beside = np.flatnonzero(np.isfinite(apart) & ~signs)
+        sign = distance[bright][which[beside]] + rng.normal(0, _NOISE, len(beside))
+        lit = rng.random(len(beside)) < np.exp(-0.5 * (apart[beside] / width) ** 2)
+        bloomed = distance.copy()
+        bloomed[beside] = np.where(lit & (sign < distance[beside]), sign, distance[beside])
+        return bloomed

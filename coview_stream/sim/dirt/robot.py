@@ -1,0 +1,246 @@
+"""Motion during a sweep: beams leave one after the other while the robot drives and turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats, Indices
+from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, interpolate, inverse, pose_from, rot_z
+from coview_stream.odometry.buffer import Segment
+from coview_stream.odometry.deskew import deskew
+from coview_stream.sim.ranges import within
+from coview_stream.sim.sensors import FRAME_PERIOD
+
+
+@dataclass(frozen=True)
+class Miscalibration:
+    """Constant errors of odometry over a run, and a heading that walks.
+
+    Attributes:
+        scale: share by which distances are over- or underrated; the sign is drawn.
+        yaw_rate: constant error of the heading, degrees per metre driven; the sign is drawn.
+        yaw_walk: random walk of the heading, degrees per square root of a metre, one sigma.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    scale: float = 0.05
+    yaw_rate: float = 0.05
+    yaw_walk: float = 0.5
+
+    def __post_init__(self) -> None:
+        within(self, scale=(0.0, 0.5), yaw_rate=(0.0, 10.0), yaw_walk=(0.0, 20.0))
+
+    def apply(self, odometry: Floats, rng: np.random.Generator) -> Floats:
+        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them."""
+        driven = _driven(odometry)
+        sides = rng.choice([-1.0, 1.0], 2)
+        walk = rng.normal(size=len(driven)) * np.sqrt(driven) * self.yaw_walk
+        yaw = np.radians(np.cumsum(walk + sides[1] * self.yaw_rate * driven))
+        return spoilt(odometry, _about_z(yaw), np.full(len(driven), 1.0 + sides[0] * self.scale))
+
+
+@dataclass(frozen=True)
+class Slip:
+    """Bursts of slipping wheels: distance counted that was not driven, or the other way round, and a false turn.
+
+    Attributes:
+        share: of the distance in a burst that is counted too much (spinning) or too little (skidding), either drawn.
+        turn: false turn in a burst, degrees, one sigma.
+        length: of a burst, metres driven.
+        every: mean distance from burst to burst, metres driven.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    share: float = 0.5
+    turn: float = 4.0
+    length: float = 1.5
+    every: float = 25.0
+
+    def __post_init__(self) -> None:
+        within(self, share=(0.0, 1.0), turn=(0.0, 90.0), length=(0.1, 100.0), every=(0.1, 1e4))
+
+    def apply(self, odometry: Floats, rng: np.random.Generator) -> Floats:
+        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them."""
+        driven = _driven(odometry)
+        way = np.cumsum(driven)
+        turns, factors = np.zeros(len(driven)), np.ones(len(driven))
+        for begin in self.bursts(float(way[-1]) if len(way) else 0.0, rng):
+            inside = (way > begin) & (way <= begin + self.length)
+            share, turn = rng.choice([-1.0, 1.0]) * self.share, rng.normal() * self.turn
+            factors[inside] = 1.0 + share
+            turns[inside] += turn / max(int(inside.sum()), 1)
+        return spoilt(odometry, _about_z(np.radians(np.cumsum(turns))), factors)
+
+    def bursts(self, way: float, rng: np.random.Generator) -> Floats:
+        """Draw where on a way of that length, metres, the wheels begin to slip: evenly spread, at least once."""
+        count = max(1, round(way / self.every))
+        return (np.arange(count) + rng.uniform(0.2, 0.8, count)) * way / count
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Error of the direction that the inertial unit takes for down: constant in size, slowly turning.
+
+    Attributes:
+        error: angle between down and what is taken for it, degrees.
+        period: seconds in which the false direction goes once round.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    error: float = 0.5
+    period: float = 300.0
+
+    def __post_init__(self) -> None:
+        within(self, error=(0.0, 45.0), period=(1.0, 1e6))
+
+    def apply(self, odometry: Floats, stamps: Floats, rng: np.random.Generator) -> Floats:
+        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them at (N,) stamps, seconds."""
+        angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * (stamps - stamps[0]) / self.period
+        axes = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+        tilts = exp_so3(np.radians(self.error) * axes)
+        return spoilt(odometry, tilts[1:], np.ones(len(odometry) - 1), tilts[0])
+
+
+def spoilt(odometry: Floats, turns: Floats, factors: Floats, first: Floats | None = None) -> Floats:
+    """Return poses (N, 4, 4) put together anew from spoilt motions.
+
+    Args:
+        odometry: (N, 4, 4) ``T_odom_body``.
+        turns: (N - 1, 3, 3) rotation of the odometry's axes after each motion, in place of none.
+        factors: (N - 1,) on the length of each motion.
+        first: (3, 3) rotation of the axes at the first pose, the identity if None.
+    """
+    every = np.concatenate([(np.eye(3) if first is None else first)[None], turns])
+    moved = np.diff(odometry[:, :3, 3], axis=0) * factors[:, None]
+    moved = np.einsum("nij,nj->ni", every[:-1], moved)
+    poses = odometry.copy()
+    poses[:, :3, :3] = every @ odometry[:, :3, :3]
+    poses[1:, :3, 3] = odometry[0, :3, 3] + np.cumsum(moved, axis=0)
+    return poses
+
+
+def _about_z(angles: Floats) -> Floats:
+    return exp_so3(np.column_stack([np.zeros((len(angles), 2)), angles]))
+
+
+def _driven(odometry: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1))
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Mounting error that nobody calibrated: points are taken for the body's while they are the sensor's.
+
+    Attributes:
+        lean: angle between the vertical axes of sensor and body, degrees; the side it leans to is drawn.
+        yaw: turn about the vertical, degrees, one sigma; no map shows it on a straight road.
+        lever: distance between sensor and body, metres; its direction is drawn.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    lean: float = 2.0
+    yaw: float = 0.0
+    lever: float = 0.05
+
+    def __post_init__(self) -> None:
+        within(self, lean=(0.0, 30.0), yaw=(0.0, 180.0), lever=(0.0, 5.0))
+
+    def draw(self, rng: np.random.Generator) -> Pose:
+        """Draw the pose ``T_body_sensor`` (4, 4)."""
+        towards, turn, offset = rng.uniform(0, 2 * np.pi), rng.normal(), rng.normal(size=3)
+        axis = np.array([np.cos(towards), np.sin(towards), 0.0])
+        R = exp_so3(np.radians(self.lean) * axis) @ rot_z(float(np.radians(self.yaw) * turn))
+        return pose_from(R, self.lever * offset / np.linalg.norm(offset))
+
+
+_STEPS = 200  # true poses along a sweep: every 0.5 ms; set by hand
+_NS = 1e9
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Raw sweeps: each lasts from one stamp to the next and bears the stamp of its end.
+
+    Attributes:
+        rate: samples of odometry a second, by which the sweeps are deskewed.
+        deskewed: whether the frames are deskewed, by the product's own code; if not they stay bent.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    rate: float = 50.0
+    deskewed: bool = True
+
+    def __post_init__(self) -> None:
+        within(self, rate=(10.0, 1000.0))
+
+
+class Track:
+    """Smooth motion through the poses of a run's frames, true and as odometry has it.
+
+    The robot is where the frames' poses say at their stamps, and moves smoothly between them; what odometry gets
+    wrong grows evenly from frame to frame.
+    """
+
+    def __init__(self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses) -> None:
+        """Lay the track through (N,) stamps in seconds and (N, 4, 4) poses; it begins a frame before the first."""
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        before = T_scene_body[0]
+        if len(stamps) > 1:
+            before = T_scene_body[0] @ inverse(T_scene_body[1]) @ T_scene_body[0]
+        self.stamps = stamps
+        self.odometry = T_odom_body
+        self._at: Floats = np.concatenate([stamps[:1] - FRAME_PERIOD, stamps])
+        poses = np.concatenate([before[None], T_scene_body])
+        self._positions = CubicSpline(self._at, poses[:, :3, 3])
+        self._rotations = RotationSpline(self._at, Rotation.from_matrix(poses[:, :3, :3]))
+        wrong = np.stack([odom @ inverse(true) for odom, true in zip(T_odom_body, T_scene_body, strict=True)])
+        self._wrong = np.concatenate([wrong[:1], wrong])
+
+    def true(self, stamps: Floats) -> Poses:
+        """Return ``T_scene_body`` (M, 4, 4) at (M,) seconds."""
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        poses[:, :3, :3] = self._rotations(stamps).as_matrix()
+        poses[:, :3, 3] = self._positions(stamps)
+        return poses
+
+    def odom(self, stamps: Floats) -> Poses:
+        """Return ``T_odom_body`` (M, 4, 4) at (M,) seconds."""
+        k = np.clip(np.searchsorted(self._at, stamps, side="right") - 1, 0, len(self._at) - 2)
+        share = (stamps - self._at[k]) / (self._at[k + 1] - self._at[k])
+        return np.asarray(interpolate(self._wrong[k], self._wrong[k + 1], share) @ self.true(stamps))
+
+    def along(self, frame: int, times: Floats) -> tuple[Poses, Indices]:
+        """Return true poses (K, 4, 4) along a sweep, and which of them each of (N,) times after its stamp has."""
+        grid = np.linspace(-FRAME_PERIOD, 0.0, _STEPS)
+        nearest = np.rint((times + FRAME_PERIOD) * ((_STEPS - 1) / FRAME_PERIOD)).astype(np.intp)
+        return self.true(self.stamps[frame] + grid), np.clip(nearest, 0, _STEPS - 1)
+
+    def segment(self, frame: int, rate: float) -> Segment:
+        """Return the odometry of a sweep, ``rate`` samples a second."""
+        count = round(FRAME_PERIOD * rate) + 1
+        stamps = self.stamps[frame] + np.linspace(-FRAME_PERIOD, 0.0, count)
+        return Segment(np.rint(stamps * _NS).astype(np.int64), self.odom(stamps))
+
+    def straightened(self, frame: int, points: Points, times: Floats, rate: float) -> Points:
+        """Deskew a sweep's points (N, 3) by the odometry, as a node does."""
+        stamp_ns = round(float(self.stamps[frame]) * _NS)
+        return deskew(points, times, self.segment(frame, rate), stamp_ns, self.odometry[frame])
+
+
+def beam_times(count: int) -> Floats:
+    """Return (N,) seconds from a frame's stamp, the sweep's end, to each of its beams: beams come in that order."""
+    return np.asarray((np.arange(1, count + 1) / count - 1.0) * FRAME_PERIOD)
