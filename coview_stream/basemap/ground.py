@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import ndimage
 
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
@@ -312,6 +311,8 @@ def _cells_within(points: Points, config: GroundConfig) -> tuple[Floats, tuple[i
 
 def _stray_low(z: Floats32) -> Bools:
     """Mask cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
+    from scipy import ndimage  # not part of the robot's side
+
     high = np.where(np.isnan(z), np.float32(np.inf), z)
     fourth = ndimage.rank_filter(high, rank=3, size=9, mode="nearest")
     return np.asarray(np.isfinite(fourth) & (high < fourth - 1.0))
@@ -346,6 +347,8 @@ def _filtered(
 
 def _refined(z: Floats32, occupied: Ints, ground: Bools, config: GroundConfig, cell: float) -> Floats32:
     """Raster the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
+    from scipy import ndimage  # not part of the robot's side
+
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):
         kept = np.full(z.shape, np.nan, dtype=np.float32)
@@ -371,6 +374,8 @@ def _gradient(z: Floats32, cell: float) -> Floats32:
 
 
 def _slope(surface: GroundRaster) -> Floats32:
+    from scipy import ndimage  # not part of the robot's side
+
     return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
 
 
@@ -380,6 +385,8 @@ def morphological_ground(z: Floats32, cell: float) -> Bools:
     Openings with growing windows remove what is narrower than the window and stands out of the opened surface
     by more than a slope of 0.3 explains.
     """
+    from scipy import ndimage  # not part of the robot's side
+
     surface = filled(z)
     ground = np.isfinite(z)
     window, previous = 1.0, 0.0
