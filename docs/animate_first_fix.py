@@ -1,9 +1,9 @@
-"""Animated picture of a first fix: what the lidar sees, the places that the search considers, and the trail.
+"""Animate a first fix: the lidar's scan, the places that the search considers, and the trail.
 
     python docs/animate_first_fix.py docs/images/first_fix.gif
 
-A town and a drive are simulated as `coview-stream demo` does it, but the lidar sees 14 m only: what it would see else
-is found at the first keyframe, and there would be nothing to watch. Needs nothing that coview_stream does not.
+The town and the drive are those of `coview-stream demo`, but the lidar sees 14 m only. With its full range the robot is
+found at the first keyframe, and there is nothing to watch.
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.recordings import open_run
 from coview_stream.report.plots import STATE_COLOURS, draw_base_map
 
-# set by hand
-EVERY, EVERY_AFTER = 3, 5  # frames of the run between two of the picture, and after the first fix
+EVERY, EVERY_AFTER = 3, 5  # frames of the run per picture, before and after the first fix
 AFTER = 200  # frames of the run after the first fix
 AROUND = 24.0  # metres to each side of the robot in the right half
-PAUSE = 6  # times as long stands the frame of the first fix, and the last
+PAUSE = 6  # periods that the picture of the first fix stays
 SIZE, DPI, PERIOD_MS = (9.0, 5.1), 84, 150
 
 
 class Step(NamedTuple):
-    """One frame: its truth, the fix, the reason of its state, the scan (N, 3) in the body's frame, the hypotheses."""
+    """One frame: true pose, fix, reason, scan (N, 3) in the body frame, hypotheses."""
 
     truth: np.ndarray
     fix: Fix
@@ -49,7 +48,7 @@ def steps(base_map: BaseMap, world: Path, reach: float) -> Iterator[Step]:
     config = LocalizerConfig()
     localizer = Localizer(base_map, config)
     search = GlobalSearch(base_map, config, LocalMaps(base_map, config.registration.source_range))
-    considered, left = None, AFTER
+    considered, remaining = None, AFTER
     for frame, T_map_body in zip(open_run(world / "run"), truth, strict=True):
         points = frame.points[np.hypot(frame.points[:, 0], frame.points[:, 1]) < reach]
         request = localizer.add_frame(points, frame.T_odom_body, frame.stamp)
@@ -58,9 +57,9 @@ def steps(base_map: BaseMap, world: Path, reach: float) -> Iterator[Step]:
             localizer.apply_search_result(result)
             considered = result.considered
         fix = localizer.fix()
-        left -= fix.T_map_body is not None
+        remaining -= fix.T_map_body is not None
         yield Step(T_map_body, fix, "" if fix.evidence is None else fix.evidence.reason, points, considered)
-        if not left:
+        if not remaining:
             return
 
 
@@ -86,7 +85,7 @@ class Picture:
         self.trail: list[np.ndarray] = []
 
     def draw(self, step: Step) -> Any:
-        """Draw a step, and return it as a picture of Pillow's."""
+        """Draw a step and return it as a Pillow image."""
         from PIL import Image
 
         drawn = self._draw(step)
@@ -102,12 +101,12 @@ class Picture:
         head = {"transform": self.figure.transFigure, "fontsize": 15, "fontweight": "bold", "color": colour}
         drawn = [self.figure.text(0.012, 0.93, state, **head), self.figure.text(0.185, 0.931, step.reason, fontsize=13)]
         T = step.fix.T_map_body
-        what = "places that the search considers" if T is None else "the robot and its trail"
-        drawn.append(self.figure.text(0.012, 0.87, f"{what} (ring: the truth)", fontsize=11))
+        title = "places that the search considers" if T is None else "the robot and its trail"
+        drawn.append(self.figure.text(0.012, 0.87, f"{title} (ring: the truth)", fontsize=11))
         self.ground.set_visible(T is not None)
-        beside = "newest scan, on the map" if T is not None else "newest scan"
-        drawn.append(self.figure.text(0.508, 0.87, beside, fontsize=11))
-        points = step.points[step.points[:, 2] > -1.2][::3].astype(np.float64)  # what stands, not the ground
+        title = "newest scan, on the map" if T is not None else "newest scan"
+        drawn.append(self.figure.text(0.508, 0.87, title, fontsize=11))
+        points = step.points[step.points[:, 2] > -1.2][::3].astype(np.float64)  # without the ground
         centre = np.zeros(2)
         ring = {"s": 260, "facecolors": "none", "edgecolors": "black", "linewidths": 1.6, "zorder": 6}
         drawn.append(self.map.scatter(*step.truth[:2, 3], **ring))
@@ -151,28 +150,28 @@ class Picture:
 
 
 def animate(place: Path, world: Path, reach: float) -> None:
-    """Simulate, build, localize and draw; all but the picture is written to ``world``."""
+    """Simulate, build, localize and draw ``place``; the other files go to ``world``."""
     from PIL import Image
 
     coview_stream(["simulate", str(world), "--scene", "town", "--sensor", "os64", "--seed", "3"])
     coview_stream(["build", str(world / "base.laz"), "-o", str(world / "site.coview"), "--no-learned"])
     base_map = BaseMap.load(world / "site.coview")
-    picture, pictures, periods, located = Picture(base_map), [], [], False
+    figure, pictures, periods, located = Picture(base_map), [], [], False
     for number, step in enumerate(steps(base_map, world, reach)):
         first = step.fix.T_map_body is not None and not located
         located = located or first
         if first or number % (EVERY_AFTER if located else EVERY) == 0:
-            pictures.append(picture.draw(step))
+            pictures.append(figure.draw(step))
             periods.append(PERIOD_MS * (PAUSE if first else 1))
     periods[-1] = PERIOD_MS * 2 * PAUSE
-    # one palette for all: its colours do not flicker, and what does not change is not stored again
-    together = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height + 80))
-    for row, each in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
-        together.paste(each, (0, row * each.height))
-    for number, colour in enumerate(STATE_COLOURS.values()):  # a few marks would have no say in it
-        together.paste(colour, (100 * number, together.height - 80, 100 * number + 100, together.height))
-    palette = together.quantize(96, kmeans=2)
-    flat = [each.quantize(palette=palette, dither=0) for each in pictures]
+    # one palette: colours do not flicker, and unchanged pixels are not stored again
+    sheet = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height + 80))
+    for row, sample in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
+        sheet.paste(sample, (0, row * sample.height))
+    for number, colour in enumerate(STATE_COLOURS.values()):  # too few pixels to get a colour otherwise
+        sheet.paste(colour, (100 * number, sheet.height - 80, 100 * number + 100, sheet.height))
+    palette = sheet.quantize(96, kmeans=2)
+    flat = [picture.quantize(palette=palette, dither=0) for picture in pictures]
     flat[0].save(place, save_all=True, append_images=flat[1:], duration=periods, loop=0, optimize=True)
     print(f"{place}: {len(flat)} frames, {place.stat().st_size / 1e6:.2f} MB")
 
@@ -181,6 +180,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Animated picture of a first fix.")
     parser.add_argument("place", type=Path, help="GIF to write")
     parser.add_argument("--range", type=float, default=14.0, dest="reach", help="metres that the lidar sees (14)")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        animate(asked.place, Path(folder) / "world", asked.reach)
+        animate(args.place, Path(folder) / "world", args.reach)
