@@ -1,9 +1,10 @@
-"""A city of simulated towns, as a directory of tiles: building, opening and searching it, and the memory that takes.
+"""A city of simulated towns, as a directory of tiles: building, opening and searching it, and the memory of each.
 
 The towns lie side by side in one reference system, each with a survey and a drive of its own. The product's command
 builds them with two workers, without features. Then a process opens the site and searches for the robots of some
-drives, each as one that was just switched on; its memory is what the operating system counts, with and without the
-pages of files, which the system takes back when it needs them.
+drives, each as one that was just switched on; its memory is counted with and without pages of files. Votes of the
+keyframes are compared: all stations, squares of stations (as the product does on large maps), squares in the circle of
+a prior. In a wrong circle no robot may come to a pose.
 """
 
 from __future__ import annotations
@@ -15,38 +16,53 @@ import subprocess
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import coview_kernels as kernels
+from bench.accuracy.stages import keyframes_of, right
 from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered, today
-from bench.harness.rows import Row, bounded, informs, judged
+from bench.harness.rows import Row, against, bounded, informs, judged, reached
 from bench.harness.worlds import MAPPER, prepared_run, world_name
-from bench.speed import city_votes
+from bench.speed.search import last_core
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
+from coview_stream.config import ConsensusConfig, RetrievalConfig
+from coview_stream.descriptors.coview import describe
+from coview_stream.geometry.circle import Circle
+from coview_stream.localization.search.global_search import coview_peaks
+from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.search_stations import SearchStations
+from coview_stream.localization.search.station_consensus import StationConsensus
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 SIDE, EDGE, FIRST_SEED = 4, 500.0, 9001
 OPEN_S, SEARCH_S, MEGABYTES, PER_KM2, WORKER_MEGABYTES = 0.5, 1.0, 500.0, 40.0, 2000.0
-"""The targets: seconds to open a site that has its working file, and to find a robot; MB of memory, of disk, and of a
-process that builds."""
+"""Targets: seconds to open a site that has its working file, and to find a robot; MB of memory, of disk, and of a
+building process."""
 
+VOTE_MS, LEAST_KEPT = 30.0, 99.0
+"""Targets: milliseconds of a vote within the circle on one core, per cent of right places that squares keep."""
+
+RADIUS, ELSEWHERE = 1000.0, (50.0, 240.0)  # metres of the prior's circle, and of those in another town
 _CORNER = (400_000.0, 5_600_000.0, 100.0)
 _FRAMES, _DRIVES = 60, 6
 _FALSE = 1.0  # metres
-_SEARCHING = 0.05  # seconds: a step that took less did not search
+_SEARCHING = 0.05  # seconds: a shorter step did not search
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the size."""
-    words = f"towns of 500 m along each edge of the city ({SIDE}); several: how all grows, too"
-    parser.add_argument("--side", type=int, nargs="+", default=[SIDE], help=words)
+    text = f"towns of 500 m along each edge of the city ({SIDE}); several: their growth, too"
+    parser.add_argument("--side", type=int, nargs="+", default=[SIDE], help=text)
 
 
 def towns(side: int) -> list[SimulationConfig]:
@@ -62,32 +78,28 @@ def towns(side: int) -> list[SimulationConfig]:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield what building, opening and searching take, and how they grow with the points."""
+    """Yield the figures of building, opening and searching, and their growth with the points."""
     sides = [1] if asked.quick else asked.side
-    found: dict[int, dict[str, float]] = {side: {} for side in sides}
+    growing: dict[int, dict[str, float]] = {side: {} for side in sides}
     for side in sides:
-        yield from _figures(side, found[side])
+        yield from _figures(side, growing[side])
     if len(sides) > 1:
-        points = np.log10([found[side]["points"] for side in sides])
-        for name in found[sides[0]]:
-            if name != "points":
-                slope = np.polyfit(points, np.log10([found[side][name] for side in sides]), 1)[0]
-                yield informs(f"city/slope over the points: {name}", float(slope), "")
+        points = np.log10([growing[side]["points"] for side in sides])
+        for name in growing[sides[0]].keys() - {"points"}:
+            slope = np.polyfit(points, np.log10([growing[side][name] for side in sides]), 1)[0]
+            yield informs(f"city/slope over the points: {name}", float(slope), "")
 
 
-def _figures(side: int, found: dict[str, float]) -> Iterator[Row]:
+def _figures(side: int, growing: dict[str, float]) -> Iterator[Row]:
     """Yield the figures of one city, and keep those that grow."""
-    below = folder() / f"city{side}"
+    below, area = folder() / f"city{side}", side * side * (EDGE / 1e3) ** 2
     worlds = [prepared_run(below, config) for config in towns(side)]
-    site = below / "site"
-    title = f"city/{side * side} towns"
+    site, title = below / "site", f"city/{side * side} towns"
     made = {"towns": [world_name(config) for config in towns(side)], "code": fingerprint(*MAPPER)}
     built = remembered(below / "built.json", made, lambda: isolated(_built, worlds, site))
     manifest = Manifest.load(site)
-    area = side * side * (EDGE / 1e3) ** 2
-    found["points"] = float(built["points"])
-    found["build, seconds"] = built["seconds"]
-    found["build, memory"] = built["megabytes"]
+    growing |= {"points": float(built["points"]), "build, seconds": built["seconds"]}
+    growing["build, memory"] = built["megabytes"]
     yield informs(f"{title}: stations", sum(tile.stations for tile in manifest.tiles), "")
     yield informs(f"{title}: points read", built["points"] / 1e6, "million")
     yield informs(f"{title}: build, two workers", built["seconds"], "s")
@@ -95,33 +107,34 @@ def _figures(side: int, found: dict[str, float]) -> Iterator[Row]:
     yield bounded(f"{title}: memory of a worker, peak", built["megabytes"], "MB", WORKER_MEGABYTES)
     yield bounded(f"{title}: directory, per km2", manifest.nbytes / 1e6 / area, "MB", PER_KM2)
     os.environ["COVIEW_CACHE"] = str(below / "cache")
-    first = remembered(
-        below / "first.json", {"site": manifest.sha256, "code": fingerprint()}, lambda: isolated(_first_opened, site)
-    )
-    found["first opening, seconds"], found["first opening, memory"] = first["seconds"], first["peak"]
+    spec = {"site": manifest.sha256, "code": fingerprint()}
+    first = remembered(below / "first.json", spec, lambda: isolated(_first_opened, site))
+    growing |= {"first opening, seconds": first["seconds"], "first opening, memory": first["peak"]}
     yield informs(f"{title}: working file made, the first time", first["seconds"], "s")
     yield informs(f"{title}: memory for that, peak", first["peak"], "MB")
-    seen = isolated(_searched, site, worlds[:: max(1, len(worlds) // _DRIVES)][:_DRIVES])
-    yield bounded(f"{title}: load", seen["load"], "s", OPEN_S)
-    yield informs(f"{title}: localizer, and the first robot found, with compilation", seen["first"], "s")
-    if searches := [step for step in seen["steps"] if step > _SEARCHING]:
-        found["search, seconds"] = float(np.median(searches))
-        yield informs(f"{title}: steps until later robots are found, median", found["search, seconds"], "s")
+    found = isolated(_searched, site, worlds[:: max(1, len(worlds) // _DRIVES)][:_DRIVES])
+    yield bounded(f"{title}: load", found["load"], "s", OPEN_S)
+    yield informs(f"{title}: localizer, and the first robot found, with compilation", found["first"], "s")
+    if searches := [step for step in found["steps"] if step > _SEARCHING]:
+        growing["search, seconds"] = float(np.median(searches))
+        yield informs(f"{title}: steps until later robots are found, median", growing["search, seconds"], "s")
         yield bounded(f"{title}: steps until later robots are found, longest", max(searches), "s", SEARCH_S)
-    found["search, memory"] = seen["VmRSS"]
-    yield bounded(f"{title}: memory, resident at the end", seen["VmRSS"], "MB", MEGABYTES)
-    yield informs(f"{title}: of it, without pages of files", seen["RssAnon"], "MB")
-    yield informs(f"{title}: memory, peak", seen["VmHWM"], "MB")
-    yield informs(f"{title}: robots found in their first {_FRAMES} frames", seen["found"], f"of {seen['drives']}")
+    growing["search, memory"] = found["VmRSS"]
+    yield bounded(f"{title}: memory, resident at the end", found["VmRSS"], "MB", MEGABYTES)
+    yield informs(f"{title}: of it, without pages of files", found["RssAnon"], "MB")
+    yield informs(f"{title}: memory, peak", found["VmHWM"], "MB")
+    yield informs(f"{title}: robots found in their first {_FRAMES} frames", found["found"], f"of {found['drives']}")
     if side > 1:
-        yield from city_votes.rows(title, isolated(city_votes.voted, site, worlds))
-        for radius in city_votes.ELSEWHERE:
-            yield city_votes.wrong_circle_row(title, isolated(city_votes.elsewhere, site, worlds, radius))
-    yield judged(f"{title}: false poses", f"{seen['false']} of {seen['poses']}", "none", seen["false"] == 0)
+        yield from _vote_rows(title, isolated(voted, site, worlds))
+        for radius in ELSEWHERE:
+            posed, frames = isolated(elsewhere, site, worlds, radius)
+            name = f"{title}: robots posed in a circle of {radius:g} m that they are not in, {frames} frames"
+            yield judged(name, f"{posed} of {len(worlds)}", "none", posed == 0)
+    yield judged(f"{title}: false poses", f"{found['false']} of {found['poses']}", "none", found["false"] == 0)
 
 
 def _built(worlds: list[Path], site: Path) -> dict[str, float]:
-    """Build the site, and tell how many points that read, its seconds, and the memory of its largest process."""
+    """Build the site: points read, seconds, and the memory of its largest process."""
     sources = [str(world / "base.laz") for world in worlds]
     words = ("-m", "coview_stream", "build", *sources, "-o", f"{site}/", "--workers", "2", "--no-learned")
     shutil.rmtree(site, ignore_errors=True)
@@ -144,27 +157,103 @@ def _searched(site: Path, worlds: list[Path]) -> dict[str, Any]:
     """Find the robots of some drives, one after the other, in this process."""
     begin = time.monotonic()
     base_map = BaseMap.load(site)
-    found: dict[str, Any] = {"load": time.monotonic() - begin, "steps": [], "drives": len(worlds)}
+    figures: dict[str, Any] = {"load": time.monotonic() - begin, "steps": [], "drives": len(worlds)}
     begin = time.monotonic()
     localizer = Localizer(base_map)
     posed = total = wrong = 0
     for number, world in enumerate(worlds):
         localizer.reset()
-        run, (stamps, truth) = open_run(world / "run"), read_tum(world / "truth.tum")
-        known = False
-        for frame, _ in zip(run, range(_FRAMES), strict=False):
+        (stamps, truth), known = read_tum(world / "truth.tum"), False
+        for frame, _ in zip(open_run(world / "run"), range(_FRAMES), strict=False):
             before = time.monotonic()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
             if number and not known:
-                found["steps"].append(time.monotonic() - before)
+                figures["steps"].append(time.monotonic() - before)
             if fix.T_map_body is None:
                 continue
             if not known:
                 known, posed = True, posed + 1
-                found.setdefault("first", time.monotonic() - begin)
+                figures.setdefault("first", time.monotonic() - begin)
             true = truth[np.argmin(np.abs(stamps - frame.stamp))]
-            off = np.linalg.norm(fix.T_map_body[:3, 3] - true[:3, 3])
-            total, wrong = total + 1, wrong + bool(off > _FALSE)
+            total, wrong = total + 1, wrong + bool(np.linalg.norm(fix.T_map_body[:3, 3] - true[:3, 3]) > _FALSE)
     memory = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
     kept = {name: int(memory[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon", "VmHWM")}
-    return {"first": np.nan} | found | kept | {"found": posed, "poses": total, "false": wrong}
+    return {"first": np.nan} | figures | kept | {"found": posed, "poses": total, "false": wrong}
+
+
+class _AllCompared(Retrieval):
+    """Retrieval that compares every station, however many they are."""
+
+    def compared(self, area: Circle | None = None) -> SearchStations:
+        return SearchStations(self.stations.station_index, self.stations.station_grid)
+
+
+def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:
+    """Milliseconds of votes on one core, and the ranks of the right places, by the stations that are compared."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {last_core()})
+    base_map, config = BaseMap.load(site), ConsensusConfig()
+    config = replace(config, peaks=coview_peaks(config.peaks, len(base_map)))
+    middle = 0.5 * (base_map.stations.min(axis=0) + base_map.stations.max(axis=0))
+    circle = Circle(float(middle[0]), float(middle[1]), RADIUS)
+    descriptor = base_map.descriptor_config
+    drives = []
+    for world in worlds:
+        drive = []
+        for seen in keyframes_of(world, base_map.origin, descriptor):
+            centre = np.array([*seen.position[:2], seen.ground])
+            drive.append((seen, centre, describe(seen.scan, centre, descriptor)))
+        drives.append(drive)
+    kernels.warm_up()
+    out: dict[str, Any] = {"in_circle": int(circle.holds(base_map.stations).sum())}
+    for name, kind, area in (("all", _AllCompared, None), ("squares", Retrieval, None), ("circle", Retrieval, circle)):
+        consensus = StationConsensus(kind(base_map, RetrievalConfig()), config)
+        times, ranks = list[float](), list[int | None]()
+        for drive in drives:
+            places = np.array([(seen.T_map_odom @ np.append(seen.position, 1.0))[:2] for seen, _, _ in drive])
+            if area is not None and not area.holds(places).all():
+                continue
+            consensus.clear()
+            for seen, centre, described in drive:
+                begin = time.perf_counter()
+                consensus.vote(centre, described, area)
+                named = consensus.hypotheses()
+                times.append(1e3 * (time.perf_counter() - begin))
+                ranks.append(next((k for k, place in enumerate(named) if right(place.T_map_odom, seen)), None))
+        out[name] = {"ms": times, "ranks": ranks}
+    return out
+
+
+def _vote_rows(title: str, votes: dict[str, Any]) -> Iterator[Row]:
+    whole, squares, circle = (votes[name] for name in ("all", "squares", "circle"))
+    ours, all_ms, near = (float(np.median(side["ms"])) for side in (squares, whole, circle))
+    yield against(f"{title}: a vote and its places, beside all stations compared", ours, all_ms, "ms", None)
+    name = f"{title}: a vote and its places in a circle of {RADIUS:g} m, {votes['in_circle']} stations"
+    yield bounded(name, near, "ms", VOTE_MS)
+    good = [k for k, rank in enumerate(whole["ranks"]) if rank is not None]
+    kept = 100.0 * float(np.mean([squares["ranks"][k] is not None for k in good]))
+    yield reached(f"{title}: right places kept, of {len(good)} that all stations name", kept, "%", LEAST_KEPT)
+    for most in (1, 10, 50):
+        shares = [
+            100.0 * float(np.mean([r is not None and r < most for r in side["ranks"]])) for side in (squares, whole)
+        ]
+        yield Row(f"{title}: right place among the first {most}, beside all stations compared", *shares, "%")
+    named = [rank is not None for rank in circle["ranks"]]
+    yield informs(f"{title}: right place named in the circle, of {len(named)}", 100.0 * float(np.mean(named)), "%")
+
+
+def elsewhere(site: Path, worlds: Sequence[Path], radius: float) -> tuple[int, int]:
+    """Search for each robot in a circle around another one's start: robots that came to a pose, and frames."""
+    localizer = Localizer(BaseMap.load(site))
+    starts = [read_tum(world / "truth.tum")[1][0][:2, 3] for world in worlds]
+    posed = frames = 0
+    for number, world in enumerate(worlds):
+        localizer.reset()
+        x, y = starts[(number + len(worlds) // 2 + 1) % len(worlds)].tolist()
+        localizer.guess_place(PlaceGuess(x, y, within=radius))
+        poses = 0
+        for frame, _ in zip(open_run(world / "run"), range(_FRAMES), strict=False):
+            poses += localizer.step(frame.points, frame.T_odom_body, frame.stamp).T_map_body is not None
+            frames += 1
+        posed += poses > 0
+    return posed, frames
