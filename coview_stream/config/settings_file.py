@@ -1,0 +1,68 @@
+"""Settings of a node from a TOML file: tables named like the configuration classes' fields."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from coview_stream.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises:
+        ConfigError: the file cannot be read or is no TOML; the message names file and line.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}; name a TOML file that can be read") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text; name a TOML file") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is no TOML: {error}") from error
+
+
+def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
+    """Return a configuration with the fields of a table; a field that is a configuration takes a table of its own.
+
+    Args:
+        config: frozen dataclass with the values of all other fields.
+        table: of a settings file.
+        where: file and table, for messages.
+
+    Raises:
+        ConfigError: an unknown key, or a value of another type or out of range.
+    """
+    names = [field.name for field in fields(config)]  # type: ignore[arg-type]  # T is a dataclass
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in names:
+            raise ConfigError(f"{where}: {unknown_key(key, names)}")
+        current = getattr(config, key)
+        if is_dataclass(current):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{where}: {key} is {value!r}; write a table [{key}] with its fields")
+            values[key] = with_table(current, value, f"{where}.{key}")
+        elif isinstance(value, list):
+            values[key] = tuple(value)
+        else:
+            values[key] = float(value) if isinstance(current, float) and type(value) is int else value
+    try:
+        return replace(config, **values)  # type: ignore[type-var]  # likewise
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def unknown_key(key: str, known: list[str]) -> str:
+    """Return the message about a key that a table does not have, with its nearest known one."""
+    near = difflib.get_close_matches(key, known, 1)
+    remedy = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+    return f"unknown key {key!r}; {remedy}"
