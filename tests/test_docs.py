@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib.util
 import re
 import shlex
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sockets import until
 
 import coview_stream
 from bench.harness.run import BENCHMARKS
@@ -22,6 +24,7 @@ from coview_stream.messages import decode_cloud, decode_odometry, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client import client
 from coview_stream.stream.node.counters import Counters
+from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
@@ -282,6 +285,20 @@ def test_client_example_runs(monkeypatch, capsys):
     exec(compile(code.replace("timeout=1.0", "timeout=0"), "python.md", "exec"), names)
     assert capsys.readouterr().out.startswith("2500000000 [[1.")
     assert net.closed  # a client closes what it opened
+
+
+def test_program_of_the_feed_prints_poses(monkeypatch, capsys):
+    net = MemoryTransport()
+    monkeypatch.setattr(zenoh_transport, "open_client", lambda: net)
+
+    def publish(_):
+        pose = PoseMessage(0, "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, "ab" * 32)
+        net.publish(Sample("coview/r1/out/pose", encode_pose(pose, "json").payload, "application/json"))
+        printed = []
+        until(lambda: printed.append(capsys.readouterr().out) or "r1 [0. 0. 0.]" in "".join(printed))
+
+    monkeypatch.setattr(builtins, "input", publish)
+    exec(compile(blocks("serve.md", "python")[0], "serve.md", "exec"), {})
 
 
 class Asked:
