@@ -1,8 +1,8 @@
-"""Where am I in a forest: every method on the same queries.
+"""Places named from one query in a forest: descriptors, learned features, and the product's search.
 
 Worlds of the training simulator whose seeds were never trained on, and any worlds on disk (``--world``, in the layout
-of ``coview-stream simulate``); of each the map is built with learned features. docs/forest.md says what the methods
-and columns mean. What is done stays in ``--work``: an interrupted benchmark goes on.
+of ``coview-stream simulate``); each map is built with learned features. Answers stay in ``--work``, so an interrupted
+benchmark resumes. AR@N is the share of queries with the right place (within 10 m) among the first N.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.forest.methods import BASELINES, METHODS, Methods
-from bench.forest.worlds import Place, code, drawn, noted, on_disk, place, recorded, say, weights
+from bench.forest.methods import METHODS, Methods
+from bench.forest.worlds import Place, code, drawn, on_disk, place, recorded, say, weights
 from bench.harness.files import remembered
 from bench.harness.rows import NOTHING, Row, failed, informs, number, table
 from coview_stream import BaseMap
@@ -35,17 +35,15 @@ NEAR_METRES, NEAR_DEGREES = 2.0, 5.0
 EXACT_METRES, EXACT_DEGREES = 0.3, 1.0
 """... and within these it is a success."""
 
-_BROAD = ("all", "forest", "built", "on disk")
 WORDS = ("sparse", "medium", "dense", "flat", "hilly", "steep", "leaf-on", "leaf-off")
 STEPS = {
     "descriptors": "Scan Context and co-view: describing, all stations and shifts",
-    "canopy": "canopy heights: drawing, all places and 72 headings",
     "network": "learned: bird view and ground network",
     "correlation": "learned: coarse correlation, the best places at 36 headings",
     "registration": "registration and verification of five places",
 }
 LEARNED = ("network", "correlation", "registration")
-"""What a search by learned features alone takes."""
+"""Steps of a search by learned features alone."""
 
 
 def recall(answers: Sequence[Answer], method: str, best: int) -> float:
@@ -143,20 +141,6 @@ def metric_table(answers: Sequence[Answer]) -> str:
     return table(head, rows)
 
 
-def compared_table(answers: Sequence[Answer]) -> str:
-    """Poses from the five best places of each method, before and after the same registration and decision."""
-    rows = []
-    for name, some in groups(answers):
-        if name not in _BROAD or (name != "all" and len(some) == len(answers)):
-            continue
-        chains = {method: [answer["chains"][method] for answer in some] for method in BASELINES}
-        chains["learned"] = [answer | {"ms": answer["ms"]["registration"]} for answer in some]
-        for method, each in chains.items():
-            took = f"{np.median([chain['ms'] for chain in each]):.0f}"
-            rows.append([name, str(len(some)), method, *_poses(each), took])
-    return table(("", "n", "places of", f"named: {_POSES[0]}", *_POSES[1:], "ms"), rows)
-
-
 def times_table(answers: Sequence[Answer]) -> str:
     """Medians over all queries, milliseconds; the first query of a map is left out."""
     warm = [answer for answer in answers if not answer.get("first")] or list(answers)
@@ -167,16 +151,6 @@ def times_table(answers: Sequence[Answer]) -> str:
     totals = [sum(answer["ms"][step] for step in LEARNED) for answer in warm]
     rows.append(["learned, from the query's points to verified poses", f"{np.median(totals):.0f}"])
     return table(("median of a query", "ms"), rows)
-
-
-def tables_of(answers: Sequence[Answer]) -> dict[str, str]:
-    """All tables by the names of their places in docs/forest.md; worlds on disk alone have places of their own."""
-    made = {
-        "recall": recall_table(answers), "metric": metric_table(answers), "compared": compared_table(answers)
-    }  # fmt: skip
-    if all(answer["kind"] == "on disk" for answer in answers):
-        return {f"disk {name}": text for name, text in made.items()}
-    return made | {"times": times_table(answers)}
 
 
 def options(parser: ArgumentParser) -> None:
@@ -230,7 +204,5 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Recall, accuracy and times, by kind of place."""
-    found = [answer for row in rows for answer in row.details.get("answers", ())]
-    about = f"--seeds {asked.seeds} --worlds {asked.worlds} --queries {asked.queries}"
-    disk = " --world" * bool(asked.world) + " DIR" * len(asked.world)
-    return {name: noted(text, f"forest {about}{disk}") for name, text in tables_of(found).items()} if found else {}
+    answers = [answer for row in rows for answer in row.details.get("answers", ())]
+    return {"recall": recall_table(answers), "metric": metric_table(answers), "times": times_table(answers)}

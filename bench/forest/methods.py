@@ -6,16 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import fft
 
 import coview_kernels as kernels
 from bench.forest.worlds import Drive, in_odometry
 from bench.harness.files import Clock
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
+from coview_stream.geometry.arrays import Floats, Floats32, Reals
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
@@ -102,16 +100,6 @@ def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypo
     return found
 
 
-def of_places(xy: Floats, score: Floats, heading: Floats, stations: Floats32, centre: Floats) -> list[Hypothesis]:
-    """Hypotheses of the best places (N, 2) at their headings (N,), as high as the station next to each."""
-    found = []
-    for k in best_places(xy, score):
-        nearest = int(np.hypot(*(stations[:, :2] - xy[k]).T).argmin())
-        at = np.array([*xy[k], stations[nearest, 2]])
-        found.append(Hypothesis(_pose(at, float(heading[k]), centre), nearest, 0, -float(score[k])))
-    return found
-
-
 def _pose(at: Reals, yaw: float, centre: Floats) -> Pose:
     return pose_from(rot_z(yaw), at) @ pose_from(np.eye(3), -centre)
 
@@ -151,10 +139,8 @@ class Chain:
         }
 
 
-METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified", "search")
+METHODS = ("scan context", "co-view", "both", "global", "dense", "verified", "search")
 """In the tables' order."""
-
-BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
 
 
 class Methods:
@@ -170,7 +156,6 @@ class Methods:
         self._learned, self._retrieval = learned, retrieval
         self._learned.prepare()
         self._retrieval.prepare()
-        self._canopy = Canopy(base_map.points)
         self._chain = Chain(base_map, self.config)
         maps = LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, replace(self.config, reloc="learned"), maps)
@@ -188,37 +173,24 @@ class Methods:
         places = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
         metric = self._by_features(query, truth, clock, places)
         places["search"], found = self._searched(query, truth)
-        scan, chains = self._chain.scan(query), {}
-        for name in BASELINES:
-            spent = Clock()
-            with spent("ms"):
-                judged = self._chain.register(named[name], scan)
-            chains[name] = self._chain.metric(named[name], judged, truth, query) | _milliseconds(spent)
         apart = {name: np.hypot(*(at - robot).T) for name, at in places.items()}
         return {
             "sensor": drive.sensor,
             "chance": self._chance,
             "off": {name: np.round(values, 2).tolist() for name, values in apart.items()},
-            "chains": chains,
             **metric,
             "found": found,
             "ms": _milliseconds(clock),
         }
 
     def _by_hand(self, query: SearchRequest, clock: Clock) -> dict[str, list[Hypothesis]]:
-        """Name places by descriptors and by the heights of the canopy."""
-        stations = self.base_map.stations
+        """Name places by descriptors."""
         with clock("descriptors"):
             centre = on_ground(query.scan, query)
             volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
             both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
-        with clock("canopy"):
-            score, heading = self._canopy.search(*seen_from(query.surroundings, query.position))
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
-        named = {name: of_volume(volume, stations, centre) for name, volume in by_volume.items()}
-        centre = on_ground(query.surroundings, query)
-        canopy = of_places(self._canopy.places, score.ravel(), heading.ravel(), stations, centre)
-        return named | {"canopy": canopy}
+        return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in by_volume.items()}
 
     def _by_features(
         self, query: SearchRequest, truth: Pose, clock: Clock, places: dict[str, Floats]
@@ -270,112 +242,3 @@ def _in_turn(hypotheses: list[Hypothesis], query: SearchRequest) -> Floats:
     """Places (K, 2) of hypotheses in their order, those left out that are near a better one."""
     at = [transform(each.T_map_odom, query.position[None])[0, :2] for each in hypotheses]
     return distinct(np.array(at).reshape(-1, 2), -np.arange(len(at), dtype=np.float64))
-
-
-COARSE = 2.0  # edge of a cell, metres
-HEADINGS = 72
-REACH = 30.0  # metres around the robot
-COVERED = 0.6  # share of the query's cells that the map must have for a place to be scored
-
-_RATIO = round(COARSE / CELL)
-_WINDOW, _MARGIN = 128.0, 48.0  # metres: large maps are drawn piece by piece
-_TOP, _FLAT = -3, 1e-3
-
-
-def heights(points: Points, corner: Floats, shape: tuple[int, int]) -> tuple[Floats, Bools]:
-    """Greatest heights (H, W) above the ground, metres, and which cells of 0.5 m were seen at all."""
-    image = birds_eye_view(points, corner, shape)
-    return image[_TOP] * (SLABS[-1] / 255.0), np.asarray(image[:-1].any(axis=0))
-
-
-class Canopy:
-    """A map's canopy, ready to be searched."""
-
-    def __init__(self, points: Points) -> None:
-        """Draw a cloud (N, 3), metres."""
-        low = np.floor(points[:, :2].min(axis=0).astype(np.float64) / COARSE) * COARSE
-        high = points[:, :2].max(axis=0).astype(np.float64)
-        columns, rows = (np.floor((high - low) / COARSE).astype(int) + 1).tolist()
-        top, seen = np.zeros((rows, columns)), np.zeros((rows, columns), dtype=bool)
-        step = round(_WINDOW / COARSE)
-        for row in range(0, rows, step):
-            for column in range(0, columns, step):
-                part = _window(points, low + np.array([column, row]) * COARSE, step)
-                here = slice(row, row + step), slice(column, column + step)
-                fits = tuple(slice(n) for n in top[here].shape)
-                top[here], seen[here] = part[0][fits], part[1][fits]
-        self.shape = top.shape
-        row, column = np.indices(self.shape)
-        # (H * W, 2) middles of the cells, metres
-        self.places = (np.stack([column.ravel(), row.ravel()], axis=1) + 0.5) * COARSE + low
-        self._half = round(REACH / COARSE)
-        self._size = tuple(fft.next_fast_len(n + 2 * self._half, real=True) for n in self.shape)
-        values = np.where(seen, top, 0.0)
-        self._spectra = fft.rfft2(np.stack([seen.astype(np.float64), values, values**2]), self._size)
-
-    def search(self, xy: Floats, top: Floats) -> tuple[Floats, Floats]:
-        """Correlate heights ``top`` (N,) seen at ``xy`` (N, 2), metres from the robot, axes of the odometry.
-
-        Returns:
-            (H, W) the best correlation at each cell over all headings, -inf where too little overlaps, and (H, W) the
-            heading of the odometry frame in the map that gives it, radians.
-        """
-        best, heading = np.full(self.shape, -np.inf), np.zeros(self.shape)
-        for yaw in np.arange(HEADINGS) * (2 * np.pi / HEADINGS):
-            score = self._at(*self._turned(xy, top, yaw))
-            better = score > best
-            best[better], heading[better] = score[better], yaw
-        return best, heading
-
-    def _turned(self, xy: Floats, top: Floats, yaw: float) -> tuple[Floats, Floats]:
-        """Greatest heights (2h + 1, 2h + 1) of the query's cells about its middle, and which were seen."""
-        side = 2 * self._half + 1
-        cell = np.rint(xy @ rot_z(yaw)[:2, :2].T / COARSE).astype(np.int64) + self._half
-        inside = ((cell >= 0) & (cell < side)).all(axis=1)
-        flat = cell[inside, 1] * side + cell[inside, 0]
-        seen, image = np.zeros(side * side), np.zeros(side * side)
-        seen[flat] = 1.0
-        np.maximum.at(image, flat, top[inside])
-        return image.reshape(side, side), seen.reshape(side, side)
-
-    def _at(self, image: Floats, seen: Floats) -> Floats:
-        """Masked normalised cross-correlation (H, W) of a query with its middle at each cell."""
-        mask, first, second = np.conj(fft.rfft2(np.stack([seen, image, image**2]), self._size))
-        known, values, squares = self._spectra
-        products = np.stack(
-            [mask * known, mask * values, mask * squares, first * known, second * known, first * values]
-        )
-        # the query's middle is its cell (h, h): what lies at a shift of -h is found at the end of the grid
-        sums = np.roll(fft.irfft2(products, self._size), (self._half, self._half), axis=(1, 2))
-        count, theirs, theirs2, ours, ours2, both = sums[:, : self.shape[0], : self.shape[1]]
-        enough = count >= COVERED * seen.sum() - 0.5
-        n = np.maximum(count, 1.0)
-        spread = (theirs2 - theirs**2 / n) * (ours2 - ours**2 / n)
-        score = (both - ours * theirs / n) / np.sqrt(np.maximum(spread, _FLAT))
-        return np.where(enough & (spread > _FLAT), score, -np.inf)
-
-
-def seen_from(points: Points, centre: Floats) -> tuple[Floats, Floats]:
-    """Where a scan (N, 3) has seen anything within 30 m of ``centre`` (K, 2), metres from it, and the heights (K,)."""
-    cells = 2 * round((REACH + COARSE) / CELL)
-    corner = centre[:2] - 0.5 * cells * CELL
-    top, seen = heights(points, corner, (cells, cells))
-    row, column = np.nonzero(seen)
-    xy = (np.stack([column, row], axis=1) + 0.5) * CELL - 0.5 * cells * CELL
-    near = np.hypot(xy[:, 0], xy[:, 1]) < REACH
-    return xy[near], top[row[near], column[near]]
-
-
-def _window(points: Points, corner: Floats, cells: int) -> tuple[Floats, Bools]:
-    """Draw cells (n, n) of 2 m from ``corner`` on, the ground found with a margin of points around them."""
-    low, high = corner - _MARGIN, corner + cells * COARSE + _MARGIN
-    part = points[((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1)]
-    edge = round(_MARGIN / CELL)
-    side = cells * _RATIO + 2 * edge
-    top, seen = heights(part, low, (side, side))
-    inner = slice(edge, -edge)
-    blocks = (cells, _RATIO, cells, _RATIO)
-    return (
-        top[inner, inner].reshape(blocks).max(axis=(1, 3)),
-        np.asarray(seen[inner, inner].reshape(blocks).any(axis=(1, 3))),
-    )

@@ -1,7 +1,5 @@
 """Place recognition on public sets: which submap of another traverse is of the same place.
 
-    python -m bench recognition DIR [--within METRES] [--most N] [--as-map]
-
 ``DIR`` is a set on disk: Wild-Places, CS-Wild-Places (a folder of submaps in metres, with their ground) or CS-Campus3D;
 ``bench/forest/places.py`` says how each lies there. Every query that has a right submap in a database is asked of it
 by each method. AR@1, AR@5 and AR@1 % are the shares for which one of the first, the first five or the first per cent
@@ -10,13 +8,10 @@ traverses. In the MRR every rank counts; the sets' own scripts leave out the que
 
 *scan context*, *co-view* and *both* are the product's descriptors at all shifts; *learned* is the global descriptor of
 its networks, the aerial one for databases and the ground one for queries, which were trained on simulated worlds only.
-``--as-map`` builds a base map of each site's aerial submaps as well and asks that, as the product does: places of the
-dense features, and what verification makes of them.
 """
 
 from __future__ import annotations
 
-import tempfile
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,19 +21,15 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
-from bench.forest.methods import METHODS as MAP_METHODS
-from bench.forest.methods import Methods
 from bench.forest.places import Site, Submap, read_sites
-from bench.forest.worlds import Drive, noted, say
+from bench.forest.worlds import say
 from bench.harness.rows import Row, informs, number, table
-from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import DescriptorConfig, LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.descriptors.network import ViewName, network
-from coview_stream.errors import CoViewError
 from coview_stream.geometry.arrays import Floats32, Ints
-from coview_stream.geometry.transforms import Points, to_local, transform
+from coview_stream.geometry.transforms import Points
 from coview_stream.localization.search.votes import robust_zscore
 
 METHODS = ("scan context", "co-view", "both", "learned")
@@ -55,7 +46,6 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--within", type=float, metavar="METRES", help="a submap this near is right (the set's own)")
     parser.add_argument("--metres", type=float, default=_METRES, help="half of a normalised submap's edge (50)")
     parser.add_argument("--most", type=int, default=0, metavar="N", help="queries of a traverse, spread (0: all)")
-    parser.add_argument("--as-map", action="store_true", help="ask a map of the aerial submaps as well")
 
 
 @dataclass(frozen=True)
@@ -163,45 +153,12 @@ def measured(site: Site, asked: Namespace) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def as_map(site: Site, asked: Namespace) -> dict[str, Any]:
-    """Build a map of a site's aerial submaps and ask it all queries: AR@1 and AR@5 by method, per cent."""
-    air = [each for traverse in site.traverses if traverse.searched for each in traverse.submaps]
-    most = _QUICK if asked.quick else asked.most
-    walked = [each for each in site.traverses if not each.searched]
-    ground = [each.submaps[k] for each in walked for k in spread(each.queries, most)]
-    if not ground or any(each.pose is None for each in (*air, *ground)):
-        raise CoViewError(f"{site.name}: --as-map needs aerial and ground submaps with poses, as CS-Wild-Places has")
-    origin = np.mean([each.upright[:3, 3] for each in air], axis=0)
-    clouds = [transform(to_local(each.upright, origin), each.cloud(asked.metres)) for each in air]
-    with tempfile.TemporaryDirectory() as folder:
-        base = Path(folder) / "base.npy"
-        np.save(base, _thinned(np.concatenate(clouds)))
-        methods = Methods(BaseMap.build(base, radius=REACH, learned=True))
-    off: dict[str, list[list[float]]] = {name: [] for name in MAP_METHODS}
-    for each in ground:
-        truth = to_local(each.upright, origin)
-        found = methods.ask(Drive("submap", 0.0, np.eye(4)[None], (each.cloud(asked.metres),), truth))["off"]
-        for name in MAP_METHODS:
-            off[name].append(found[name])
-    right = {
-        name: {
-            f"AR@{best}": 100.0 * float(np.mean([min(each[:best], default=np.inf) <= site.within for each in values]))
-            for best in (1, 5)
-        }
-        for name, values in off.items()
-    }
-    return {"site": site.name, "database": "map", "queries": "all", "size": len(air), "n": len(ground), "map": right}
-
-
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per pair of traverses, and per site's map."""
     for site in read_sites(asked.data, asked.within):
         for found in measured(site, asked):
             name = f"recognition/{site.name}, {found['queries']} in {found['database']}: AR@1"
             yield informs(name, max(each["AR@1"] for each in found["methods"].values()), "%", found)
-        if asked.as_map:
-            found = as_map(site, asked)
-            yield informs(f"recognition/{site.name}, as a map: AR@1", found["map"]["dense"]["AR@1"], "%", found)
 
 
 def averages(found: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -211,22 +168,11 @@ def averages(found: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Averages by site and method, and recalls on the sites' maps."""
-    found = [row.details for row in rows]
-    pairs = [each for each in found if "methods" in each]
-    shown = []
-    for site in dict.fromkeys(each["site"] for each in pairs):
-        some = [each for each in pairs if each["site"] == site]
-        for method, each in averages(some).items():
-            counted = f"{len(some)} pairs, {sum(pair['n'] for pair in some)} queries"
-            shown.append([site, counted, method, *(number(value, 1) for value in each.values())])
-    out = {"": noted(table(("site", "", "method", "AR@1", "AR@5", "AR@1 %", "MRR"), shown), "recognition DIR")}
-    maps = [each for each in found if "map" in each]
-    lines = [
-        [each["site"], str(each["n"]), method, *(number(value, 1) for value in values.values())]
-        for each in maps
-        for method, values in each["map"].items()
-    ]
-    if lines:
-        out["map"] = noted(table(("site", "queries", "method", "AR@1", "AR@5"), lines), "recognition DIR --as-map")
-    return out
+    """Averages by site and method."""
+    pairs, lines = [row.details for row in rows], []
+    for site in dict.fromkeys(pair["site"] for pair in pairs):
+        own = [pair for pair in pairs if pair["site"] == site]
+        counted = f"{len(own)} pairs, {sum(pair['n'] for pair in own)} queries"
+        for method, values in averages(own).items():
+            lines.append([site, counted, method, *(number(value, 1) for value in values.values())])
+    return {"": table(("site", "", "method", "AR@1", "AR@5", "AR@1 %", "MRR"), lines)}

@@ -19,7 +19,7 @@ import numpy as np
 
 from bench.accuracy.scores import Track, errors, rms
 from bench.forest.forest import NEAR_DEGREES, NEAR_METRES
-from bench.forest.worlds import WORLDS, base_of, code, noted, on_disk, place, say, weights
+from bench.forest.worlds import WORLDS, base_of, code, on_disk, place, say, weights
 from bench.harness.files import fingerprint, remembered
 from bench.harness.rows import Row, failed, informs, number, table
 from coview_stream import BaseMap
@@ -212,5 +212,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
                                      for key, scale, digits in columns.values())]
         for run in (row.details for row in rows if row.details)
     ]  # fmt: skip
-    about = " --quick" * asked.quick + " --world" * bool(asked.world) + " DIR" * len(asked.world)
-    return {"": noted(table(("run", "reloc", *columns), shown), f"forest_runs{about}")}
+    return {"": table(("run", "reloc", *columns), shown)}

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.forest.methods import BEST, Chain, on_ground, query_of
-from bench.forest.worlds import drawn, noted, place
+from bench.forest.worlds import drawn, place
 from bench.harness.files import Clock
 from bench.harness.rows import Row, bounded, number, table
 from coview_stream.basemap.basemap import BaseMap
@@ -132,4 +132,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     digits = {"km2": 2, "stations": 0, "prepare": 2, **dict.fromkeys(_PARTS, 3), "total": 2, "limit": 1}
     shown = [[number(row.details[key], places) for key, places in digits.items()] for row in rows]
     text = f"{table(head, shown)}\n\n{rows[0].details['threads']}; {os.cpu_count()} cores."
-    return {"": noted(text, "forest_scale")}
+    return {"": text}

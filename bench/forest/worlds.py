@@ -69,11 +69,6 @@ def code() -> str:
     return fingerprint(*ANSWERS)
 
 
-def noted(text: str, command: str) -> str:
-    """Return a table with the command that made it, which knows no paths of a machine."""
-    return f"{text}\n\n`python -m bench {command}`. Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
-
-
 def on_disk(world: Path) -> dict[str, Any]:
     """Say what lies in a world's folder: a hash of its files' names, sizes and times."""
     files = [world / part for part in _PARTS] + sorted((world / "run" / "frames").glob("*"))
