@@ -9,6 +9,7 @@ import small_world
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import voxelized
@@ -37,7 +38,7 @@ def tracker_of(world_map, config=None):
 
 def add_frame(tracker, cloud, T_odom_body):
     """Add a raw frame, body frame, as the localizer does: one point per voxel, odometry frame."""
-    tracker.add_scan(voxelized(cloud, T_odom_body, tracker.config.keyframe), T_odom_body)
+    tracker.add_scan(RawScan(voxelized(cloud, T_odom_body, tracker.config.keyframe), T_odom_body))
 
 
 def match_and_update(tracker, cloud, T_odom_body, **how):

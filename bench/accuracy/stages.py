@@ -22,6 +22,7 @@ from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, Key
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -99,7 +100,7 @@ def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> I
     for frame in run:
         T_odom_body = to_local(frame.T_odom_body, run.poses[0][:3, 3])  # near its own origin, as the localizer has it
         T_map_body = to_local(truth[frame.index], origin)
-        keyframe = buffer.add(voxelized(frame.points, T_odom_body, settings), T_odom_body, frame.stamp)
+        keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, settings), T_odom_body), frame.stamp)
         if keyframe is None:
             continue
         scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)

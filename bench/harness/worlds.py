@@ -18,6 +18,7 @@ from coview_stream.clouds import read_tum
 from coview_stream.config import KeyframeConfig, MapConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rotation_angle, to_local
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
@@ -120,7 +121,7 @@ def _place(run: Run, truth: Floats, start: int, site: BaseMap) -> Place:
     for index in range(start, len(run)):
         frame = run.read(index)
         T_odom_body = to_local(frame.T_odom_body, run.poses[start][:3, 3])
-        keyframe = buffer.add(voxelized(frame.points, T_odom_body, buffer.config), T_odom_body, frame.stamp)
+        keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, buffer.config), T_odom_body), frame.stamp)
         if keyframe is not None:
             queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(site.descriptor_config)))
         if len(queries) == KEYFRAMES:

@@ -18,7 +18,7 @@ from coview_stream.errors import CloudError, InputError, warn
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, pose_from, transform
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.odometry_correction import OdometryCorrection
+from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.recordings.run import Run, SweepCorrection
 
 _SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least

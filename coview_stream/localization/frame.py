@@ -1,18 +1,23 @@
-"""Frames as the localizer uses them: checked, levelled, and with their odometry corrected."""
+"""Frames as the localizer uses them: checked, with their odometry corrected by the calibration."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, to_local
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, log_so3, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry
-from coview_stream.localization.calibration.frame_correction import FrameCorrection
-from coview_stream.localization.calibration.frame_motion import Variances
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.frame_motion import FrameMotion, Variances
+
+_LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one
+_PLACE_TILT = math.radians(0.5)  # sigma of an accepted place's roll and pitch, as the search has registered it
 
 
 @dataclass(frozen=True)
@@ -20,48 +25,57 @@ class Frame:
     """One frame, checked.
 
     Attributes:
-        raw: (N, 3) float32, body frame, as it came.
-        cloud: (N, 3) float32, body frame, levelled.
+        cloud: (N, 3) float32, the sensor's own axes.
         T_odom_body: (4, 4) odometry about the anchor, corrected.
         T_odom_raw: (4, 4) odometry as it came.
         stamp: seconds.
-        R_body_cloud: (3, 3) rotation that the cloud has been levelled by.
-        voxels: (M, 3) float32, one point per voxel, odometry frame about the anchor.
+        scan: one point per voxel.
     """
 
-    raw: Points
     cloud: Points
     T_odom_body: Pose
     T_odom_raw: Pose
     stamp: float
-    R_body_cloud: Floats
-    voxels: Points
+    scan: RawScan
 
 
 class FramePreparation:
-    """Preparation of a robot's frames, by what has been learnt of its sensor and odometry.
+    """Preparation of a robot's frames by the calibration, which is estimated from them.
 
     Attributes:
-        correction: what has been learnt.
+        estimator: of the calibration; learns from registrations, too.
         anchor: (3,) origin of odometry in use, so that float32 stays exact; None before the first frame.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
         """Begin with nothing known of the robot."""
-        self.correction = FrameCorrection(config)
+        self.estimator = CalibrationEstimator(config.sensor_leans)
         self.anchor: Floats | None = None
+        self._odometry = OdometryCorrection()
+        self._motion = FrameMotion(config.registration, config.keyframe.distance)
         self._newest: float | None = None  # stamp of the newest frame
         self._voxel_filter = kernels.VoxelFilter(config.keyframe.voxel, config.keyframe.range_min)
 
+    @property
+    def calibration(self) -> Calibration:
+        """The present calibration."""
+        return self.estimator.calibration
+
     def restart(self) -> None:
-        """Go on in another frame of odometry, with what is known of the robot."""
-        self.correction.restart()
+        """Go on in another frame of odometry, with the same calibration."""
+        self.estimator.begin_odometry()
+        self._odometry = OdometryCorrection()
+        self._motion.clear()
         self.anchor = self._newest = None
 
     def forget_odometry(self) -> None:
         """Connect the next frame with none before it: odometry may have jumped."""
-        self.correction.forget_frame()
+        self.forget_keyframe()
         self.anchor = None
+
+    def forget_keyframe(self) -> None:
+        """Measure no motion between the next keyframe and the one before."""
+        self._motion.clear()
 
     def prepare(self, cloud: Points, T_odom_body: Pose, stamp: float, drift: Variances | None = None) -> Frame:
         """Check and correct a frame.
@@ -71,28 +85,75 @@ class FramePreparation:
             T_odom_body: (4, 4) likewise.
             stamp: seconds.
             drift: of odometry; a keyframe's motion is then mended by its registration to the keyframe before, if one is
-                due. None while a place is known, which tells the motion better.
+                due. None while a place is known, for registrations to the map measure the motion better.
 
         Raises:
             CloudError, RunError: the frame is unusable; nothing has changed.
         """
         raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp, self._newest)
         self._newest = stamp
-        T = self.correction.odometry(T_raw)
+        T = self._odometry.correct(T_raw, self.calibration)
         if self.anchor is None:
             self.anchor = T[:3, 3].copy()
         T = to_local(T, self.anchor)
-        if drift is not None and self.correction.is_due(T):
-            T = self.correction.refine(self._voxels(raw, np.eye(4)), T, self.anchor, drift)
-        return self._levelled(Frame(raw, raw, T, T_raw, stamp, np.eye(3), raw))
+        if drift is not None and self._motion.is_due(T):
+            T = self._motion.refine(self._voxels(raw, np.eye(4)), T, self.estimator, drift)
+            self._odometry.move_to(pose_from(T[:3, :3], T[:3, 3] + self.anchor))
+        points = self._voxels(raw, T @ self.calibration.T_body_cloud)
+        return Frame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration.R_body_cloud))
 
-    def level_again(self, frame: Frame) -> Frame:
-        """Return a frame, levelled by what is known now; the same if it stands straight."""
-        return self._levelled(frame) if self.correction.leans(frame.R_body_cloud) else frame
+    def learn_place(self, T_map_cloud: Pose, T_odom_body: Pose, probability: float | None = None) -> Pose:
+        """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) by the calibration that follows.
 
-    def _levelled(self, frame: Frame) -> Frame:
-        cloud, R_body_cloud = self.correction.level(frame.raw), self.correction.calibration.R_body_cloud
-        return replace(frame, cloud=cloud, R_body_cloud=R_body_cloud, voxels=self._voxels(cloud, frame.T_odom_body))
+        Args:
+            T_map_cloud: (4, 4) registered pose of a keyframe's cloud in the sensor's own axes.
+            T_odom_body: (4, 4) corrected odometry of the same keyframe.
+            probability: of a place that leads the search; None if it has been accepted.
+        """
+        if probability is None:
+            self.estimator.measure_attitude(T_map_cloud, T_odom_body, _PLACE_TILT**2)
+        else:
+            self.estimator.suppose_attitude(T_map_cloud, T_odom_body, _LEADER_TILT**2, probability)
+        return T_map_cloud @ inverse(T_odom_body @ self.calibration.T_body_cloud)
 
     def _voxels(self, cloud: Points, T: Pose) -> Points:
         return self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
+
+
+class OdometryCorrection:
+    """Odometry with its scale and its heading corrected, step by step; what has been corrected stays as it is.
+
+    Gravity stays odometry's: turns are about the vertical.
+    """
+
+    def __init__(self) -> None:
+        self._before: Pose | None = None  # as it came
+        self._position = np.zeros(3)
+        self._turned = 0.0
+
+    def correct(self, T_odom_body: Pose, calibration: Calibration) -> Pose:
+        """Return the next pose (4, 4), odometry <- body, corrected."""
+        if self._before is None:
+            self._position = T_odom_body[:3, 3].copy()
+        else:
+            step = T_odom_body[:3, 3] - self._before[:3, 3]
+            turn = calibration.turn * float(np.linalg.norm(step))
+            middle = exp_so3(np.array([0.0, 0.0, self._turned + 0.5 * turn]))
+            self._position = self._position + (1.0 + calibration.scale) * (middle @ step)
+            self._turned += turn
+        self._before = T_odom_body
+        return self._corrected(T_odom_body)
+
+    def move_to(self, T_odom_body: Pose) -> Pose:
+        """Go on from another pose (4, 4) than the newest corrected one; its roll and pitch stay odometry's."""
+        assert self._before is not None  # there is a newest one
+        now = self._corrected(self._before)
+        self._turned += float(log_so3(T_odom_body[:3, :3] @ now[:3, :3].T)[2])
+        self._position = T_odom_body[:3, 3].copy()
+        return self._corrected(self._before)
+
+    def _corrected(self, T_odom_body: Pose) -> Pose:
+        T = np.eye(4)
+        T[:3, :3] = exp_so3(np.array([0.0, 0.0, self._turned])) @ T_odom_body[:3, :3]
+        T[:3, 3] = self._position
+        return T

@@ -6,14 +6,11 @@ import os
 from dataclasses import replace
 from typing import NoReturn
 
-import numpy as np
-
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
@@ -21,7 +18,6 @@ from coview_stream.localization.evidence.observation import RangeImage
 from coview_stream.localization.frame import Frame, FramePreparation
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
-from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
@@ -35,9 +31,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
-_FOUND = np.diag(np.square([*np.radians([0.5, 0.5, 0.5]), 0.1, 0.1, 0.1]))  # of an accepted place; set by hand
 _BY_INDEX = ("exhaustive", "consensus")  # modes of retrieval and consensus
-_SMEARED = np.radians(1.0)  # keyframes that lean by less are not levelled again while searching; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
@@ -117,16 +111,13 @@ class Localizer:
         radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
-        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.correction.estimator)
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
         self._odometry_check = OdometryCheck()
         self._newest: Frame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
-        self._lean_is_told = True  # by a registration at the place
-        self._leader: Pose | None = None  # T_map_odom of the place that leads the search
-        self._levelled_at: Floats | None = None  # position in the odometry frame where the search was levelled anew
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -149,7 +140,7 @@ class Localizer:
     @property
     def calibration(self) -> Calibration:
         """What is corrected now of the sensor's tilt and of odometry, and of the site's ground."""
-        return replace(self._frames.correction.calibration, ground=self._tracker.ground.metres)
+        return replace(self._frames.calibration, ground=self._tracker.ground.metres)
 
     @property
     def last_query(self) -> dict[Channel, Descriptor]:
@@ -315,7 +306,7 @@ class Localizer:
         """
         if self.state.has_place:
             return
-        self._frames.correction.estimator.learn(known.doubted())
+        self._frames.estimator.learn(known.doubted())
         if not self._tracker.ground.learned:
             self._tracker.ground.restore(known.ground)
 
@@ -336,63 +327,13 @@ class Localizer:
         frame = self._frames.prepare(cloud, T_odom_body, stamp, self._tracker.drift.variances if searching else None)
         keyframe = None
         if searching:
-            # what has been searched with leant: level it, and search again at once
-            leant = self._buffer.lean(frame.R_body_cloud) > _SMEARED and self._has_driven_on(frame.T_odom_body)
-            if leant:
-                self._levelled_at = frame.T_odom_body[:3, 3].copy()
-                self._buffer.level(frame.R_body_cloud)
+            keyframe = self._buffer.add(frame.scan, stamp, self._frames.calibration.R_body_cloud)
+            if keyframe is not None and keyframe.begins_anew:
                 self._next_epoch()
-                if self._leader is not None and self._frames.anchor is not None:
-                    self._hints.place_led(self._leader, self._frames.anchor)
-            keyframe = self._buffer.add(frame.voxels, frame.T_odom_body, stamp, frame.R_body_cloud, leant)
-        self._tracker.add_scan(frame.voxels, frame.T_odom_body)
+                self._hints.search_begins_anew()
+        self._tracker.add_scan(frame.scan)
         self._newest = frame
         return frame, keyframe
-
-    def _has_driven_on(self, T_odom_body: Pose) -> bool:
-        """Tell whether the robot has driven on since the search was levelled: places seen from here say nothing new."""
-        at = self._levelled_at
-        return at is None or float(np.linalg.norm(T_odom_body[:3, 3] - at)) >= self.config.keyframe.distance
-
-    def _start_tracking(self, found: Registration, result: SearchResult, newest: Frame) -> Frame:
-        """Begin at an accepted place, registered for a keyframe; return the newest frame, levelled by what that tells.
-
-        The keyframe may be seconds old, and its clouds levelled otherwise than by what is known now.
-        """
-        T_odom_found, R_body_cloud = result.T_odom_body, result.R_body_cloud
-        seen = found.T_map_source @ T_odom_found
-        levelled = self._frames.correction.learn_found(seen, _FOUND, T_odom_found, R_body_cloud)
-        newest = self._levelled(newest)
-        found = replace(found, T_map_source=levelled @ inverse(T_odom_found))
-        self._tracker.start(found, newest.T_odom_body, result.travelled, T_odom_found)
-        return newest
-
-    def _level(
-        self, match: MapMatch, frame: Frame, standing_still: bool = False, newest_only: bool = False
-    ) -> MapMatch:
-        """Level the newest frame by the first registration at a place that fits, and match it again, if it leans.
-
-        The last two are those of :meth:`Tracker.match_to_map`.
-        """
-        if self._lean_is_told or not match.verdict.verified:
-            return match
-        self._lean_is_told = True
-        T_odom_body = frame.T_odom_body
-        T_map_body = self._frames.correction.learn_found(
-            match.T_map_body, match.covariance, T_odom_body, frame.R_body_cloud
-        )
-        levelled = self._levelled(frame)
-        if levelled is frame:
-            return match
-        self._tracker.start_levelled(T_map_body, match.covariance, T_odom_body)
-        return self._tracker.match_to_map(levelled.cloud, T_odom_body, standing_still, newest_only)
-
-    def _levelled(self, newest: Frame) -> Frame:
-        """Return the newest frame, levelled by what is known now; the same if it stands straight."""
-        self._newest = self._frames.level_again(newest)
-        if self._newest is not newest:
-            self._tracker.level_newest_scan(self._newest.voxels)
-        return self._newest
 
     def _search_request(self, frame: Frame, keyframe: Keyframe | None) -> SearchRequest | None:
         """Return what has to be searched for: the keyframe that a frame completes, if any."""
@@ -402,7 +343,7 @@ class Localizer:
         area = self._hints.area(self._frames.anchor, frame.T_odom_body)
         if area is not None:
             hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
-        if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
+        if self._odometry_check.contradicts(frame.scan.levelled(self._buffer.R_body_cloud), frame.scan.position):
             self._restart_search(frame.stamp)
             return None
         if keyframe is None:
@@ -412,7 +353,7 @@ class Localizer:
             self._evidence = KeyframeEvidence(frame.stamp, self.state, reason)
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
-        rays = RangeImage.rays(frame.cloud)
+        rays = RangeImage.rays(self._frames.calibration.level(frame.cloud))
         request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints, guesses, area)
         # what the search would begin with: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
@@ -424,28 +365,27 @@ class Localizer:
             return None
         self._evidence = result.evidence
         if result.accepted is None:
-            if result.leader is not None and result.evidence.evidence is not None:  # it has been registered
-                self._learn_leader(result.leader @ result.T_odom_body, result)
+            if result.T_map_cloud is not None and result.evidence.evidence is not None:  # it has been registered
+                probability = result.evidence.confidence or 0.0
+                leader = self._frames.learn_place(result.T_map_cloud, result.T_odom_body, probability)
+                if self._frames.anchor is not None:
+                    self._hints.place_leads(leader, self._frames.anchor)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
         self._handle(Event.PLACE_ACCEPTED)
         self._confidence = result.evidence.confidence or 0.0
-        newest = self._start_tracking(result.accepted.registration, result, newest)
+        assert result.T_map_cloud is not None  # the accepted place leads
+        T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
+        registration = replace(result.accepted.registration, T_map_source=T_map_odom)
+        self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
-        self._frames.correction.forget_frame()
+        self._frames.forget_keyframe()
         # the robot may have driven on or been carried since the keyframe
-        self._lean_is_told = False
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
-        return replace(self._level(match, newest), confirms_search=True)
-
-    def _learn_leader(self, T_map_body: Pose, result: SearchResult) -> None:
-        """Learn the tilt from a place that leads, (4, 4) as registered, which a search that begins anew tries, too."""
-        probability, R_body_cloud = result.evidence.confidence or 0.0, result.R_body_cloud
-        levelled = self._frames.correction.learn_leader(T_map_body, result.T_odom_body, probability, R_body_cloud)
-        self._leader = levelled @ inverse(result.T_odom_body)
+        return replace(match, confirms_search=True)
 
     def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
@@ -454,8 +394,7 @@ class Localizer:
         waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
         if due or waited or newest_only:
-            match = self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
-            return self._level(match, frame, not due, newest_only)
+            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
@@ -503,7 +442,6 @@ class Localizer:
         if self._frames.anchor is not None:
             self._hints.odometry_continues(self._tracker.T_map_odom, self._frames.anchor)
         self._frames.forget_odometry()
-        self._leader = self._levelled_at = None
         self._tracker.ground.restore(self._tracker.ground.metres)
         self._buffer.clear()
         self._odometry_check.clear()
@@ -513,10 +451,9 @@ class Localizer:
     def _restart_search(self, stamp: float) -> None:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
-        self._leader = None
-        self._hints.forget_led()
-        self._frames.correction.estimator.forget_leader()
-        self._frames.correction.forget_frame()
+        self._hints.forget_leader()
+        self._frames.estimator.forget_leader()
+        self._frames.forget_keyframe()
         self._tracker.forget_scans()
         self._next_epoch()
         self._handle(Event.SCANS_CONTRADICT)

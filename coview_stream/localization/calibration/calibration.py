@@ -1,4 +1,4 @@
-"""The calibration: by how much sensor and odometry are off, as they seem to be now."""
+"""The calibration: current errors of sensor and odometry, and scans to which it is applied when they are read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import exp_so3
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from
 
 _WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next three
 _SCALE = 0.01
@@ -49,6 +49,16 @@ class Calibration:
     def R_body_cloud(self) -> Floats:
         """(3, 3) rotation that levels clouds."""
         return exp_so3(np.array([self.roll, self.pitch, 0.0]))
+
+    @property
+    def T_body_cloud(self) -> Pose:
+        """(4, 4) the same as a transform."""
+        return pose_from(self.R_body_cloud, np.zeros(3))
+
+    def level(self, cloud: Points) -> Points:
+        """Return a cloud (N, 3) of the sensor's own axes in the body's."""
+        R = self.R_body_cloud
+        return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
@@ -101,3 +111,46 @@ class Calibration:
             "ground_offset_m": round(self.ground, 3),
             "says": self.describe(mount),
         }
+
+
+class RawScan:
+    """Points of a frame in the sensor's own axes, with the frame's odometry; levelled when they are read.
+
+    The newest reading is held, so reading again with the same rotation costs nothing.
+
+    Attributes:
+        T_odom_body: (4, 4) odometry of the frame.
+    """
+
+    def __init__(self, points: Points, T_odom_body: Pose, R_body_cloud: Floats | None = None) -> None:
+        """Store a frame.
+
+        Args:
+            points: (N, 3) float32, one per voxel, odometry frame, levelled by ``R_body_cloud``.
+            T_odom_body: (4, 4) odometry of the frame.
+            R_body_cloud: (3, 3); None if the points are as the sensor saw them.
+        """
+        self.T_odom_body = T_odom_body
+        self._newest = (np.eye(3) if R_body_cloud is None else R_body_cloud), points
+        self._raw: Points | None = None
+
+    def __len__(self) -> int:
+        """Return the number of points N."""
+        return len(self._newest[1])
+
+    @property
+    def position(self) -> Floats:
+        """(3,) sensor position in the odometry frame, metres."""
+        return np.asarray(self.T_odom_body[:3, 3])
+
+    def levelled(self, R_body_cloud: Floats) -> Points:
+        """Return the points (N, 3), odometry frame, levelled by a rotation (3, 3)."""
+        R, points = self._newest
+        if np.array_equal(R, R_body_cloud):
+            return points
+        position = self.position.astype(np.float32)
+        if self._raw is None:
+            self._raw = (points - position) @ (self.T_odom_body[:3, :3] @ R).astype(np.float32)
+        turn = (self.T_odom_body[:3, :3] @ R_body_cloud).astype(np.float32)
+        self._newest = R_body_cloud, self._raw @ turn.T + position
+        return self._newest[1]

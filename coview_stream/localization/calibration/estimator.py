@@ -79,29 +79,26 @@ class CalibrationEstimator:
         spread[2, 2] += (self.calibration.sigma_turn * float(np.linalg.norm(step))) ** 2
         return np.asarray(spread)
 
-    def measure_attitude(self, T_map_body: Pose, T_odom_body: Pose, variance: float, R_body_cloud: Floats) -> None:
-        """Take in the attitude of a registration at the place that is known (eq. C1).
+    def measure_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
+        """Take in the attitude of a registration at the known place (eq. C1).
 
         Args:
-            T_map_body: (4, 4) as the map alone has it, of a cloud that has been levelled.
-            T_odom_body: (4, 4) odometry of the same body.
+            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
+            T_odom_body: (4, 4) odometry of the same frame.
             variance: of the registration's roll and pitch, rad^2.
-            R_body_cloud: (3, 3) rotation that the cloud has been levelled by, which may be known better by now.
         """
         self._supposed = None
-        _measure_attitude(self._known, T_map_body, T_odom_body, variance, R_body_cloud)
+        _measure_attitude(self._known, T_map_cloud, T_odom_body, variance)
         self._apply()
 
-    def suppose_attitude(
-        self, T_map_body: Pose, T_odom_body: Pose, variance: float, R_body_cloud: Floats, probability: float
-    ) -> None:
-        """Take in the attitude at a place that is the right one with a ``probability``; else it tells nothing.
+    def suppose_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float, probability: float) -> None:
+        """Take in the attitude at a place that is right with a ``probability``; a wrong place says nothing.
 
-        It takes the place of what was supposed before: a search looks at the same scans again. Args as
+        Replaces the previous supposition, for a search registers the same scans again. Args as
         :meth:`measure_attitude`.
         """
         self._supposed, self._probability = self._known.copy(), probability
-        _measure_attitude(self._supposed, T_map_body, T_odom_body, variance, R_body_cloud)
+        _measure_attitude(self._supposed, T_map_cloud, T_odom_body, variance)
         self._apply()
 
     def measure_motion(self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats) -> Pose:
@@ -174,10 +171,9 @@ class CalibrationEstimator:
             self.calibration = mixed(self.calibration, self._supposed.applied(), self._probability)
 
 
-def _measure_attitude(
-    belief: Belief, T_map_body: Pose, T_odom_body: Pose, variance: float, R_body_cloud: Floats
-) -> None:
-    left = np.cross(T_map_body[2, :3], T_odom_body[2, :3])
+def _measure_attitude(belief: Belief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
+    R_body_cloud = belief.applied().R_body_cloud
+    left = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
     left[2] = 0.0
     seen = log_so3(exp_so3(left) @ R_body_cloud)[:2]
     H = np.eye(2, SIZE)

@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Pose, pose_from
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.considered import Considered
@@ -51,6 +51,13 @@ class SearchResult:
     T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
     R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
     considered: Considered | None = None
+
+    @property
+    def T_map_cloud(self) -> Pose | None:
+        """(4, 4) the leader's pose of the keyframe's cloud in the sensor's own axes; None without a leader."""
+        if self.leader is None:
+            return None
+        return self.leader @ self.T_odom_body @ pose_from(self.R_body_cloud, np.zeros(3))
 
 
 def decide(

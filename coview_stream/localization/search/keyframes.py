@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,10 +12,12 @@ import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, rotation_angle
+from coview_stream.localization.calibration.calibration import RawScan
 
 _PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
 _RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
 _PARTS = 3  # in which the points of keyframes are gathered; set by hand
+_SMEARED = np.radians(1.0)  # keyframes that lean by less are not gathered again; set by hand
 
 # of OdometryCheck
 _VOXEL = 1.0  # metres; set by hand
@@ -29,41 +31,36 @@ _BITS = 21  # of a coordinate in a voxel's key
 
 @dataclass(frozen=True)
 class Keyframe:
-    """All frames since the previous keyframe, one point per voxel.
+    """All frames since the previous keyframe.
 
     Attributes:
         stamp: seconds, of the newest frame.
-        T_odom_body: (4, 4) of the newest frame.
-        points: (N, 3) float32 odometry-frame coordinates, metres.
-        R_body_cloud: (3, 3) rotation that its clouds have been levelled by.
+        scan: one point per voxel, about the newest frame's odometry.
+        begins_anew: the calibration has changed so much that earlier keyframes have been levelled again.
     """
 
     stamp: float
-    T_odom_body: Pose
-    points: Points
-    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
+    scan: RawScan
+    begins_anew: bool = False
+
+    @property
+    def T_odom_body(self) -> Pose:
+        """(4, 4) odometry of the newest frame."""
+        return self.scan.T_odom_body
 
     @property
     def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
-        return np.asarray(self.T_odom_body[:3, 3])
-
-    def levelled(self, R_body_cloud: Floats) -> Keyframe:
-        """Return the same, levelled by another rotation (3, 3), about where it was taken."""
-        if np.array_equal(R_body_cloud, self.R_body_cloud):
-            return self
-        R = self.T_odom_body[:3, :3] @ R_body_cloud @ self.R_body_cloud.T @ self.T_odom_body[:3, :3].T
-        centre = self.position.astype(np.float32)
-        points = (self.points - centre) @ R.T.astype(np.float32) + centre
-        return replace(self, points=points, R_body_cloud=R_body_cloud)
+        return self.scan.position
 
 
 class KeyframeBuffer:
     """Buffer of the newest keyframes, made from the frames that are added.
 
     All coordinates are in the odometry frame, which must be gravity aligned and near its own origin. The points of the
-    newest ``capacity`` keyframes or somewhat fewer are gathered, one per voxel, for virtual local scans; of the newest
-    five the points are kept as they are as well.
+    newest ``capacity`` keyframes or somewhat fewer are gathered, one per voxel, for virtual local scans, levelled by
+    the calibration of their time; the newest five are held raw and levelled when they are read. Where the calibration
+    has moved by more than a degree, the gathered points are replaced by those of the newest five.
 
     Args:
         config: distance between keyframes, how many are held, and their voxels.
@@ -72,54 +69,65 @@ class KeyframeBuffer:
 
     Attributes:
         keyframes: the newest ones, oldest first.
+        R_body_cloud: (3, 3) rotation that levels the clouds, as given with the newest frame.
     """
 
     def __init__(self, config: KeyframeConfig, reach: float = math.inf) -> None:
         self.config = config
         self.reach = reach
         self.keyframes: deque[Keyframe] = deque(maxlen=min(config.capacity, _RECENT))
-        self._pending: list[Keyframe] = []  # frames since the newest keyframe
+        self.R_body_cloud = np.eye(3)
+        self._gathered_by: deque[Floats] = deque(maxlen=self.keyframes.maxlen)  # rotations, of the keyframes
+        self._levelled_at: Floats | None = None  # position where the gathered points were last levelled again
+        self._pending: list[RawScan] = []  # frames since the newest keyframe
         # the points of so many keyframes each, one per voxel, which are dropped as a whole
         self._part_size = max(1, config.capacity // _PARTS)
         self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)
         self._in_part = 0  # keyframes in the newest of them
 
-    def add(
-        self, points: Points, T_odom_body: Pose, stamp: float, R_body_cloud: Floats | None = None,
-        complete: bool = False,
-    ) -> Keyframe | None:  # fmt: skip
-        """Add a frame's points (N, 3), odometry frame, which are kept; return the keyframe that it completes, if any.
-
-        :func:`~coview_stream.localization.registration.prepare_scan.voxelized` makes the points of a cloud, which has
-        been levelled by ``R_body_cloud`` (3, 3), if at all. ``complete`` makes it a keyframe wherever the last one was.
-        """
-        frame = Keyframe(stamp, T_odom_body, points, np.eye(3) if R_body_cloud is None else R_body_cloud)
-        self._pending.append(frame)
-        if sum(len(each.points) for each in self._pending) > _PENDING_POINTS:
-            self._pending = [self._merged(frame)]
-        if self.keyframes and not complete:
-            moved = float(np.linalg.norm(T_odom_body[:3, 3] - self.keyframes[-1].position))
+    def add(self, scan: RawScan, stamp: float, R_body_cloud: Floats | None = None) -> Keyframe | None:
+        """Add a frame, whose clouds ``R_body_cloud`` (3, 3) levels; return the keyframe that it completes, if any."""
+        self.R_body_cloud = np.eye(3) if R_body_cloud is None else R_body_cloud
+        if anew := self._leans() and self._has_driven_on(scan.position):
+            self._gather_again()
+            self._levelled_at = scan.position.copy()
+        self._pending.append(scan)
+        if sum(map(len, self._pending)) > _PENDING_POINTS:
+            self._pending = [self._merged(scan)]
+        if self.keyframes and not anew:
+            moved = float(np.linalg.norm(scan.position - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None
-        keyframe = self._merged(frame)
-        self.keyframes.append(keyframe)
+        keyframe = Keyframe(stamp, self._merged(scan), anew)
         self._pending = []
         self._gather(keyframe)
         return keyframe
 
+    def _leans(self) -> bool:
+        """Whether a keyframe was levelled by a rotation more than a degree off the present one."""
+        return any(rotation_angle(self.R_body_cloud.T @ R) > _SMEARED for R in self._gathered_by)
+
+    def _has_driven_on(self, position: Floats) -> bool:
+        """Whether the robot has driven on since the last levelling: from the same position nothing new is seen."""
+        at = self._levelled_at
+        return at is None or float(np.linalg.norm(position - at)) >= self.config.distance
+
     def _gather(self, keyframe: Keyframe) -> None:
-        """Add a keyframe's points to the newest part: where it has none in their voxels, and within reach."""
+        """Add a keyframe, its points to the newest part: where it has none in their voxels, and within reach."""
+        self.keyframes.append(keyframe)
+        self._gathered_by.append(self.R_body_cloud)
         if not self._parts or self._in_part == self._part_size:
             near = [_within(part, keyframe.position, self.reach) for part in self._parts]
             self._parts = deque([*near, np.empty((0, 3), dtype=np.float32)], maxlen=self._parts.maxlen)
             self._in_part = 0
-        points = np.concatenate((self._parts[-1], keyframe.points))
+        points = np.concatenate((self._parts[-1], keyframe.scan.levelled(self.R_body_cloud)))
         self._parts[-1] = self._unique(_within(points, keyframe.position, self.reach))
         self._in_part += 1
 
     def recent(self, count: int) -> Points:
         """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since."""
-        parts = [each.points for each in (*list(self.keyframes)[-count:], *self._pending)]
+        scans = [*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending]
+        parts = [scan.levelled(self.R_body_cloud) for scan in scans]
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
@@ -130,30 +138,27 @@ class KeyframeBuffer:
         near = [_within(part, centre, radius) for part in self._parts]
         return self._unique(np.concatenate(near), voxel)
 
-    def lean(self, R_body_cloud: Floats) -> float:
-        """Return by how much a keyframe that is held was levelled otherwise than by a rotation (3, 3), at most, rad."""
-        return max((rotation_angle(R_body_cloud.T @ each.R_body_cloud) for each in self.keyframes), default=0.0)
-
-    def level(self, R_body_cloud: Floats) -> None:
-        """Level all that is held by a rotation (3, 3) that is known better now; all but the newest five is dropped."""
+    def _gather_again(self) -> None:
+        """Level all held points again; of the gathered ones only those of the newest five keyframes remain."""
         held, pending = list(self.keyframes), self._pending
         self.clear()
         for keyframe in held:
-            self.keyframes.append(keyframe.levelled(R_body_cloud))
-            self._gather(self.keyframes[-1])
-        self._pending = [frame.levelled(R_body_cloud) for frame in pending]
+            self._gather(keyframe)
+        self._pending = pending
 
     def clear(self) -> None:
         """Forget all keyframes, for odometry does not connect them with the next frame."""
         self.keyframes.clear()
+        self._gathered_by.clear()
+        self._levelled_at = None
         self._pending = []
         self._parts.clear()
         self._in_part = 0
 
-    def _merged(self, newest: Keyframe) -> Keyframe:
-        """Return all frames since the newest keyframe as one, levelled as the newest of them."""
-        frames = [frame.levelled(newest.R_body_cloud).points for frame in self._pending]
-        return replace(newest, points=self._unique(np.concatenate(frames)))
+    def _merged(self, newest: RawScan) -> RawScan:
+        """Return all frames since the newest keyframe as one."""
+        frames = [scan.levelled(self.R_body_cloud) for scan in self._pending]
+        return RawScan(self._unique(np.concatenate(frames)), newest.T_odom_body, self.R_body_cloud)
 
     def _unique(self, points: Points, voxel: float | None = None) -> Points:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]

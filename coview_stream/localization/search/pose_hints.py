@@ -35,6 +35,7 @@ class PoseHints:
     def __init__(self) -> None:
         self._awaited: Pose | None = None  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
+        self._leader: Pose | None = None  # of the search so far
         self._led: tuple[Pose, ...] = ()
         self._guess: PlaceGuess | None = None  # of the place at the next frame
         self._guessed: tuple[Pose, ...] = ()
@@ -43,7 +44,8 @@ class PoseHints:
 
     def clear(self) -> None:
         """Forget them all: a place has been accepted."""
-        self._awaited, self._known, self._led = None, (), ()
+        self._awaited, self._known = None, ()
+        self.forget_leader()
         self._guess, self._guessed, self.circle = None, (), None
 
     def guess(self, guess: PlaceGuess) -> None:
@@ -82,15 +84,21 @@ class PoseHints:
 
     def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Hint, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
-        self._awaited, self._known, self._led = None, (T_map_odom @ pose_from(np.eye(3), -anchor),), ()
+        self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
+        self.forget_leader()
 
-    def place_led(self, T_map_odom: Pose, anchor: Floats) -> None:
-        """Hint that ``T_map_odom`` (4, 4) about ``anchor`` (3,) led a search that has begun anew; one at a time."""
-        self._led = (T_map_odom @ pose_from(np.eye(3), -anchor),)
+    def place_leads(self, T_map_odom: Pose, anchor: Floats) -> None:
+        """Note that ``T_map_odom`` (4, 4) about ``anchor`` (3,) leads the search; no hint until it begins anew."""
+        self._leader = T_map_odom @ pose_from(np.eye(3), -anchor)
 
-    def forget_led(self) -> None:
+    def search_begins_anew(self) -> None:
+        """Hint at the place that has led the search so far, if any."""
+        if self._leader is not None:
+            self._led = (self._leader,)
+
+    def forget_leader(self) -> None:
         """Forget the place that led: the odometry that it is tied to has been contradicted."""
-        self._led = ()
+        self._leader, self._led = None, ()
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""

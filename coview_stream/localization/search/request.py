@@ -111,7 +111,7 @@ class SearchRequest:
         return cls(
             keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, guesses,
             surroundings,
-            keyframe.R_body_cloud,
+            buffer.R_body_cloud,
             area,
         )  # fmt: skip
 

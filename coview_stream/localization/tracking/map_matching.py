@@ -18,7 +18,7 @@ from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
-from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
+from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.rivals import Rival, find_rivals
 from coview_stream.localization.tracking.slip import matters, off_by
 
@@ -84,7 +84,7 @@ class MapMatcher:
         belief: Estimate,
         target: LocalMap,
         scales: tuple[float, ...],
-        graph: PoseGraph,
+        predicted: Estimate,
         beside: int = 1,
     ) -> MapMatch:
         """Register (eq. 13), verify and judge; where registration fails, the belief stays.
@@ -94,7 +94,7 @@ class MapMatcher:
             belief: pose and covariance that it starts from, and that take part in it as a prior.
             target: the map around it.
             scales: largest correspondence distance of each scale, metres.
-            graph: predicts the pose.
+            predicted: pose and covariance by the graph, which the innovation is measured from.
             beside: so many rivals at most are looked for.
         """
         settings, acceptance = self.config.registration, self.config.acceptance
@@ -120,14 +120,14 @@ class MapMatcher:
             T_map_body = T_map_odom @ scan.T_odom_body
             own = remove_prior(T_map_body, registration.information, belief.T_map_body, information, settings)
             covariance = registration_covariance(own.information, settings)
-            innovation = graph.innovation(own.T_map_body, covariance)
+            innovation = predicted.innovation(own.T_map_body, covariance)
         except InputError as error:
             return _failed(belief, str(error), evidence, seen)
         verdict = MatchVerdict(cause, reason, evidence, innovation, seen)
         return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target, tuple(rivals))
 
     def match_widely(
-        self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, graph: PoseGraph
+        self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, predicted: Estimate
     ) -> list[MapMatch]:
         """Match again, from a wide belief and from the best rival of a match, and hold all against each other.
 
@@ -136,19 +136,19 @@ class MapMatcher:
             scan: what to register.
             belief: wide enough for a slip.
             target: the map around it.
-            graph: predicts the pose.
+            predicted: as for :meth:`match`.
 
         Returns:
             Two or three matches, ``first`` being the first.
         """
         scales = self.config.registration.search[1:]
-        tries = [first, self.match(scan, belief, target, scales, graph, _MAX_RIVALS)]
+        tries = [first, self.match(scan, belief, target, scales, predicted, _MAX_RIVALS)]
         rivals = sorted((rival for each in tries for rival in each.rivals), key=lambda rival: -rival.ratio)
         for rival in rivals:
             T_map_body = rival.T_map_odom @ scan.T_odom_body
             if all(matters(*off_by(each.T_map_body, T_map_body)) for each in tries):
                 start = Estimate(T_map_body, belief.covariance)
-                tries.append(self.match(scan, start, target, scales, graph, 0))
+                tries.append(self.match(scan, start, target, scales, predicted, 0))
                 break
         return [self._against(each, tries) for each in tries]
 

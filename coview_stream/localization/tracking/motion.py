@@ -16,6 +16,7 @@ import numpy as np
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, yaw_of
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, tilt_variance
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
@@ -142,15 +143,13 @@ class _Registered:
     """A verified registration.
 
     Attributes:
-        T_map_body: (4, 4) as the map alone has it.
+        T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
         covariance: (6, 6) of that.
-        R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
         mark: where odometry was.
     """
 
-    T_map_body: Pose
+    T_map_cloud: Pose
     covariance: Floats
-    R_body_cloud: Floats
     mark: _Mark
 
 
@@ -202,21 +201,20 @@ class OdometryTracker:
         """Rates of odometry's drift, as measured so far."""
         return self._estimator.drift
 
-    def learn(self, T_map_body: Pose, covariance: Floats, R_body_cloud: Floats) -> None:
+    def learn(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
         Args:
-            T_map_body: (4, 4) as the map alone has it.
+            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
             covariance: (6, 6) of that.
-            R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
         """
         self._confirm()
-        self._learn(_Registered(T_map_body, covariance, R_body_cloud, self._keyframe))
+        self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
 
-    def learn_once_confirmed(self, T_map_body: Pose, covariance: Floats, R_body_cloud: Floats) -> None:
+    def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Do the same once another registration has followed: odometry contradicts this one. Args as there."""
         self._confirm()
-        self._unconfirmed = _Registered(T_map_body, covariance, R_body_cloud, self._keyframe)
+        self._unconfirmed = _Registered(T_map_cloud, covariance, self._keyframe)
 
     def forget_registration(self) -> None:
         """Compare the next registration with none before it; the rates stay."""
@@ -236,32 +234,25 @@ class OdometryTracker:
             step = inverse(before.mark.T_odom_body) @ now.mark.T_odom_body
             noise = _OWN_NOISE * np.diag(now.covariance + before.covariance)
             expected = self.drift.variances(driven, turned) + noise
-            step = self._calibration.measure_motion(before.T_map_body, now.T_map_body, step, expected[[3, 2]])
-            gap = boxminus(now.T_map_body, before.T_map_body @ step)
-            self._estimator.add(gap, noise, driven, turned)
-            tilt = tilt_variance(now.covariance)
-            self._calibration.measure_attitude(now.T_map_body, now.mark.T_odom_body, tilt, now.R_body_cloud)
+            level = inverse(self._calibration.calibration.T_body_cloud)
+            T_before, T_now = before.T_map_cloud @ level, now.T_map_cloud @ level
+            step = self._calibration.measure_motion(T_before, T_now, step, expected[[3, 2]])
+            self._estimator.add(boxminus(T_now, T_before @ step), noise, driven, turned)
+        self._calibration.measure_attitude(now.T_map_cloud, now.mark.T_odom_body, tilt_variance(now.covariance))
         self._registered = now
 
 
-@dataclass(frozen=True)
-class _BufferedScan:
-    """A frame's points (N, 3), odometry frame, and the metres driven when it was seen."""
-
-    travelled: float
-    points: Points
-
-
 class ScanBuffer:
-    """Points of at most 40 frames, odometry frame, newest last."""
+    """Scans of at most 40 frames, newest last, levelled by the calibration when they are read."""
 
-    def __init__(self, config: TrackingConfig) -> None:
+    def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
         self._config = config
-        self._frames: deque[_BufferedScan] = deque(maxlen=MAX_FRAMES)
+        self._calibration = calibration
+        self._frames: deque[tuple[float, RawScan]] = deque(maxlen=MAX_FRAMES)  # metres driven, scan
 
-    def add(self, points: Points, travelled: float) -> None:
-        """Add a frame (N, 3), seen after ``travelled`` metres."""
-        self._frames.append(_BufferedScan(travelled, points))
+    def add(self, scan: RawScan, travelled: float) -> None:
+        """Add a frame, seen after ``travelled`` metres."""
+        self._frames.append((travelled, scan))
 
     def clear(self) -> None:
         """Forget them all."""
@@ -275,16 +266,16 @@ class ScanBuffer:
     @property
     def newest(self) -> Points | None:
         """(N, 3) points of the newest frame, odometry frame."""
-        return self._frames[-1].points if self._frames else None
+        return self._frames[-1][1].levelled(self._calibration.calibration.R_body_cloud) if self._frames else None
 
     def window(self) -> Points:
         """Points (N, 3) of the newest frames, as :class:`coview_stream.config.TrackingConfig` has it; perhaps none."""
         parts: list[Points] = []
-        count = 0
-        for frame in reversed(self._frames):
-            old = self._frames[-1].travelled - frame.travelled > self._config.window
+        count, R_body_cloud = 0, self._calibration.calibration.R_body_cloud
+        for travelled, scan in reversed(self._frames):
+            old = self._frames[-1][0] - travelled > self._config.window
             if count >= self._config.max_points or (old and count >= self._config.min_points):
                 break
-            parts.append(frame.points)
-            count += len(frame.points)
+            parts.append(scan.levelled(R_body_cloud))
+            count += len(parts[-1])
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)

@@ -44,6 +44,21 @@ class Estimate(NamedTuple):
     covariance: Floats
     """(6, 6) over (rx, ry, rz, x, y, z): a turn about the body, then a shift, along the map's axes."""
 
+    def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
+        """Squared Mahalanobis distance of a measurement from this estimate.
+
+        If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
+        22.5 by one in a thousand.
+
+        Args:
+            T_map_body: (4, 4) measured pose of the same keyframe.
+            covariance: of that measurement alone.
+        """
+        T = check_rigid(T_map_body, "T_map_body")
+        spread = check_covariance(covariance, "covariance")
+        gap: Floats = boxminus(T, self.T_map_body)
+        return float(gap @ np.linalg.solve(self.covariance + spread, gap))
+
 
 class _Gaussian(NamedTuple):
     """A pose and its covariance (6, 6) in the tangent of its own body."""
@@ -161,22 +176,6 @@ class PoseGraph:
         """Pose and covariance of the newest keyframe: the prediction after ``move``, corrected after ``correct``."""
         belief = self._belief()
         return Estimate(belief.T.copy(), along_map(belief.covariance, belief.T))
-
-    def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
-        """Squared Mahalanobis distance of a measurement from the present estimate; ask before ``correct``.
-
-        If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
-        22.5 by one in a thousand.
-
-        Args:
-            T_map_body: (4, 4) measured pose of the newest keyframe.
-            covariance: of that measurement alone.
-        """
-        T = check_rigid(T_map_body, "T_map_body")
-        spread = check_covariance(covariance, "covariance")
-        expected = self.estimate
-        gap: Floats = boxminus(T, expected.T_map_body)
-        return float(gap @ np.linalg.solve(expected.covariance + spread, gap))
 
     def _newest(self) -> _Keyframe:
         if not self._keyframes:

@@ -12,7 +12,8 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
-from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle, transform, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, transform, yaw_of
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.covariance import (
@@ -56,15 +57,13 @@ class Tracker:
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
         self.ground = GroundOffset()
-        self._graph = PoseGraph(config.graph)
+        self._graph = PoseGraph(config.graph)  # of clouds in the sensor's own axes: independent of the calibration
         self._calibration = calibration
-        self._R_body_cloud = np.eye(3)  # that the newest cloud has been levelled by
-        self._R_keyframe = np.eye(3)  # and that of the newest keyframe
         self._odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
         self._dispute = Dispute(self._matcher.place, config.tracking.distance)
         self._displacement = DisplacementCheck()
-        self._scans = ScanBuffer(config.tracking)
+        self._scans = ScanBuffer(config.tracking, calibration)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
         self._learned_at = -math.inf  # metres driven where what is usual here was learned last
@@ -83,19 +82,11 @@ class Tracker:
 
     # ---- scans
 
-    def add_scan(self, points: Points, T_odom_body: Pose) -> None:
-        """Add a frame's points (N, 3), one per voxel, odometry frame, levelled as is known now, and its odometry."""
-        self._odometry.add_pose(T_odom_body)
-        self._R_body_cloud = self._calibration.calibration.R_body_cloud
-        self._scans.add(points, self.travelled)
+    def add_scan(self, scan: RawScan) -> None:
+        """Add a frame: its points, one per voxel, and its odometry."""
+        self._odometry.add_pose(scan.T_odom_body)
+        self._scans.add(scan, self.travelled)
         self._unregistered += 1
-
-    def level_newest_scan(self, points: Points) -> None:
-        """Replace the newest frame's points by (N, 3) that are levelled as is known now; all others are dropped."""
-        self._R_body_cloud = self._calibration.calibration.R_body_cloud
-        if self._scans.newest is not None:  # no frame, where only later ones may verify the place
-            self._scans.clear()
-            self._scans.add(points, self.travelled)
 
     def forget_odometry(self) -> None:
         """Drop the scans and the newest odometry: what lost the place may be an odometry that jumped."""
@@ -159,23 +150,13 @@ class Tracker:
         covariance = propagate(own + _START, step) + drifted
         self._restart(registration.T_map_source @ T_odom_body, covariance, T_odom_body)
 
-    def start_levelled(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
-        """Begin again at the newest frame's first registration, once it is known how the sensor leans.
-
-        Args:
-            T_map_body: (4, 4) pose of that registration, of the levelled frame.
-            covariance: (6, 6) of it.
-            T_odom_body: (4, 4) odometry of the frame.
-        """
-        self._restart(T_map_body, covariance + _START, T_odom_body)
-
     def match_to_map(
         self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False
     ) -> MapMatch:
         """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
         Args:
-            cloud: (N, 3) the newest frame, body frame, which has been added.
+            cloud: (N, 3) the newest frame, which has been added, in the sensor's own axes.
             T_odom_body: (4, 4) its odometry.
             standing_still: by its odometry the robot stands still: use only frames since the last registration, and
                 believe the odometry a little less; standing and looking again and again must not add up to certainty.
@@ -196,12 +177,12 @@ class Tracker:
         if seen < _MIN_POINTS:
             verdict = MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register")
             return MapMatch.without_registration(verdict, belief)
-        scan = ObservedScan.of(points, cloud, T_odom_body)
-        match = self._matcher.match(scan, belief, target, self.config.registration.track, self._graph)
+        scan = ObservedScan.of(points, self._calibration.calibration.level(cloud), T_odom_body)
+        match = self._matcher.match(scan, belief, target, self.config.registration.track, belief)
         limit, tries = self.config.acceptance.max_innovation, [match]
         if newest_only or not match.verdict.verified or match.innovation > limit:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
-            tries = self._matcher.match_widely(match, scan, wider, target, self._graph)
+            tries = self._matcher.match_widely(match, scan, wider, target, belief)
             match = max(tries, key=_rank)
         if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
             return self._against_odometry(match, belief, scan, tries)
@@ -214,13 +195,14 @@ class Tracker:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as it has done before; go on where the lidar says
-            self._odometry.learn_once_confirmed(match.T_map_body, match.covariance, self._R_body_cloud)
+            self._odometry.learn_once_confirmed(self._of_cloud(match.T_map_body), match.covariance)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
             self._dispute.clear()
-            self._graph.correct(match.T_map_body, match.covariance)
+            self._graph.correct(self._of_cloud(match.T_map_body), match.covariance)
             self._set_belief(T_odom_body)
             self._learn(match, T_odom_body[:3, 3])
+            self._set_belief(T_odom_body)
             return
         self._scans.clear()  # bad frames among the newest must not spoil the next registration too
 
@@ -229,7 +211,7 @@ class Tracker:
         last = self._odometry.pose
         if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
-        belief = self._graph.estimate
+        belief = self._belief()
         here = self.T_map_odom @ last
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
         return np.asarray(carried + self.drift.covariance(*self._odometry.since_keyframe()))
@@ -289,9 +271,8 @@ class Tracker:
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
         self._dispute.clear()
-        self._graph.start(T_map_body, covariance)
+        self._graph.start(self._of_cloud(T_map_body), covariance)
         self._odometry.set_keyframe(T_odom_body)
-        self._R_keyframe = self._R_body_cloud
         self._set_belief(T_odom_body)
 
     def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
@@ -299,16 +280,24 @@ class Tracker:
         driven, turned = self._odometry.since_keyframe()
         spread = self.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self._odometry.motion(T_odom_body)
-        step = self._graph.estimate.T_map_body[:3, :3] @ motion[:3, 3]
-        spread += self._calibration.motion_covariance(step)
-        spread[:2, :2] += np.eye(2) * rotation_angle(self._R_keyframe.T @ self._R_body_cloud) ** 2
-        self._R_keyframe = self._R_body_cloud
-        self._graph.move(motion, spread)
+        spread += self._calibration.motion_covariance(self._belief().T_map_body[:3, :3] @ motion[:3, 3])
+        level = self._calibration.calibration.T_body_cloud
+        self._graph.move(inverse(level) @ motion @ level, spread)
         self._odometry.set_keyframe(T_odom_body)
-        return self._graph.estimate
+        return self._belief()
+
+    def _belief(self) -> Estimate:
+        """Return the newest keyframe's pose, of the body by the present calibration; its covariance is the cloud's."""
+        of_cloud = self._graph.estimate
+        level = inverse(self._calibration.calibration.T_body_cloud)
+        return Estimate(of_cloud.T_map_body @ level, of_cloud.covariance)
+
+    def _of_cloud(self, T_map_body: Pose) -> Pose:
+        """Return the pose (4, 4) of the cloud in the sensor's own axes."""
+        return T_map_body @ self._calibration.calibration.T_body_cloud
 
     def _set_belief(self, T_odom_body: Pose) -> None:
-        self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)
+        self.T_map_odom = self._belief().T_map_body @ inverse(T_odom_body)
 
     def _learn(self, match: MapMatch, position: Floats) -> None:
         """Learn from a verified registration: odometry's drift, what is usual here, what errors repeat."""
@@ -322,9 +311,9 @@ class Tracker:
             self._learned_at = self.travelled
             self._matcher.place.learn(seen)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
-        self._odometry.learn(match.T_map_body, match.covariance, self._R_body_cloud)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
+        self._odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
 
 
 def _rank(match: MapMatch) -> tuple[bool, float]:

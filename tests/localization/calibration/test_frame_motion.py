@@ -10,7 +10,7 @@ from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.frame_motion import FrameMotion, surface_points
-from coview_stream.localization.calibration.odometry_correction import OdometryCorrection
+from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.tracking.motion import Drift
 
 DRIFT = Drift.of(TrackingConfig()).variances

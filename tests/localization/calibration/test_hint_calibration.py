@@ -63,7 +63,7 @@ def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
 
 def test_what_is_known_better_here_stays_group_by_group(world_map):
     localizer = Localizer(world_map)
-    estimator = localizer._frames.correction.estimator
+    estimator = localizer._frames.estimator
     estimator.restore(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
     localizer.hint_calibration(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001))
     assert localizer.calibration.pitch == pytest.approx(0.03, abs=0.002)
@@ -86,7 +86,7 @@ def test_what_a_leader_supposed_ends_with_it():
     before = estimator.calibration
     T = np.eye(4)
     T[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
-    estimator.suppose_attitude(T, np.eye(4), np.radians(0.3) ** 2, np.eye(3), 0.7)
+    estimator.suppose_attitude(T, np.eye(4), np.radians(0.3) ** 2, 0.7)
     assert abs(np.degrees(estimator.calibration.pitch)) > 1.0
     estimator.forget_leader()
     assert estimator.calibration == before
@@ -109,5 +109,5 @@ def test_leaders_that_alternate_do_not_begin_the_search_anew_at_every_frame(worl
         localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.1 * k)
         epochs.add(localizer._epoch)
         T = leaning if k % 2 else straight
-        localizer._frames.correction.estimator.suppose_attitude(T, np.eye(4), 1e-5, np.eye(3), 0.9)
+        localizer._frames.estimator.suppose_attitude(T, np.eye(4), 1e-5, 0.9)
     assert len(epochs) <= 2

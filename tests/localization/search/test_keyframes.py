@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z, transform
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search import keyframes
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -24,7 +25,11 @@ def cloud(seed, count=200):
 
 
 def add(buffer, points, T_odom_body, stamp):
-    return buffer.add(voxelized(points, T_odom_body, buffer.config), T_odom_body, stamp)
+    return buffer.add(RawScan(voxelized(points, T_odom_body, buffer.config), T_odom_body), stamp)
+
+
+def points_of(keyframe):
+    return keyframe.scan.levelled(np.eye(3))
 
 
 def test_keyframe_every_configured_distance():
@@ -38,7 +43,7 @@ def test_keyframe_points_are_in_the_odometry_frame():
     buffer = KeyframeBuffer(CONFIG)
     corner = np.array([[3.0, 1.0, 0.5]] * 3, np.float32)
     keyframe = add(buffer, corner, at(10.0, np.pi / 2), 0.0)
-    np.testing.assert_allclose(keyframe.points, [[9.0, 3.0, 2.0]], atol=1e-5)
+    np.testing.assert_allclose(points_of(keyframe), [[9.0, 3.0, 2.0]], atol=1e-5)
     np.testing.assert_allclose(keyframe.position, [10.0, 0.0, 1.5])
 
 
@@ -48,9 +53,9 @@ def test_points_between_keyframes_go_into_the_next_one():
     assert add(buffer, np.array([[5.0, 5, 5]], np.float32), at(1.0), 0.1) is None
     waiting = buffer.recent(1)
     keyframe = add(buffer, np.array([[-5.0, 5, 5]], np.float32), at(2.5), 0.2)
-    for points in (keyframe.points, waiting):
+    for points in (points_of(keyframe), waiting):
         assert np.abs(points - [6.0, 5.0, 6.5]).sum(axis=1).min() < 1e-4
-    assert len(keyframe.points) == 2
+    assert len(points_of(keyframe)) == 2
 
 
 def test_keyframe_buffer_keeps_its_capacity():
@@ -58,13 +63,13 @@ def test_keyframe_buffer_keeps_its_capacity():
     for k in range(9):
         add(buffer, cloud(k), at(2.0 * k), float(k))
     assert [k.stamp for k in buffer.keyframes] == [5.0, 6.0, 7.0, 8.0]
-    assert len(buffer.recent(2)) == sum(len(k.points) for k in list(buffer.keyframes)[-2:])
+    assert len(buffer.recent(2)) == sum(len(points_of(k)) for k in list(buffer.keyframes)[-2:])
 
 
 def test_returns_below_min_range_are_dropped():
     buffer = KeyframeBuffer(KeyframeConfig(range_min=1.0))
     keyframe = add(buffer, np.array([[0.3, 0, 0], [3, 0, 0]], np.float32), at(0.0), 0.0)
-    np.testing.assert_allclose(keyframe.points, [[3, 0, 1.5]], atol=1e-6)
+    np.testing.assert_allclose(points_of(keyframe), [[3, 0, 1.5]], atol=1e-6)
 
 
 def test_standing_still_uses_bounded_memory(monkeypatch):
@@ -81,7 +86,7 @@ def test_virtual_scan_gathers_points_around_keyframe():
         add(buffer, cloud(k), at(5.0 * k), float(k))
     centre = np.array([15.0, 0.0, 1.5])
     scan = buffer.virtual_scan(centre, 8.0, 0.5)
-    everything = np.concatenate([k.points for k in buffer.keyframes])
+    everything = np.concatenate([points_of(k) for k in buffer.keyframes])
     near = everything[np.hypot(*(everything[:, :2] - centre[:2]).T) < 8.0]
     voxels = np.unique(np.floor(near / 0.5), axis=0)
     assert len(scan) == len(voxels)
@@ -94,7 +99,7 @@ def test_virtual_scan_is_of_the_newest_keyframes_in_parts():
     centre, kept = np.zeros(3), []
     for k in range(9):
         corner = np.array([[0.125, 0.125 + 2.0 * k, 0.125 + k % 2]], np.float32)
-        buffer.add(corner, at(2.0 * k), float(k))
+        buffer.add(RawScan(corner, at(2.0 * k)), float(k))
         kept.append({int(y // 2) for y in buffer.virtual_scan(centre, 99.0, 0.25)[:, 1]})
     assert kept[:6] == [set(range(k + 1)) for k in range(6)]
     assert kept[6:] == [{2, 3, 4, 5, 6}, {2, 3, 4, 5, 6, 7}, {4, 5, 6, 7, 8}]
@@ -103,8 +108,8 @@ def test_virtual_scan_is_of_the_newest_keyframes_in_parts():
 def test_points_beyond_reach_are_dropped():
     buffer = KeyframeBuffer(CONFIG, reach=10.0)
     behind = np.array([[-8.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
-    buffer.add(behind, at(0.0), 0.0)
-    buffer.add(np.array([[6.0, 0.0, 0.0]], np.float32), at(5.0), 1.0)
+    buffer.add(RawScan(behind, at(0.0)), 0.0)
+    buffer.add(RawScan(np.array([[6.0, 0.0, 0.0]], np.float32), at(5.0)), 1.0)
     scan = buffer.virtual_scan(np.array([5.0, 0.0, 1.5]), 99.0, 0.25)
     np.testing.assert_array_equal(np.sort(scan[:, 0]), [1.0, 6.0])
     np.testing.assert_array_equal(buffer.recent(2), [*behind, [6.0, 0.0, 0.0]])
@@ -113,7 +118,7 @@ def test_points_beyond_reach_are_dropped():
 def test_first_point_of_a_voxel_stays():
     buffer = KeyframeBuffer(KeyframeConfig(capacity=30), reach=50.0)
     for k in range(4):
-        buffer.add(np.array([[5.0 + 0.01 * k, 1.0, 0.5]], np.float32), at(2.0 * k), float(k))
+        buffer.add(RawScan(np.array([[5.0 + 0.01 * k, 1.0, 0.5]], np.float32), at(2.0 * k)), float(k))
     np.testing.assert_array_equal(buffer.virtual_scan(np.zeros(3), 50.0, 0.5), np.float32([[5.0, 1.0, 0.5]]))
 
 
@@ -127,34 +132,31 @@ def test_clear_drops_all_keyframes():
     assert add(buffer, cloud(2), at(1.0), 0.2) is not None
 
 
-def test_each_keyframe_is_levelled_from_what_it_was_levelled_by_before():
-    """Whatever was known when a frame was taken: levelled anew, all lie as if it had been known from the beginning."""
-    known = [exp_so3(np.radians([0.0, pitch, 0.0])) for pitch in (0.0, 1.2, 2.6)]
+def test_keyframes_are_levelled_by_the_newest_calibration():
+    """Whatever was known when a frame was taken: read again, all lie as if it had been known from the beginning."""
+    known = [exp_so3(np.radians([0.0, pitch, 0.0])) for pitch in (0.0, 0.7, 2.6)]
     leaning, straight = (KeyframeBuffer(KeyframeConfig(distance=1.0)) for _ in range(2))
+    began_anew = []
     for k, R in enumerate(known):
-        T, points = at(1.5 * k, 0.3 * k), cloud(k, 300)
+        T, ahead, points = at(1.5 * k, 0.3 * k), at(1.5 * k + 0.4, 0.3 * k), cloud(k, 300)
         for buffer, level in ((leaning, R), (straight, known[-1])):
-            seen = transform(T, (points @ level.T).astype(np.float32))
-            assert buffer.add(seen, T, float(k), level) is not None
-            assert buffer.add(seen[:50], at(1.5 * k + 0.4, 0.3 * k), k + 0.5, level) is None
-    assert leaning.lean(known[-1]) == pytest.approx(np.radians(2.6), abs=1e-6)
-    leaning.level(known[-1])
-    assert leaning.lean(known[-1]) == pytest.approx(0.0, abs=1e-6)
-    for a, b in zip(leaning.keyframes, straight.keyframes, strict=True):
-        apart = cKDTree(b.points).query(a.points)[0]
-        assert np.median(apart) < 0.01, a.stamp
+            scans = [RawScan(transform(T, (points @ level.T).astype(np.float32)), T, level) for T in (T, ahead)]
+            began_anew.append(buffer.add(scans[0], float(k), level).begins_anew)
+            assert buffer.add(scans[1], k + 0.5, level) is None
+    assert began_anew == [False] * 4 + [True, False]
+    apart = cKDTree(straight.recent(3)).query(leaning.recent(3))[0]
+    assert np.median(apart) < 0.01
+    everything = [buffer.virtual_scan(np.zeros(3), 99.0, 0.25) for buffer in (leaning, straight)]
+    assert np.median(cKDTree(everything[1]).query(everything[0])[0]) < 0.01
     assert len(leaning.recent(1)) == pytest.approx(len(straight.recent(1)), rel=0.1)
 
 
-def test_buffer_without_keyframes_does_not_lean():
-    buffer = KeyframeBuffer(KeyframeConfig())
-    assert buffer.lean(exp_so3(np.array([0.1, 0.0, 0.0]))) == 0.0
-
-
-def test_keyframe_may_be_completed_where_the_last_one_was():
+def test_standing_robot_begins_its_search_anew_once_at_most():
+    """However the calibration goes back and forth: from the same position nothing new is seen."""
     buffer = KeyframeBuffer(CONFIG)
-    assert buffer.add(cloud(0), at(0.0), 0.0) is not None
-    assert buffer.add(cloud(1), at(0.1), 0.1) is None
-    made = buffer.add(cloud(2), at(0.2), 0.2, complete=True)
-    assert made is not None
-    assert len(made.points) > len(cloud(2))  # of both frames since
+    anew = [
+        keyframe.begins_anew
+        for k in range(20)
+        if (keyframe := buffer.add(RawScan(cloud(0), at(0.0)), float(k), exp_so3(np.array([0.1 * (k % 2), 0.0, 0.0]))))
+    ]
+    assert anew == [False, True]

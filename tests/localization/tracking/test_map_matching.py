@@ -18,7 +18,7 @@ from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking import map_matching
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import RejectionReason
-from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
+from coview_stream.localization.tracking.pose_graph import Estimate
 
 CONFIG = LocalizerConfig()
 T_MAP_ODOM = pose_from(rot_z(-1.1), [3.0, 8.0, 0.5])
@@ -39,11 +39,9 @@ def scan_of(cloud, truth) -> ObservedScan:
 
 def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
     """Match from a belief, which is what the graph predicts unless that is given too."""
-    pose_graph = PoseGraph(CONFIG.graph)
-    pose_graph.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, pose_graph)
+    return MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, graph or belief)
 
 
 def off(found, truth):
@@ -130,12 +128,10 @@ def assert_no_hold(found, truth):
 def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
-    pose_graph = PoseGraph(CONFIG.graph)
     belief = Estimate(boxplus(truth, edge), TIGHT)
-    pose_graph.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, pose_graph)
+    found = MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, belief)
     assert found.verdict.cause is RejectionReason.OFF_MAP
 
 
@@ -144,12 +140,11 @@ def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
 
 def held(world_map, scan, belief):
     """The matches from a belief that may be metres off, the first with it as it is."""
-    pose_graph, matcher = PoseGraph(CONFIG.graph), MapMatcher(world_map, CONFIG)
-    pose_graph.start(*belief)
+    matcher = MapMatcher(world_map, CONFIG)
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
-    first = matcher.match(scan, belief, target, CONFIG.registration.track, pose_graph)
+    first = matcher.match(scan, belief, target, CONFIG.registration.track, belief)
     wider = Estimate(belief.T_map_body, belief.covariance + np.diag([0.01, 0.01, 0.1, 1.0, 1.0, 0.3]) ** 2)
-    return matcher.match_widely(first, scan, wider, target, pose_graph)
+    return matcher.match_widely(first, scan, wider, target, belief)
 
 
 def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_map, world_drive, scan):

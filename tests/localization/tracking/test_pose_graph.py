@@ -78,8 +78,8 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
     T, covariance = graph.estimate
     gap = np.array([0.01, 0.0, -0.02, 0.3, -0.2, 0.1])
     expected = gap @ np.linalg.solve(covariance + REGISTRATION, gap)
-    assert graph.innovation(boxplus(T, gap), REGISTRATION) == pytest.approx(expected, rel=1e-6)
-    assert graph.innovation(T, REGISTRATION) == pytest.approx(0.0, abs=1e-9)
+    assert graph.estimate.innovation(boxplus(T, gap), REGISTRATION) == pytest.approx(expected, rel=1e-6)
+    assert graph.estimate.innovation(T, REGISTRATION) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(graph.estimate.T_map_body, T)
 
 
@@ -91,7 +91,7 @@ def test_innovations_are_chi_square_with_true_covariances():
     for step, seen in zip(way.steps, way.seen[1:], strict=True):
         graph.move(step, ODOMETRY)
         if seen is not None:
-            found.append(graph.innovation(seen, REGISTRATION))
+            found.append(graph.estimate.innovation(seen, REGISTRATION))
             graph.correct(seen, REGISTRATION)
     assert np.mean(found) == pytest.approx(6.0, rel=0.15)
 
@@ -137,7 +137,7 @@ def test_empty_graph_raises(graph):
         ask,
         lambda: graph.move(STEP, ODOMETRY),
         lambda: graph.correct(START, REGISTRATION),
-        lambda: graph.innovation(START, REGISTRATION),
+        lambda: graph.estimate.innovation(START, REGISTRATION),
     ):
         with pytest.raises(RuntimeError, match="call start first"):
             call()

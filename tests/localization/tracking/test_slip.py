@@ -11,6 +11,7 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
+from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
 AWAY = pose_from(rot_z(np.radians(4.0)), [1.2, -0.5, 0.0])
@@ -129,7 +130,7 @@ def test_doubt_that_makes_the_belief_wide_lets_no_such_registration_in(world_map
     ride = on_the_way(world_map, slow_drive)
     ride.slips(pose_from(np.eye(3), [0.9, -0.6, 0.1]), truth[7])
     refused(ride, clouds[8], truth[8])
-    monkeypatch.setattr(ride.tracker._graph, "innovation", lambda *_: 1.0)
+    monkeypatch.setattr(Estimate, "innovation", lambda *_: 1.0)
     assert refused(ride, clouds[9], truth[9], newest_only=True).cause is RejectionReason.ODOMETRY
     monkeypatch.setattr(Dispute, "settle", lambda *_: truth[10])
     assert ride.update(clouds[10], truth[10], newest_only=True).cause is RejectionReason.ODOMETRY

@@ -13,6 +13,7 @@ from trackers import OFF, Ride, add_frame, garbage, match_and_update, on_the_way
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import inverse, pose_from
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.covariance import registration_covariance
 from coview_stream.localization.tracking.monitor import RejectionReason
 
@@ -56,7 +57,7 @@ def test_protection_level_grows_with_the_metres_driven_and_with_evidence_that_fa
     T_odom_body = ride.odometry(truth)
     T_odom_body[:3, 3] += (5.0, 0.0, 0.0)
     before = tracker.protection_level()
-    tracker.add_scan(cloud, T_odom_body)
+    tracker.add_scan(RawScan(cloud, T_odom_body))
     assert tracker.protection_level().metres > before.metres
 
 

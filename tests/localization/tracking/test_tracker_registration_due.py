@@ -8,6 +8,7 @@ from trackers import Ride, add_frame, match_and_update, registration, tracker_of
 
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
@@ -21,7 +22,7 @@ def steps_until_due(world_map, poses, patience=1.0, **settings):
     """How many of the poses it takes after the first; a registration is never due at the first."""
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(**{**GOOD, **settings})))
     for k, T in enumerate(poses):
-        tracker.add_scan(NOTHING, T)
+        tracker.add_scan(RawScan(NOTHING, T))
         if tracker.needs_registration(patience):
             return k
     return None
@@ -109,7 +110,7 @@ def test_scan_buffer_window_adapts_to_point_count(world_map):
         tracker = tracker_of(world_map, config)
         for k in range(8):
             T = pose_from(np.eye(3), [0.5 * k, 0, 0])
-            tracker.add_scan(np.full((points, 3), k, np.float32), T)
+            tracker.add_scan(RawScan(np.full((points, 3), k, np.float32), T))
         return sorted({int(k) for k in tracker._scans.window()[:, 0]})
 
     assert window(1000, window=2.0) == [3, 4, 5, 6, 7]
@@ -123,7 +124,7 @@ def test_scan_buffer_drops_old_frames(world_map):
     """A robot that never gets its points together, on a robot that runs for weeks."""
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(min_points=10**6)))
     for k in range(300):
-        tracker.add_scan(np.zeros((10, 3), np.float32), pose_from(np.eye(3), [0.01 * k, 0, 0]))
+        tracker.add_scan(RawScan(np.zeros((10, 3), np.float32), pose_from(np.eye(3), [0.01 * k, 0, 0])))
     assert len(tracker._scans.window()) <= 400
 
 
@@ -144,7 +145,7 @@ def started(world_map):
 
     def covariance(*poses):
         for T in poses:
-            tracker.add_scan(NOTHING, T)
+            tracker.add_scan(RawScan(NOTHING, T))
         return tracker.predicted_covariance()
 
     covariance(np.eye(4))
@@ -178,7 +179,7 @@ def test_late_fix_has_larger_covariance(world_map):
     for found_at in (3.0, 0.0):
         tracker = tracker_of(world_map)
         for x in (0.0, 3.0):
-            tracker.add_scan(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0]))
+            tracker.add_scan(RawScan(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0])))
         tracker.start(registration(np.eye(4)), pose_from(np.eye(3), [3.0, 0.0, 0.0]), found_at)
         sigmas.append(np.diag(tracker.predicted_covariance()))
     expected = tracker.drift.variances(3.0, 0.0)
@@ -226,7 +227,7 @@ def ridden(world_map, drive, scale):
 
 def metres_until_due(tracker, T):
     for k in range(1, 200):
-        tracker.add_scan(NOTHING, T @ pose_from(np.eye(3), [0.01 * k, 0.0, 0.0]))
+        tracker.add_scan(RawScan(NOTHING, T @ pose_from(np.eye(3), [0.01 * k, 0.0, 0.0])))
         if tracker.needs_registration():
             return 0.01 * k
     raise AssertionError("nothing is due after two metres")
@@ -244,10 +245,10 @@ def test_noisy_odometry_is_estimated_and_registered_more_often(world_map, slow_d
     grown = []
     for tracker, T in (good, bad):
         before = tracker.predicted_covariance()[3:5, 3:5].trace()
-        tracker.add_scan(NOTHING, T @ ahead)
+        tracker.add_scan(RawScan(NOTHING, T @ ahead))
         grown.append(tracker.predicted_covariance()[3:5, 3:5].trace() - before)
     assert grown[1] > 2.0 * grown[0]
     for tracker, T in (good, bad):
-        tracker.add_scan(NOTHING, T)
+        tracker.add_scan(RawScan(NOTHING, T))
         match_and_update(tracker, slow_drive.clouds[-1], T)
     assert metres_until_due(*bad) < 0.8 * metres_until_due(*good)
