@@ -182,7 +182,9 @@ def test_place_that_led_is_one_hint_beside_the_others():
     hints = PoseHints()
     hints.odometry_continues(pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), np.array([100.0, 0.0, 0.0]))
     for x in (1.0, 2.0):
-        hints.place_led(pose_from(rot_z(0.1), [x, 0.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+        hints.place_leads(pose_from(rot_z(0.1), [x, 0.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+    assert len(hints.about(np.array([100.0, 0.0, 0.0]), np.eye(4))) == 1  # until the search begins anew
+    hints.search_begins_anew()
     continued, led = hints.about(np.array([100.0, 0.0, 0.0]), np.eye(4))
     np.testing.assert_allclose(continued, pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), atol=1e-9)
     np.testing.assert_allclose(led, pose_from(rot_z(0.1), [2.0, 0.0, 0.0]), atol=1e-9)
