@@ -49,7 +49,7 @@ def world_map(map_cloud_file):
 @pytest.fixture(scope="session")
 def learned_map(world_map):
     """The same with features of the network in the package, untested for accuracy."""
-    from coview_stream.descriptors.feature_build import feature_arrays
+    from coview_stream.descriptors.feature_map import feature_arrays
 
     arrays, parameters = feature_arrays(np.array(world_map.points))
     return BaseMap({**world_map._arrays, **arrays}, {**world_map.parameters, "learned": parameters})

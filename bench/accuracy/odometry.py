@@ -20,8 +20,7 @@ from coview_stream.clouds import read_tum
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CloudError, InputError
 from coview_stream.geometry.transforms import Poses, inverse, log_so3
-from coview_stream.odometry.kiss_icp import KissRegistration
-from coview_stream.odometry.lidar_odometry import LidarOdometry
+from coview_stream.odometry.lidar_odometry import KissRegistration, LidarOdometry
 from coview_stream.recordings.lidar_runs import open_bare_run
 from coview_stream.recordings.run import Run
 

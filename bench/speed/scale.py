@@ -33,7 +33,7 @@ from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.station_consensus import StationConsensus

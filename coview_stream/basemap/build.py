@@ -81,7 +81,7 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
 
     learned: tuple[Arrays, dict[str, Any] | None] = ({}, None)
     if config.learned:
-        from coview_stream.descriptors.feature_build import feature_arrays
+        from coview_stream.descriptors.feature_map import feature_arrays
 
         with _progress_bar(progress, "learned features") as step:
             learned = feature_arrays(points, step)

@@ -15,12 +15,13 @@ lever arm [t]x R, would belong to turning about the map's origin.)
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.arrays import Floats, Reals
+from coview_stream.geometry.arrays import Bools, Floats, Reals
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -280,3 +281,64 @@ def adjoint(T: Pose) -> Floats:
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
     Ad[3:, :3] = skew(T[:3, 3]) @ T[:3, :3]
     return Ad
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Circle in a horizontal plane.
+
+    Attributes:
+        x, y: its centre, metres.
+        radius: metres.
+        begin, end: of x, beyond which it holds nothing.
+    """
+
+    x: float
+    y: float
+    radius: float
+    begin: float = -math.inf
+    end: float = math.inf
+
+    def holds(self, positions: Reals) -> Bools:
+        """Tell which of positions (N, 2 or 3) lie within it, heights left out of account."""
+        x = positions[:, 0]
+        away = np.asarray(positions[:, :2], dtype=np.float64) - (self.x, self.y)
+        return np.asarray(((away * away).sum(axis=1) <= self.radius**2) & (x >= self.begin) & (x < self.end))
+
+
+def position_of(T: Pose) -> Floats:
+    """Return the position (3,) of a pose, metres; a copy."""
+    return np.array(T[:3, 3], dtype=np.float64)
+
+
+def quaternion_of(T: Pose) -> Floats:
+    """Return the unit quaternion (4,) x y z w of a pose."""
+    return matrix_to_quat(T[:3, :3])
+
+
+def stddev_of(covariance: Floats) -> Floats:
+    """Return one sigma (6,) of x, y, z, roll, pitch, yaw, metres and radians; NaN where a variance is not known."""
+    return np.asarray(np.sqrt(np.diag(covariance)))
+
+
+def pose_fields(T: Pose, covariance: Floats | None) -> dict[str, Any]:
+    """Return a pose as plain data: position, orientation (quaternion) and covariance in rows, None where not known."""
+    known = covariance is not None and not np.isnan(covariance).any()
+    return {
+        "position": position_of(T).tolist(),
+        "orientation": quaternion_of(T).tolist(),
+        "covariance": np.ravel(covariance).tolist() if known and covariance is not None else None,
+    }
+
+
+def place_fields(T: Pose) -> dict[str, Any]:
+    """Return a pose as plain data: position and orientation (quaternion)."""
+    return {"position": position_of(T).tolist(), "orientation": quaternion_of(T).tolist()}
+
+
+def pose_in_words(T: Pose, covariance: Floats | None) -> str:
+    """Return a pose in half a line: ``x 12.30, y 4.00, z 1.70 m, yaw 12.3 deg, sigma 0.02 m``."""
+    x, y, z = T[:3, 3].tolist()
+    sigma = math.nan if covariance is None else math.sqrt(abs(float(np.trace(covariance[:3, :3]))))
+    spread = "" if math.isnan(sigma) else f", sigma {sigma:.2g} m"
+    return f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, yaw {math.degrees(yaw_of(T)):.1f} deg{spread}"

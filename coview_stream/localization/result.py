@@ -7,9 +7,16 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, position_of, quaternion_of, stddev_of
 from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Pose, yaw_of
+from coview_stream.geometry.transforms import (
+    Pose,
+    pose_fields,
+    pose_in_words,
+    position_of,
+    quaternion_of,
+    stddev_of,
+    yaw_of,
+)
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.evidence.words import one_in

@@ -12,9 +12,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from coview_stream.errors import MessageError
-from coview_stream.geometry.pose_numbers import place_fields
 from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Pose, place_fields
 from coview_stream.messages.types import (
     Encoded,
     HypothesesMessage,

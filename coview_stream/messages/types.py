@@ -10,16 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.pose_numbers import (
+from coview_stream.geometry.protection import ProtectionLevel
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
     place_fields,
     pose_fields,
     pose_in_words,
     position_of,
     quaternion_of,
     stddev_of,
+    yaw_of,
 )
-from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Points, Pose, yaw_of
 
 
 @dataclass(frozen=True)

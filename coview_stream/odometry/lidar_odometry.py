@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Protocol
 
 import numpy as np
 
 from coview_stream.config.odometry import LidarOdometryConfig, down
-from coview_stream.errors import CloudError, RunError
+from coview_stream.errors import CloudError, RunError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import (
     Points,
@@ -23,10 +24,58 @@ from coview_stream.geometry.transforms import (
 from coview_stream.geometry.validation import check_stamp, cloud_rows, finite_rows, to_array
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.odometry.gravity import Ground, find_ground, level_rotation
-from coview_stream.odometry.kiss_icp import KissRegistration, ScanRegistration
-from coview_stream.odometry.plumb import Surfaces
+from coview_stream.odometry.gravity import Ground, Surfaces, find_ground, level_rotation
 from coview_stream.odometry.tilt_filter import Since, TiltFilter, upright
+
+_NO_TIMES = np.zeros(0)
+
+
+class ScanRegistration(Protocol):
+    """Registration of frames to a local map that grows with them."""
+
+    def register(self, points: Floats, guess: Pose) -> Pose:
+        """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess near it; add the frame."""
+        ...
+
+    def clear(self) -> None:
+        """Forget the local map; the next frame is placed where it is guessed to be."""
+        ...
+
+
+class KissRegistration:
+    """kiss-icp's point-to-point ICP against its voxel map, with its adaptive threshold."""
+
+    def __init__(self, config: LidarOdometryConfig) -> None:
+        self._kiss_icp, self._settings = _settings(config)
+        self.clear()
+
+    def register(self, points: Floats, guess: Pose) -> Pose:
+        """As of :class:`ScanRegistration`."""
+        icp = self._icp
+        # register_frame predicts by the last motion, for any time between: so the guess goes in as that motion
+        icp.last_delta = inverse(icp.last_pose) @ guess
+        icp.register_frame(points, _NO_TIMES)
+        return np.array(icp.last_pose, dtype=np.float64)
+
+    def clear(self) -> None:
+        """As of :class:`ScanRegistration`."""
+        self._icp = self._kiss_icp(self._settings)
+
+
+def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
+    """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
+    pipeline, configuration = (
+        require_library(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry") for module in ("kiss_icp", "config")
+    )
+    settings = configuration.KISSConfig()
+    settings.data.min_range, settings.data.max_range = config.min_range, config.max_range
+    settings.data.deskew = False
+    settings.mapping.voxel_size = config.voxel
+    settings.registration.max_num_threads = config.threads
+    settings.registration.convergence_criterion = config.convergence
+    settings.registration.max_num_iterations = config.iterations
+    return pipeline.KissICP, settings
+
 
 # set by hand, all of them
 _MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise and predicts nothing

@@ -40,7 +40,7 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import exp_so3
-from coview_stream.odometry.plumb import Plumb
+from coview_stream.odometry.gravity import Plumb
 
 # set by hand, all of them
 _DRIFT = 0.2  # of the local map in a frame, as a share of the frame's own error

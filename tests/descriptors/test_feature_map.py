@@ -7,12 +7,12 @@ import pytest
 from scipy import ndimage
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import (
     TILE,
     FeatureMap,
     dequantized,
     dequantized_sigma,
+    feature_arrays,
     quantized,
     quantized_sigma,
 )
@@ -84,7 +84,7 @@ def differing(one, other, name):
 def test_feature_windows_leave_no_seams(points, monkeypatch, encoder):
     """Many windows make of a map what one does: drawing and network see enough around each."""
     encode = network("aerial") if encoder == "aerial" else far_sighted
-    monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: encode)
+    monkeypatch.setattr("coview_stream.descriptors.feature_map.network", lambda *_: encode)
     one, many = (by_place(feature_arrays(points, window=window)[0]) for window in (256, 64))
     for name in one:  # a rare point lies so near a layer's bound that rounding puts it to either side
         assert differing(one, many, name) < 1e-3, name
@@ -93,10 +93,10 @@ def test_feature_windows_leave_no_seams(points, monkeypatch, encoder):
 @pytest.mark.slow
 def test_window_margin_is_needed(points, monkeypatch):
     """Or the test above could not fail."""
-    monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: far_sighted)
+    monkeypatch.setattr("coview_stream.descriptors.feature_map.network", lambda *_: far_sighted)
     whole = by_place(feature_arrays(points)[0])
     for margin, name in ((24, "learned.local"), (48, "learned.place")):
-        monkeypatch.setattr("coview_stream.descriptors.feature_build._NET_MARGIN", margin)
+        monkeypatch.setattr("coview_stream.descriptors.feature_map._NET_MARGIN", margin)
         assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
 
 

@@ -121,7 +121,7 @@ def test_kiss_icp_still_aborts_without_the_input_check():
 
 
 def test_settings_reach_kiss_icp():
-    from coview_stream.odometry.kiss_icp import KissRegistration
+    from coview_stream.odometry.lidar_odometry import KissRegistration
 
     icp = KissRegistration(LidarOdometryConfig(voxel=0.7, min_range=2.0, max_range=55.0, threads=2))._icp
     assert icp.config.mapping.voxel_size == 0.7

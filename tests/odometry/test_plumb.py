@@ -6,8 +6,7 @@ import numpy as np
 from fake_lidar_odometry import frame
 
 from coview_stream.geometry.transforms import rot_z
-from coview_stream.odometry.gravity import ground_plane, level_rotation
-from coview_stream.odometry.plumb import Surfaces
+from coview_stream.odometry.gravity import Surfaces, ground_plane, level_rotation
 
 
 def test_walls_and_ground_of_a_tilted_frame_point_up(scene):

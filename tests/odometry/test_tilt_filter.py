@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.odometry.plumb import Plumb
+from coview_stream.odometry.gravity import Plumb
 from coview_stream.odometry.tilt_filter import Since, TiltFilter, upright
 
 DEGREE = np.radians(1.0)

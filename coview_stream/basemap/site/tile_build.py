@@ -316,7 +316,7 @@ def _build(job: TileJob, store: TileStore) -> TileEntry | None:
         "stations": stations_layer(stations, config.block),
     }
     if config.learned:
-        from coview_stream.descriptors.feature_build import features_of_square
+        from coview_stream.descriptors.feature_map import features_of_square
 
         layers["features"] = features_of_square(
             (region + corner).astype(np.float32), np.rint(corner[:2]).astype(np.int64), round(job.grid.tile)

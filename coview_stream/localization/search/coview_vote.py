@@ -10,7 +10,7 @@ from coview_kernels import StationCodes
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.geometry.selection import argsmallest
+from coview_stream.geometry.rasters import argsmallest
 from coview_stream.localization.search.votes import Request
 
 _MIN_STATIONS = 2048  # whose shifts are looked at one by one: the best; set by hand

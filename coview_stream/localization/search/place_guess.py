@@ -13,8 +13,7 @@ import numpy as np
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config.checks import require
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.transforms import Pose, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import Circle, Pose, pose_from, rot_z, transform, yaw_of
 from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.localization.search.consensus import Hypothesis
 

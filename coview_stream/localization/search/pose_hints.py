@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import Circle, Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.place_guess import PlaceGuess
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle
+from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rotation_angle
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
 _SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift; set by hand

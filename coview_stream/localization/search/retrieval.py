@@ -15,7 +15,7 @@ from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.coview_vote import CoViewVote
 from coview_stream.localization.search.search_stations import SearchStations
 from coview_stream.localization.search.votes import ScoreVolume, TableVote, Vote

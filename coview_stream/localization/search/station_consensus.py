@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.coview_vote import CoViewVote
 from coview_stream.localization.search.retrieval import Retrieval

@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.geometry.selection import argsmallest
+from coview_stream.geometry.rasters import argsmallest
 
 ScoreVolume = Floats32
 """(M, S): one number for each station and shift."""

@@ -15,23 +15,22 @@ from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, inverse, transform, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
     swap_rotation_translation,
 )
-from coview_stream.localization.registration.ground_offset import GroundOffset
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.tracking.displacement_check import DisplacementCheck
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
-from coview_stream.localization.tracking.slip import Dispute, matters, off_by
+from coview_stream.localization.tracking.slip import DisplacementCheck, Dispute, matters, off_by
 
 _MIN_POINTS = 100  # to register; set by hand
 _STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand

@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.odometry.kiss_icp import KissRegistration, ScanRegistration
-from coview_stream.odometry.lidar_odometry import LidarOdometry
+from coview_stream.odometry.lidar_odometry import KissRegistration, LidarOdometry, ScanRegistration
 from coview_stream.stream.node.jobs import Job, OdometryJob, OdometryResult
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import exp_so3
-from coview_stream.localization.calibration.belief import mixed
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, mixed
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult

@@ -10,7 +10,7 @@ import pytest
 from made_up_places import REQUEST, RULE, candidate, judged, moved, place
 
 from coview_stream.config import AcceptanceConfig
-from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, decide
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.scoring import Rivals, Scored

@@ -8,7 +8,7 @@ from dense_consensus import dense_scores
 
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
-from coview_stream.geometry.selection import argsmallest
+from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
 from coview_stream.localization.search.smallest_distance import SmallestDistance

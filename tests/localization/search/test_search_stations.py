@@ -8,8 +8,7 @@ import pytest
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.transforms import pose_from
+from coview_stream.geometry.transforms import Circle, pose_from
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search import search_stations

@@ -9,8 +9,8 @@ from small_world import boxes, scan
 
 from coview_stream.geometry.transforms import boxplus, pose_from, rot_z, transform
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.tracking import displacement_check as module
-from coview_stream.localization.tracking.displacement_check import DisplacementCheck, share_on_map
+from coview_stream.localization.tracking import slip as module
+from coview_stream.localization.tracking.slip import DisplacementCheck, share_on_map
 
 T_MAP_ODOM = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
 ELSEWHERE = boxplus(T_MAP_ODOM, np.array([0.0, 0.0, 1.0, 4.3, -3.7, 0.0]))

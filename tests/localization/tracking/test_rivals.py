@@ -12,8 +12,8 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
+from coview_stream.localization.tracking.map_matching import _beside, find_rivals, rings
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
-from coview_stream.localization.tracking.rivals import _beside, find_rivals, rings
 from coview_stream.localization.tracking.slip import matters, off_by
 
 CONFIG = LocalizerConfig()

@@ -14,9 +14,8 @@ from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.selection import argsmallest
-from coview_stream.geometry.transforms import Points
+from coview_stream.geometry.rasters import argsmallest
+from coview_stream.geometry.transforms import Circle, Points
 from coview_stream.localization.search.consensus import yaw_of_shift
 from coview_stream.localization.search.learned.correlation import correlate_turned
 from coview_stream.localization.search.learned.feature_index import FeatureIndex

@@ -9,11 +9,9 @@ from scipy import ndimage
 
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, LearnedConfig
-from coview_stream.descriptors.feature_build import feature_arrays
-from coview_stream.descriptors.feature_map import TILE, FeatureMap
+from coview_stream.descriptors.feature_map import TILE, FeatureMap, feature_arrays
 from coview_stream.descriptors.network import Features
-from coview_stream.geometry.circle import Circle
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
+from coview_stream.geometry.transforms import Circle, inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.localization.search.learned.rasters import principal_axes
@@ -151,7 +149,7 @@ def pointwise(image):
 )
 def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
     """Drawing, features, correlation and stations mean the same by x, y and heading."""
-    monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: pointwise)
+    monkeypatch.setattr("coview_stream.descriptors.feature_map.network", lambda *_: pointwise)
     cloud, place, yaw = map_points.astype(np.float32), np.array([*xy, 0.0]), np.radians(degrees)
     axis = np.arange(-31.0, 32.0, 2.0)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.localization.registration.ground_offset import GroundOffset
+from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
