@@ -17,6 +17,7 @@ from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import Channel, KeyframeConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import Retrieval
@@ -36,9 +37,8 @@ def main(world: Path) -> dict[str, float]:
 
     found: dict[str, list[bool]] = {name: [] for name in settings.channels}
     for frame in open_run(world / "run"):
-        keyframe = keyframes.add(
-            voxelized(frame.points, frame.T_odom_body, keyframes.config), frame.T_odom_body, frame.stamp
-        )
+        points = voxelized(frame.points, frame.T_odom_body, keyframes.config)
+        keyframe = keyframes.add(RawScan(points, frame.T_odom_body), frame.stamp)
         if keyframe is None:
             continue
         scan = keyframes.virtual_scan(keyframe.position, settings.radius, settings.voxel)

@@ -19,6 +19,7 @@ from coview_stream.config import (
     RegistrationConfig,
 )
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of
+from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -60,7 +61,7 @@ def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM, epoch=FIRST_EPOCH):
     for k in range(frames):
         T = inverse(T_map_odom) @ world_drive.T_map_body[k]
         cloud = world_drive.clouds[k]
-        keyframe = buffer.add(voxelized(cloud, T, buffer.config), T, 0.5 * k)
+        keyframe = buffer.add(RawScan(voxelized(cloud, T, buffer.config), T), 0.5 * k)
         yield SearchRequest.of(buffer, keyframe, cloud, spec, epoch=epoch)
 
 
