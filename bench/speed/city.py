@@ -35,7 +35,7 @@ from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
 from coview_stream.config import ConsensusConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe
-from coview_stream.geometry.circle import Circle
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.search.retrieval import Retrieval
