@@ -52,7 +52,7 @@ def learned_map(world_map):
     from coview_stream.descriptors.feature_map import feature_arrays
 
     arrays, parameters = feature_arrays(np.array(world_map.points))
-    return BaseMap({**world_map._arrays, **arrays}, {**world_map.parameters, "learned": parameters})
+    return BaseMap({**world_map.arrays, **arrays}, {**world_map.parameters, "learned": parameters})
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +60,7 @@ def world_file(world_map, tmp_path_factory):
     """The same, saved; read only."""
     path = tmp_path_factory.mktemp("maps") / "site.coview"
     # a map of its own, for saving sets the hash
-    BaseMap(world_map._arrays, world_map.parameters).save(path)
+    BaseMap(world_map.arrays, world_map.parameters).save(path)
     return path
 
 

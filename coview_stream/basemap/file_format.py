@@ -298,6 +298,12 @@ def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
         release(array)
 
 
+def release_arrays(arrays: Arrays) -> None:
+    """Release the memory of arrays that are mapped from a file; pages that are used again are read again."""
+    for array in arrays.values():
+        release(array)
+
+
 def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[bytes | memoryview]]) -> str:
     """Hash parameters, and names, types, shapes and content of the arrays."""
     total = hashlib.sha256(parameters.encode())

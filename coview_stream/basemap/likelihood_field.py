@@ -112,6 +112,11 @@ def field_of(arrays: Arrays) -> FieldMap:
     return FieldMap(tiles, occupied, ground, edge, stored)
 
 
+def without_layers(arrays: Arrays) -> Arrays:
+    """Return a map's arrays without the rasters of :func:`layers_arrays`."""
+    return {name: values for name, values in arrays.items() if not name.startswith(LAYERS)}
+
+
 def _tiles(known: Bools) -> tuple[Ints, Ints]:
     """Return row and column (T, 2) of the tiles with any surveyed cell, and their number among all tiles (T,)."""
     down, across = known.shape[0] // TILE, known.shape[1] // TILE

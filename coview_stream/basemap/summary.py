@@ -13,6 +13,7 @@ import numpy as np
 
 from coview_kernels import Raster
 from coview_stream.basemap.map_parts import MapParts
+from coview_stream.basemap.tiles import unit_normals
 from coview_stream.clouds.reference_system import short_name
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, MessageError, require_library
@@ -75,28 +76,14 @@ class SummarizedMap(Protocol):
     sha256: str
     origin: Floats
     parameters: dict[str, Any]
-
-    @property
-    def points(self) -> Points:
-        """(N, 3) points, relative to ``origin``."""
-
-    @property
-    def stations(self) -> Points:
-        """(M, 3) ground positions, likewise."""
-
-    @property
-    def survey(self) -> Raster:
-        """Cells that hold points."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays."""
+    points: Points
+    stations: Points
+    survey: Raster
+    nbytes: int
+    arrays: dict[str, Any]
 
     def sampled_points(self, count: int) -> Points:
         """Return some of the points."""
-
-    def sampled_normals(self, count: int) -> Points:
-        """Return their normals."""
 
 
 def summary(base_map: SummarizedMap) -> MapSummary:
@@ -143,7 +130,9 @@ def _dense(density: float | None) -> str | None:
 
 def _upright(base_map: SummarizedMap) -> str | None:
     """Compare how many surfaces face each axis, and how far the points extend along it."""
-    facing = (np.abs(base_map.sampled_normals(_SAMPLED)) > _FACING).mean(axis=0)
+    packed = base_map.arrays["normals"]
+    normals = unit_normals(np.array(packed[:: max(1, -(-len(packed) // _SAMPLED))]))
+    facing = (np.abs(normals) > _FACING).mean(axis=0)
     wide = np.ptp(np.percentile(base_map.sampled_points(_SAMPLED), [1.0, 99.0], axis=0), axis=0)
     axis = int(np.argmax(facing[:2]))
     if facing[axis] > _FLAT_SHARE * facing[2] and wide[axis] < 0.5 * np.delete(wide, axis).min():

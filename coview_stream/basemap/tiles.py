@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
@@ -62,6 +64,12 @@ def crop(
     # compress: a boolean index of rows takes five times as long
     packed = np.concatenate([normals[stretch] for stretch in stretches]).compress(inside, axis=0)
     return near_points.compress(inside, axis=0), unit_normals(packed)
+
+
+def cut_points(arrays: Mapping[str, npt.NDArray[Any]], tile: float, cut: kernels.Cut) -> kernels.Crop | None:
+    """Cut the points around a place out of a map's arrays, sorted for searching; None where there are none."""
+    stretches = spans(arrays["tile_index"], tile, np.array([cut.x, cut.y]), cut.radius)
+    return kernels.crop_points(arrays["points"], arrays["normals"], stretches, cut)
 
 
 def unit_normals(packed: npt.NDArray[Any]) -> Points:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.file_format import release_arrays
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.localization.search.ambiguity import FARTHEST, Ambiguity
 from coview_stream.report.plots import (
@@ -77,9 +78,9 @@ def plot_ambiguity(found: Ambiguity, base_map: BaseMap, path: str | os.PathLike[
     Raises:
         InputError: the picture cannot be written.
     """
-    base_map.release()  # of what searching took
+    release_arrays(base_map.arrays)  # of what searching took
     base = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
-    base_map.release()
+    release_arrays(base_map.arrays)
     with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
         shift = draw_base_map(axes, base)
         at = found.position + base_map.origin - shift

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.basemap import BaseMap, station_descriptors
+from coview_stream.basemap.file_format import release_arrays
 from coview_stream.errors import InputError, naming_missing_libraries
 from coview_stream.geometry.arrays import Bools, Floats, Reals
 from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, RunResult
@@ -346,14 +347,14 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
     """
     no_position = np.full(3, np.nan)
     positions = np.array([no_position if f.T_map_body is None else f.T_map_body[:3, 3] for f in result.fixes])
-    base_map.release()  # of what searching took, before pictures take as much
+    release_arrays(base_map.arrays)  # of what searching took, before pictures take as much
     points = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
-    base_map.release()
+    release_arrays(base_map.arrays)
     states = [fix.state.reported for fix in result.fixes]
     plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth)
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:
         channel = next(iter(result.query))
-        station = base_map.descriptors_of(winner.station)[channel].astype(np.float32)
+        station = station_descriptors(base_map, winner.station)[channel].astype(np.float32)
         titles = (f"keyframe ({channel})", f"winning station {winner.station}")
         plot_descriptor_pair(result.query[channel], station, winner.shift, folder / DESCRIPTORS_PNG, titles)

@@ -95,8 +95,8 @@ def test_coarse_float32_coordinates_are_told(cut):
 def test_extent_area_and_density_are_those_of_the_points(from_array, cut):
     np.testing.assert_allclose(from_array.bounds, [cut.min(axis=0), cut.max(axis=0)], atol=0.3)
     assert from_array.bounds.dtype == np.float64
-    assert 300.0 <= from_array.area <= 441.0
-    assert from_array.density == pytest.approx(len(cut) / from_array.area)
+    assert 300.0 <= from_array.summary.area <= 441.0
+    assert from_array.summary.density == pytest.approx(len(cut) / from_array.summary.area)
     there = from_array.world_points()
     np.testing.assert_array_equal(there - from_array.origin, from_array.points.astype(np.float64))
 
@@ -151,7 +151,7 @@ def test_pickled_map_whose_file_is_another_is_refused(world_file, from_array, tm
     path = tmp_path / "site.coview"
     shutil.copy(world_file, path)
     data = pickle.dumps(BaseMap.load(path))
-    BaseMap(from_array._arrays, from_array.parameters).save(path)
+    BaseMap(from_array.arrays, from_array.parameters).save(path)
     with pytest.raises(MapError, match="another map than the one that was pickled"):
         pickle.loads(data)
     path.unlink()

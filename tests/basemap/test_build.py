@@ -187,7 +187,7 @@ def test_configuration_replaces_preset_and_options(cut, tmp_path):
 
 @pytest.mark.parametrize("name", ["origin", "stations", "points", "surveyed"])
 def test_map_with_missing_array_is_refused(whole, name):
-    arrays = {k: v for k, v in whole._arrays.items() if k != name}
+    arrays = {k: v for k, v in whole.arrays.items() if k != name}
     with pytest.raises(MapError, match=r"lacks.*build it again"):
         BaseMap(arrays, whole.parameters)
 
@@ -198,7 +198,7 @@ def with_option(whole, **option):
 
 
 def test_map_of_earlier_version_with_removed_options_loads(whole):
-    earlier = BaseMap(whole._arrays, with_option(whole, visibility="paper", eye=1.5))
+    earlier = BaseMap(whole.arrays, with_option(whole, visibility="paper", eye=1.5))
     assert earlier.config == whole.config
     assert earlier.parameters["config"]["descriptor"]["eye"] == 1.5  # the checksum is of what was written
 
@@ -208,7 +208,7 @@ def test_map_of_earlier_version_with_removed_options_loads(whole):
 )
 def test_map_made_with_removed_option_is_refused(whole, option):
     with pytest.raises(MapError, match=f"{next(iter(option))} is .*build it again"):
-        BaseMap(whole._arrays, with_option(whole, **option))
+        BaseMap(whole.arrays, with_option(whole, **option))
 
 
 @pytest.mark.parametrize(
@@ -223,6 +223,6 @@ def test_map_made_with_removed_option_is_refused(whole, option):
 )
 def test_invalid_map_parameters_are_refused(whole, damage):
     with pytest.raises(MapError, match="build it again"):
-        BaseMap(whole._arrays, whole.parameters | damage)
+        BaseMap(whole.arrays, whole.parameters | damage)
     with pytest.raises(CoViewError):
-        BaseMap(whole._arrays, {})
+        BaseMap(whole.arrays, {})

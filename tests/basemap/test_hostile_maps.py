@@ -24,7 +24,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[file_format.Arrays,
     np.save(path, np.concatenate([ground, wall]).astype(np.float32))
     built = BaseMap.build(path)
     # of a map as earlier versions made them, with descriptors
-    return built._arrays | {"descriptor.coview": built.descriptors("coview")}, built.parameters
+    return built.arrays | {"descriptor.coview": built.descriptors("coview")}, built.parameters
 
 
 def test_whole_map_is_loaded(small: Any, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_file_keeps_the_field_and_an_older_map_makes_its_own(world_map, tmp_path
     site = tmp_path / "site.coview"
     world_map.save(site)
     kept = BaseMap.load(site).field
-    older = {name: a for name, a in world_map._arrays.items() if not name.startswith("field.")}
+    older = {name: a for name, a in world_map.arrays.items() if not name.startswith("field.")}
     made = BaseMap(older, world_map.parameters).field
     for name in ("tiles", "occupied", "edge"):
         np.testing.assert_array_equal(getattr(kept, name), getattr(world_map.field, name))
@@ -80,7 +80,7 @@ def test_file_keeps_the_field_and_an_older_map_makes_its_own(world_map, tmp_path
 
 
 def test_field_of_other_shapes_is_refused(world_map):
-    arrays = world_map._arrays
+    arrays = world_map.arrays
     for name, damaged in (
         ("tiles", arrays["field.tiles"][:-1]),
         ("occupied", arrays["field.occupied"][:, :16]),

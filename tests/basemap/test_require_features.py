@@ -113,7 +113,7 @@ def test_missing_or_wrong_weights_disable_learned_features(learned_map, weights,
 
 
 def test_damaged_features_disable_learned_features(learned_map, weights):
-    arrays = {n: v for n, v in learned_map._arrays.items() if n != "learned.sigma"}
+    arrays = {n: v for n, v in learned_map.arrays.items() if n != "learned.sigma"}
     judged(BaseMap(arrays, learned_map.parameters), RELEARN)
 
 
@@ -140,7 +140,7 @@ def test_track_engine_loads_no_network(learned_map, weights):
 
 def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_path, monkeypatch, caplog):
     parameters = {**learned_map.parameters, "learned": {**learned_map.parameters["learned"], "weights": "0" * 64}}
-    BaseMap(learned_map._arrays, parameters).save(tmp_path / "old.coview")
+    BaseMap(learned_map.arrays, parameters).save(tmp_path / "old.coview")
     relocs = []
 
     class Recorded(serve.EngineProcess):
@@ -162,7 +162,7 @@ def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_pat
 
 def test_node_memory_counts_bounding_rectangle_of_features(learned_map, world_map):
     """Two tiles at the ends of a diagonal of 3 km."""
-    arrays = dict(learned_map._arrays)
+    arrays = dict(learned_map.arrays)
     arrays["learned.tiles"] = arrays["learned.tiles"].copy()
     arrays["learned.tiles"][-1] = arrays["learned.tiles"][0] + 100
     sparse = BaseMap(arrays, learned_map.parameters)

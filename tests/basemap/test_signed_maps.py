@@ -172,7 +172,7 @@ def test_verified_file_is_not_read_again_and_a_changed_one_is(path, key, monkeyp
 @pytest.fixture
 def signed_world(world_map, keys, tmp_path):
     target = tmp_path / "world.coview"
-    BaseMap(world_map._arrays, world_map.parameters).save(target, SigningKey(f"{keys[0]}.key"))
+    BaseMap(world_map.arrays, world_map.parameters).save(target, SigningKey(f"{keys[0]}.key"))
     return target
 
 
@@ -194,7 +194,7 @@ def test_engines_refuse_a_file_that_was_changed_after_the_node_verified_it(signe
 
 def test_engines_refuse_another_map_of_the_same_key(signed_world, key, keys, world_map):
     node = BaseMap.load(signed_world, verify_key=key)
-    other = BaseMap(world_map._arrays, world_map.parameters | {"crs": "another"})
+    other = BaseMap(world_map.arrays, world_map.parameters | {"crs": "another"})
     other.save(signed_world, SigningKey(f"{keys[0]}.key"))
     with pytest.raises(MapError, match="replaced by another map"):
         open_engine("track", signed_world, node.sha256, trust=Trust(key, node.identity))

@@ -52,7 +52,7 @@ def test_index_of_a_file_is_that_of_the_descriptors(world_map, query, tmp_path):
 
 
 def test_map_without_index_makes_it(world_map, query):
-    arrays = {name: each for name, each in world_map._arrays.items() if not name.startswith("station_codes")}
+    arrays = {name: each for name, each in world_map.arrays.items() if not name.startswith("station_codes")}
     old = BaseMap(arrays, world_map.parameters)
     index = world_map.station_index
     np.testing.assert_array_equal(
@@ -61,7 +61,7 @@ def test_map_without_index_makes_it(world_map, query):
 
 
 def test_index_of_other_shapes_is_made_anew_or_refused(world_map, query):
-    arrays = world_map._arrays
+    arrays = world_map.arrays
     for name, damaged in (
         ("station_codes", arrays["station_codes"][:, :8]),
         ("station_codes", arrays["station_codes"].astype(np.int32)),

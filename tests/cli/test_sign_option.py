@@ -17,8 +17,8 @@ def site(tmp_path_factory, world_map, world_drive):
     folder = tmp_path_factory.mktemp("signed")
     for name in ("ours", "theirs"):
         assert main(["keygen", str(folder / name)]) == 0
-    BaseMap(world_map._arrays, world_map.parameters).save(folder / "signed.coview", SigningKey(folder / "ours.key"))
-    BaseMap(world_map._arrays, world_map.parameters).save(folder / "unsigned.coview")
+    BaseMap(world_map.arrays, world_map.parameters).save(folder / "signed.coview", SigningKey(folder / "ours.key"))
+    BaseMap(world_map.arrays, world_map.parameters).save(folder / "unsigned.coview")
     damaged = bytearray((folder / "signed.coview").read_bytes())
     damaged[-50] ^= 4
     (folder / "damaged.coview").write_bytes(damaged)

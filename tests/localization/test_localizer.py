@@ -29,7 +29,7 @@ def follow(localizer, drive, frames=None):
 
 
 def moved_map(base_map: BaseMap, origin) -> BaseMap:
-    return BaseMap({**base_map._arrays, "origin": np.asarray(origin) + base_map.origin}, base_map.parameters)
+    return BaseMap({**base_map.arrays, "origin": np.asarray(origin) + base_map.origin}, base_map.parameters)
 
 
 def test_first_fix_and_later_poses_are_correct(world_fixes, world_drive):

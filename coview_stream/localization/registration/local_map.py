@@ -11,6 +11,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_kernels.cells import Cells
+from coview_stream.basemap.tiles import cut_points
 from coview_stream.config import RegistrationMethod
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, norms
@@ -86,7 +87,8 @@ class LocalMaps:
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
             radius = self._radius + 0.75 * _CROP_STEP
-            crop = self._map.cut(kernels.Cut(float(centre[0]), float(centre[1]), radius))
+            cut = kernels.Cut(float(centre[0]), float(centre[1]), radius)
+            crop = cut_points(self._map.arrays, self._map.config.tile, cut)
             few = crop is None or len(crop.points) < MIN_PAIRS
             self._crops[key] = None if crop is None or few else LocalMap(*crop)
             if len(self._crops) > self._max_crops:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import yaw_of
@@ -192,7 +192,7 @@ class _Rehearsal:
         scan = self._scan(place)
         if scan is None:
             return _Seen(False, False, 0.0, 0.0, 1.0)
-        query = {name: own.astype(np.float32) for name, own in self.base_map.descriptors_of(station).items()}
+        query = {name: own.astype(np.float32) for name, own in station_descriptors(self.base_map, station).items()}
         self._consensus.vote(self.base_map.stations[station].astype(np.float64), query)
         named = self._consensus.hypotheses()
         beside = np.tile(np.eye(4), (len(_AROUND), 1, 1))

@@ -310,5 +310,5 @@ def make_sessions(options: ServeOptions, base_map: BaseMap) -> list[Session]:
     else:
         made = [LidarSession(keys, map_sha256, options.node, codecs, options.lidar, parts) for keys in options.keys]
     for session in made:
-        session.site_sha256 = base_map.site_sha256
+        session.site_sha256 = str(base_map.parameters.get("site") or base_map.sha256)
     return made

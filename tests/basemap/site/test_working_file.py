@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap import file_format
-from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
 from coview_stream.basemap.map_arrays import EarlierMap
 from coview_stream.basemap.site.assemble import PARAMETER
@@ -76,7 +76,7 @@ def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, tak
     wanted = np.arange(0, len(base_map.stations), 97)
     right = 0
     for station in wanted:
-        described = base_map.descriptors_of(station)
+        described = station_descriptors(base_map, station)
         scores = index.best(index.query({name: values.astype(np.float32) for name, values in described.items()}))
         away = np.linalg.norm(base_map.stations[scores.argmin()] - base_map.stations[station])
         right += away < 3.0

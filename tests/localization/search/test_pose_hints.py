@@ -58,7 +58,7 @@ def test_without_hint_and_votes_search_finds_nothing(world_map, world_drive, mon
 
 def test_hint_is_given_in_map_source_coordinates(world_map, world_drive, monkeypatch):
     """A map far from zero, odometry far from zero, and a robot that leans otherwise than when it was saved."""
-    far = BaseMap({**world_map._arrays, "origin": UTM + world_map.origin}, world_map.parameters)
+    far = BaseMap({**world_map.arrays, "origin": UTM + world_map.origin}, world_map.parameters)
     localizer = misled(Localizer(far), world_drive, monkeypatch)
     leaning = exp_se3(np.array([0.05, -0.04, 0.0, *UTM])) @ pose_from(np.eye(3), -UTM)
     there = pose_from(np.eye(3), UTM) @ world_drive.T_map_body[0] @ NEAR

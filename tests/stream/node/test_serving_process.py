@@ -30,7 +30,7 @@ def service(world_file, slow_drive, tmp_path):
 def second_map(world_file, path):
     """The same survey as a map with another hash."""
     first = BaseMap.load(world_file)
-    arrays = {name: np.array(array) for name, array in first._arrays.items()}
+    arrays = {name: np.array(array) for name, array in first.arrays.items()}
     BaseMap(arrays, {**first.parameters, "note": "surveyed again"}).save(path)
     return BaseMap.load(path).sha256
 

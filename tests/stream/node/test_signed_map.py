@@ -27,7 +27,7 @@ def site(tmp_path, world_map):
 
 def save(world_map, folder, key, **more):
     signing = None if key is None else SigningKey(folder / f"{key}.key")
-    return BaseMap(world_map._arrays, world_map.parameters | more).save(folder / "site.coview", signing)
+    return BaseMap(world_map.arrays, world_map.parameters | more).save(folder / "site.coview", signing)
 
 
 def options_of(site):
