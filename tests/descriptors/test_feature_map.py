@@ -181,7 +181,7 @@ def test_map_without_features_has_no_feature_map(world_map):
 def test_maps_of_earlier_version_can_be_read(world_map):
     before = {n: v for n, v in world_map.parameters.items() if n != "learned"}
     before["config"] = {n: v for n, v in before["config"].items() if n != "learned"}
-    old = BaseMap(dict(world_map._arrays), before)
+    old = BaseMap(dict(world_map.arrays), before)
     assert old.learned is None
     assert old.config.learned is False
 

@@ -1,6 +1,5 @@
-"""Sites: maps as directories of immutable tiles, named by their hashes, under a manifest; and building them.
+"""Sites: maps as directories of immutable tiles under a manifest, built from clouds that do not fit into memory.
 
-``layer_bytes`` and ``cloud_layer`` are the bytes of a tile's layers, ``tile_store`` and ``manifest`` the directory;
-``site_build`` makes it out of clouds that do not fit into memory (``partition``, ``tile_build``, ``executors``);
-``assemble`` makes the arrays of a map of it, ``split`` a directory of a map.
+``manifest``, ``layers`` and ``store`` are the format; ``site_build``, ``tile_build`` and ``executors`` build a site;
+``assemble`` and ``working_file`` open it, ``fetch`` mirrors it, ``convert`` turns it into one file and back.
 """

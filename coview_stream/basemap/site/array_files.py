@@ -1,7 +1,7 @@
-"""Arrays in files without names: for what is made piece by piece and is larger than memory should be.
+"""Arrays in unnamed files, for arrays that are made piece by piece and should not fill the memory.
 
-The files are deleted when they are closed, or when the process ends in any way. Room is taken before it is written to,
-so that a full disk is an error and not a signal.
+The files are deleted when they are closed, or when the process ends in any way. Space is allocated before it is
+written: a full disk is an error, not a signal.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ class ArrayFiles:
     """Arrays by name, each in a file: made whole by :meth:`zeros`, or row by row by :meth:`append`."""
 
     def __init__(self, folder: Path) -> None:
-        """Make them in this folder."""
+        """Use this folder."""
         self._folder = folder
         self._files: dict[str, io.FileIO] = {}
         self._shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         self._mapped: list[Array] = []
 
     def __enter__(self) -> ArrayFiles:
-        """Return it."""
+        """Return itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Delete the files."""
         self.close()
 
     def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Array:
-        """Return an array to be written to, of zeros.
+        """Return a new array of zeros to write to.
 
         Raises:
-            MapError: there is no room for it.
+            MapError: there is no space.
         """
         kind = np.dtype(dtype)
         size = kind.itemsize * math.prod(shape)
@@ -66,10 +66,10 @@ class ArrayFiles:
         return made
 
     def append(self, name: str, rows: Array) -> int:
-        """Write rows (N, ...) below those that an array has, and return how many it had.
+        """Append rows (N, ...) to an array, and return how many it had.
 
         Raises:
-            MapError: there is no room for them.
+            MapError: there is no space.
         """
         file = self._files.get(name) or self._new(name, rows.dtype, (0, *rows.shape[1:]))
         kind, (before, *rest) = self._shapes[name]
@@ -77,14 +77,14 @@ class ArrayFiles:
             raise ValueError(f"rows of {name} are {rows.dtype} {rows.shape[1:]}, not {kind} {tuple(rest)}")
         content = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
         with self._room():
-            file.seek(before * kind.itemsize * math.prod(rest))  # not behind what a failure has left
+            file.seek(before * kind.itemsize * math.prod(rest))  # not after the remains of a failure
             while len(content):
                 content = content[file.write(content) :]
         self._shapes[name] = kind, (before + len(rows), *rest)
         return before
 
     def rows(self, name: str, begin: int, end: int) -> Array:
-        """Return some rows of an array in memory of their own."""
+        """Return a copy of rows of an array."""
         kind, (_, *rest) = self._shapes[name]
         width = kind.itemsize * math.prod(rest)
         out = np.empty((end - begin, *rest), kind)
@@ -100,23 +100,23 @@ class ArrayFiles:
 
     def arrays(self) -> Arrays:
         """Return all arrays, mapped into memory, read-only."""
-        found: Arrays = {}
+        mapped: Arrays = {}
         for name, (kind, shape) in self._shapes.items():
             if math.prod(shape):
-                found[name] = np.memmap(self._files[name], dtype=kind, mode="r", shape=shape)
-                self._mapped.append(found[name])
+                mapped[name] = np.memmap(self._files[name], dtype=kind, mode="r", shape=shape)
+                self._mapped.append(mapped[name])
             else:
-                found[name] = np.zeros(shape, kind)
-        return found
+                mapped[name] = np.zeros(shape, kind)
+        return mapped
 
     def release(self) -> None:
-        """Let the memory go that what was written or read takes; it is in the files."""
+        """Release the memory of mapped pages; the content is in the files."""
         if hasattr(mmap, "MADV_DONTNEED"):
-            for each in self._mapped:
-                each._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]  # NumPy's types lack it
+            for array in self._mapped:
+                array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]  # NumPy's types lack it
 
     def close(self) -> None:
-        """Delete the files; arrays that are still mapped can be used on."""
+        """Delete the files; mapped arrays stay usable."""
         self._mapped.clear()
         for file in self._files.values():
             file.close()
@@ -136,6 +136,6 @@ class ArrayFiles:
             yield
         except OSError as error:
             raise MapError(
-                f"{self._folder}: cannot hold what a map is made of ({error.strerror}); make room, or name another "
+                f"{self._folder}: cannot hold the parts of a map ({error.strerror}); make room, or name another "
                 "folder in COVIEW_CACHE"
             ) from error

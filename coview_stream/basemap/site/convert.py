@@ -1,8 +1,8 @@
-"""Light copy of a site, for robots with little room or a slow link: fewer points, and no learned features.
+"""Conversion of maps: one file to the tiles of a site, a site to one file, and light copies of sites.
 
-Of each cube of half a metre one point is kept, with its normal, rounded to four centimetres in place of two: the one
-nearest to the middle of those in it. Cubes are those of the likelihood field and of the voxels that descriptors count,
-so that both see the same cells occupied.
+A light copy is for robots with little room or a slow link: it has no learned features, and of each cube of half a metre
+only the point nearest to the mean of those in it, rounded to four centimetres instead of two. Cubes are those of the
+likelihood field and of the voxels that descriptors count, for which the same cells stay occupied.
 """
 
 from __future__ import annotations
@@ -14,89 +14,60 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap import file_format
-from coview_stream.basemap.file_format import Arrays
+from coview_stream.basemap.file_format import Arrays, check_target, save
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, Progress, assemble, layer_of
-from coview_stream.basemap.site.layers import (
-    PACKING,
-    STEPS,
-    cloud_layer,
-    encode,
-    read_cloud_layer,
-    square_metres,
-    stations_layer,
-)
-from coview_stream.basemap.site.manifest import (
-    TILE,
-    VERSION,
-    LayerEntry,
-    Manifest,
-    SiteGrid,
-    TileEntry,
-    in_order,
-    is_site,
-)
+from coview_stream.basemap.site.layers import STEPS, cloud_layer, read_cloud_layer
+from coview_stream.basemap.site.manifest import TILE, VERSION, Manifest, SiteGrid, TileEntry, in_order, is_site
 from coview_stream.basemap.site.site_build import check_directory
 from coview_stream.basemap.site.store import TileStore
+from coview_stream.basemap.site.tile_build import put_layer, write_tile
 from coview_stream.basemap.tiles import Key, unit_normals
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError
-from coview_stream.geometry.arrays import Ints
+from coview_stream.geometry.arrays import Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
+CUBE = 0.5
+"""Edge of a cube, metres: a cell of the likelihood field."""
+
 _FEATURES_TILE = 32  # metres
+_LIGHT = "light"  # parameter of a manifest
 
 
-def split(
-    arrays: Arrays, parameters: dict[str, Any], directory: Path, key: SigningKey | None = None, tile: float = TILE
-) -> Manifest:
+def split(arrays: Arrays, parameters: dict[str, Any], directory: Path, key: SigningKey | None = None) -> Manifest:
     """Write a map as a site. Its points are rounded to 2 cm, its normals to 2 degrees.
 
     Args:
-        arrays: of a map, as its file has them.
-        parameters: likewise.
+        arrays: of the map.
+        parameters: of the map.
         directory: new or empty, or a site.
         key: signs the manifest.
-        tile: edge of the tiles, metres.
 
     Raises:
-        MapError: the directory cannot be used, or the map cannot be cut so.
+        MapError: the directory cannot be used, or the map cannot be cut at the borders of tiles.
     """
     check_directory(directory)
-    grid = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
+    grid = SiteGrid((0.0, 0.0, 0.0), TILE, config_of_map(parameters["config"]))
     store, entries = TileStore(directory), []
     points, packed, stations = arrays["points"], arrays["normals"], arrays["stations"]
     of_points, of_stations = grid.cells(points), grid.cells(stations)
     learned = parameters.get("learned") is not None
     for column, row in np.unique(of_points, axis=0).tolist():
-        own = (of_points == (column, row)).all(axis=1)
-        standing = stations[(of_stations == (column, row)).all(axis=1)]
-        local = (points[own] - grid.corner((column, row))).astype(np.float32)
-        planarity = np.linalg.norm(packed[own].astype(np.float32), axis=1) / np.float32(127.0)
-        layers = {
-            "cloud": cloud_layer(local, unit_normals(packed[own]), np.clip(planarity, 0, 1), tile, grid.config.voxel),
-            "stations": stations_layer(standing, grid.config.block),
-        }
-        if learned:
-            layers["features"] = _features(arrays, (column, row), tile)
-        named = {}
-        for name, content in ((name, encode(each, PACKING[name])) for name, each in layers.items()):
-            named[name] = LayerEntry(store.put(content), len(content))
-        low, high = (round(float(each), 2) for each in (local[:, 2].min(), local[:, 2].max()))
-        entries.append(TileEntry(column, row, len(local), len(standing), square_metres(local), low, high, named))
-    kept = {name: value for name, value in parameters.items() if name not in ("crs", "site")}
-    origin = tuple(float(each) for each in arrays["origin"])
+        tile = (column, row)
+        own = (of_points == tile).all(axis=1)
+        local = (points[own] - grid.corner(tile)).astype(np.float32)
+        standing = stations[(of_stations == tile).all(axis=1)]
+        features = _features(arrays, tile) if learned else None
+        entries.append(write_tile(store, grid, tile, (local, *_unpacked(packed[own])), standing, features))
+    origin = tuple(float(value) for value in arrays["origin"])
     if len(origin) != 3:
         raise MapError("the map's origin is not one")
-    manifest = Manifest(origin, tile, parameters["crs"], kept, in_order(entries))
+    site_parameters = {name: value for name, value in parameters.items() if name not in ("crs", "site")}
+    manifest = Manifest(origin, TILE, parameters["crs"], site_parameters, in_order(entries))
     manifest = Manifest.from_bytes(manifest.to_bytes(), str(directory))
-    if key is not None:
-        manifest = manifest.signed(key)
-    manifest.save(directory)
-    store.prune(manifest.hashes())
-    return manifest
+    return _finish(manifest, directory, key)
 
 
 def join(directory: Path, path: Path, key: SigningKey | None = None, progress: Progress | None = None) -> str:
@@ -111,28 +82,11 @@ def join(directory: Path, path: Path, key: SigningKey | None = None, progress: P
     Raises:
         MapError: no site, a layer is missing or damaged, or the file cannot be written.
     """
-    file_format.check_target(path)
+    check_target(path)
     with ArrayFiles(path.resolve().parent) as into:
         arrays, parameters = assemble(Manifest.load(directory), TileStore(directory), into, progress)
         del parameters[PARAMETER]
-        return file_format.save(path, arrays, parameters, key)
-
-
-def _features(arrays: Arrays, key: Key, tile: float) -> Arrays:
-    """Return the learned features that lie on a tile."""
-    per = round(tile / _FEATURES_TILE)
-    tiles = arrays["learned.tiles"]
-    own = (np.floor_divide(tiles, per) == key).all(axis=1)
-    at = arrays["learned.place_at"]
-    here = (np.floor(at / tile) == key).all(axis=1)
-    found = {name: np.array(arrays[f"learned.{name}"][own]) for name in ("local", "sigma", "tiles")}
-    return found | {name: np.array(arrays[f"learned.{name}"][here]) for name in ("place", "place_at")}
-
-
-CUBE = 0.5
-"""Edge of a cube, metres: a cell of the likelihood field."""
-
-_LIGHT = "light"  # parameter of a manifest
+        return save(path, arrays, parameters, key)
 
 
 def lighten(
@@ -150,25 +104,44 @@ def lighten(
         MapError: no site, a layer is missing or damaged, or the target cannot be used.
     """
     manifest = Manifest.load(source)
-    _check(source, target, manifest)
+    _check_light(source, target, manifest)
     grid = SiteGrid(manifest.origin, manifest.tile, config_of_map(manifest.parameters["config"]))
-    kept, made, entries = TileStore(source), TileStore(target), []
+    store, light_store, entries = TileStore(source), TileStore(target), []
     for done, entry in enumerate(manifest.tiles, start=1):
-        entries.append(_light_tile(entry, grid, kept, made))
+        entries.append(_light_tile(entry, grid, store, light_store))
         if progress:
             progress(done, len(manifest.tiles))
     parameters = dict(manifest.parameters) | {"learned": None, _LIGHT: {"cube": CUBE, "of": manifest.sha256}}
     parameters["config"] = dict(manifest.parameters["config"]) | {"learned": False}
     light = replace(manifest, parameters=parameters, tiles=tuple(entries), signer="", signature="", version=VERSION)
+    return _finish(light, target, key)
+
+
+def _finish(manifest: Manifest, directory: Path, key: SigningKey | None) -> Manifest:
+    """Sign and save a manifest, and delete the layers that it does not name."""
     if key is not None:
-        light = light.signed(key)
-    light.save(target)
-    made.prune(light.hashes())
-    return light
+        manifest = manifest.signed(key)
+    manifest.save(directory)
+    TileStore(directory).prune(manifest.hashes())
+    return manifest
 
 
-def _check(source: Path, target: Path, manifest: Manifest) -> None:
-    """Refuse what would lose something: another site in the target's place, a copy within a site, a copy of a copy."""
+def _unpacked(packed: Int8s) -> tuple[Points, Floats32]:
+    """Return unit normals (N, 3) and planarity (N,) of a map's normals."""
+    planarity = np.linalg.norm(packed.astype(np.float32), axis=1) / np.float32(127.0)
+    return unit_normals(packed), np.clip(planarity, 0, 1)
+
+
+def _features(arrays: Arrays, key: Key) -> Arrays:
+    """Return the learned features that lie on a tile."""
+    own = (np.floor_divide(arrays["learned.tiles"], round(TILE / _FEATURES_TILE)) == key).all(axis=1)
+    here = (np.floor(arrays["learned.place_at"] / TILE) == key).all(axis=1)
+    local = {name: np.array(arrays[f"learned.{name}"][own]) for name in ("local", "sigma", "tiles")}
+    return local | {name: np.array(arrays[f"learned.{name}"][here]) for name in ("place", "place_at")}
+
+
+def _check_light(source: Path, target: Path, manifest: Manifest) -> None:
+    """Refuse to replace another site, to write a copy within a site, and to copy a copy."""
     here, there = source.resolve(), target.resolve()
     if here == there:
         raise MapError(f"{target}: is the site itself; name another directory for the light copy")
@@ -181,24 +154,21 @@ def _check(source: Path, target: Path, manifest: Manifest) -> None:
     check_directory(target)
 
 
-def _light_tile(entry: TileEntry, grid: SiteGrid, kept: TileStore, made: TileStore) -> TileEntry:
+def _light_tile(entry: TileEntry, grid: SiteGrid, store: TileStore, light_store: TileStore) -> TileEntry:
     voxel = grid.config.voxel
-    local = np.zeros(3)  # about the tile's corner, which lies on the cubes
-    points, packed = read_cloud_layer(layer_of(entry, "cloud", kept), local, grid.tile, voxel)
+    # about the tile's corner, which lies on the cubes
+    points, packed = read_cloud_layer(layer_of(entry, "cloud", store), np.zeros(3), grid.tile, voxel)
     chosen = one_of_each_cube(points)
     step = 2.0 * voxel / STEPS
     rounded = ((np.floor(points[chosen].astype(np.float64) / step) + 0.5) * step).astype(np.float32)
-    planarity = np.linalg.norm(packed[chosen].astype(np.float32), axis=1) / np.float32(127.0)
-    cloud = cloud_layer(rounded, unit_normals(packed[chosen]), np.clip(planarity, 0, 1), grid.tile, voxel)
-    content = encode(cloud, PACKING["cloud"])
+    cloud = put_layer(light_store, "cloud", cloud_layer(rounded, *_unpacked(packed[chosen]), grid.tile, voxel))
     stations = entry.layers["stations"]
-    layers = {"cloud": LayerEntry(made.put(content), len(content)), "stations": stations}
-    made.put(kept.get(stations.sha256, stations.bytes))
-    return replace(entry, points=len(chosen), layers=layers)
+    light_store.put(store.get(stations.sha256, stations.bytes))
+    return replace(entry, points=len(chosen), layers={"cloud": cloud, "stations": stations})
 
 
 def one_of_each_cube(points: Points, cube: float = CUBE) -> Ints:
-    """Choose of points (N, 3) the numbers (K,), ascending, of one in each cube: the nearest to their mean."""
+    """Return the numbers (K,), ascending, of one point of (N, 3) in each cube: the nearest to their mean."""
     cells = np.floor(points.astype(np.float64) / cube).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     shape = cells.max(axis=0, initial=0) + 1

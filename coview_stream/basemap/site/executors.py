@@ -1,4 +1,4 @@
-"""Executors of a build's steps: in this process, in processes of this machine, or by a Dask scheduler.
+"""Executors of a build's steps: in this process, in processes on this machine, or on a Dask scheduler.
 
 All give the same results: a step is a pure function of its arguments and of files that no other step changes.
 """
@@ -28,16 +28,14 @@ class Executor(Protocol):
     def run(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Yield the number of each item with its result, or with what it raised, in whatever order they end."""
-        ...
+        """Yield the number of each item with its result or its exception, in any order."""
 
     def close(self) -> None:
         """End the workers."""
-        ...
 
 
 class SerialExecutor:
-    """Executor in this very process."""
+    """Executor in this process."""
 
     def run(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -56,14 +54,13 @@ class SerialExecutor:
 class ProcessExecutor:
     """Executor in processes of this machine, each with one thread for its libraries.
 
-    A process that dies is no reason to lose the others' work: what was under way is done again, an item at a time, so
-    that the one which kills its process is told.
+    After a process has died, its items run again one at a time; the item that kills its process gets an error.
 
     Args:
-        workers: how many processes.
+        workers: number of processes.
 
     Raises:
-        ConfigError: none, or too many.
+        ConfigError: the number is out of range.
     """
 
     def __init__(self, workers: int) -> None:
@@ -113,11 +110,11 @@ class ProcessExecutor:
 
 
 class DaskExecutor:
-    """Executor by a Dask scheduler, whose workers see the same files under the same names.
+    """Executor on a Dask scheduler, whose workers have the same files under the same names.
 
     Args:
         address: ``HOST:PORT`` or ``tcp://HOST:PORT`` of a scheduler; ``local`` starts a cluster on this machine.
-        workers: of a local cluster; None leaves that to Dask.
+        workers: of a local cluster; None lets Dask choose.
 
     Raises:
         DependencyError: no ``distributed``. ConfigError: the scheduler cannot be reached.
@@ -156,13 +153,13 @@ class DaskExecutor:
             future.release()
 
     def close(self) -> None:
-        """Leave the scheduler; a local cluster ends."""
+        """Disconnect; a local cluster ends."""
         self._client.close()
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Have processes that are started meanwhile use one thread each: the workers are the threads."""
+    """Start processes with one thread each meanwhile: the workers run in parallel already."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:

@@ -1,8 +1,4 @@
-"""Mirror of a site: what has been fetched of it, checked, in the cache; maps are opened from it, with or without a net.
-
-Every layer is compared with its hash before it is written, the manifest with its signature where a key is asked for.
-The manifest is written last, so that the mirror is always one state of the site, the old one or the new.
-"""
+"""Sources of sites elsewhere (web server, object store, network disk), and mirrors of them in the cache."""
 
 from __future__ import annotations
 
@@ -30,7 +26,6 @@ from coview_stream.basemap.site.manifest import (
     tiles_around,
 )
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
-from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.fetch import open_web_file
 from coview_stream.errors import CloudError, MapError, TransportError, require_library, warn
 
@@ -38,7 +33,7 @@ _PIECE = 1 << 20
 
 
 class SiteSource(Protocol):
-    """Where a site is read from.
+    """Source of a site's bytes, which are untrusted.
 
     Attributes:
         name: for messages.
@@ -47,23 +42,20 @@ class SiteSource(Protocol):
     name: str
 
     def manifest(self) -> bytes:
-        """Return the manifest's bytes, whatever they are. TransportError: it cannot be had now."""
-        ...
+        """Return the manifest's bytes. TransportError: they cannot be fetched now."""
 
     def layer(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes, ``size`` + 1 at most, whatever they are. TransportError: it cannot be had now."""
-        ...
+        """Return a layer's bytes, ``size`` + 1 at most. TransportError: they cannot be fetched now."""
 
     def close(self) -> None:
-        """End connections."""
-        ...
+        """Close connections."""
 
 
 class DirectorySource:
-    """A site's directory, on a disk or a network's file system."""
+    """A site's directory on a local disk or a network file system."""
 
     def __init__(self, directory: Path) -> None:
-        """Take the directory."""
+        """Read from a directory."""
         self.name = str(directory)
         self._directory, self._store = directory, TileStore(directory)
 
@@ -80,15 +72,15 @@ class DirectorySource:
 
 
 class WebSource:
-    """A site's directory as any web server serves it: plain files below an address."""
+    """A site's directory on any web server: plain files below an address."""
 
     def __init__(self, address: str) -> None:
-        """Take the directory's address."""
+        """Read below an address."""
         self.name = address.rstrip("/")
         self._known: tuple[str, bytes] | None = None
 
     def manifest(self) -> bytes:
-        """Return the manifest's bytes; they are not sent again while the server says that they are the same."""
+        """Return the manifest's bytes; the server sends them again only if they have changed."""
         headers = {} if self._known is None else {"If-None-Match": self._known[0]}
         try:
             answer = open_web_file(urllib.request.Request(f"{self.name}/{FILE}", headers=headers))
@@ -122,7 +114,7 @@ class ObjectStoreSource:
     """
 
     def __init__(self, address: str) -> None:
-        """Take the prefix's address; DependencyError without obstore, TransportError where it names no store."""
+        """Read below a prefix; DependencyError without obstore, TransportError if the address names no store."""
         store: Any = require_library("obstore.store", "obstore>=0.6", "maps in object stores")
         self.name = address.rstrip("/")
         try:
@@ -143,19 +135,18 @@ class ObjectStoreSource:
 
     def _get(self, path: str, limit: int) -> bytes:
         try:
-            found = self._store.get(path)
             raw = bytearray()
-            for piece in found.stream(min_chunk_size=_PIECE):
+            for piece in self._store.get(path).stream(min_chunk_size=_PIECE):
                 raw += piece
                 if len(raw) > limit:
                     break
-        except Exception as error:  # obstore's are of many kinds
+        except Exception as error:  # obstore has many classes of errors
             raise TransportError(f"{self.name}/{path}: {_short(error)}") from error
         return bytes(raw[: limit + 1])
 
 
 def is_site_address(name: object) -> bool:
-    """Tell whether a name is the address of a site, not the path of a map."""
+    """Return whether a name is the address of a site, not the path of a map."""
     return urlsplit(str(name)).scheme in ("zenoh", "http", "https", "s3", "gs", "az") and "://" in str(name)
 
 
@@ -183,26 +174,29 @@ def _short(error: BaseException) -> str:
 
 log = logging.getLogger("coview_stream.maps")
 
-_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second; set by hand
+_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
 
 Progress = Callable[[int, int], None]
 """Called with bytes fetched, and bytes to fetch."""
 
 
 class Mirror:
-    """The cached state of one site.
+    """Cached copy of a site, whole or in part; maps are opened from it, with or without a network.
+
+    Layers are compared with their hashes before they are written, the manifest with its signature if there is a key.
+    The manifest is written last: the mirror always holds one state of the site.
 
     Attributes:
-        source: where the site is.
+        source: of the site.
         directory: of the mirror, itself a site.
-        circles: only tiles that these meet are fetched; none: all.
-        offline: why the source could not be asked the last time; empty where it could.
+        around: circle of the tiles that are fetched; None fetches all.
+        offline: reason why the source could not be reached the last time, else empty.
     """
 
     def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
-        """Take the source; nothing is asked for yet. MapError: the cache cannot be used."""
+        """Use a source, without asking it yet. MapError: the cache cannot be used."""
         self.source = source
-        self.circles: tuple[Around, ...] = () if around is None else (around,)
+        self.around = around
         self.offline = ""
         self._verify_key = verify_key
         name = hashlib.sha256(source.name.encode()).hexdigest()[:16]
@@ -211,45 +205,45 @@ class Mirror:
 
     @property
     def map_path(self) -> Path:
-        """What a map is opened from: the mirror, or the part of it that the circles meet."""
-        if not self.circles:
+        """Path of the map: the mirror, or the part of it in the circle."""
+        if self.around is None:
             return self.directory
-        manifest = Manifest.load(self.directory)
-        return part_file(self.directory, tiles_around(manifest, *self.circles), str(self.circles[0]))
+        keys = tiles_around(Manifest.load(self.directory), self.around)
+        return part_file(self.directory, keys, str(self.around))
 
     def open(self, progress: Progress | None = None) -> Path:
-        """Bring it up to date if the source can be asked, and return :attr:`map_path`.
+        """Bring the mirror up to date if the source can be reached, and return :attr:`map_path`.
 
         Raises:
-            TransportError: the source cannot be asked, and nothing is in the cache.
-            MapError: what came is no site, is not what it should be, or is not signed with the key.
+            TransportError: the source cannot be reached, and nothing is in the cache.
+            MapError: the source gave no site, damaged layers, or a manifest that is not signed with the key.
         """
         try:
             self.refresh(progress, check=True)
-            self._use()
         except TransportError as error:
             try:
-                kept = Manifest.load(self.directory)
+                cached = Manifest.load(self.directory)
             except MapError:
                 raise error from None
             if self._verify_key is not None:
-                kept.check_signature(self._verify_key, str(self.directory))
+                cached.check_signature(self._verify_key, str(self.directory))
             self.offline = str(error)
-            warn(f"{error}; going on with what was fetched before, manifest {kept.sha256[:12]}")
+            warn(f"{error}; going on with what was fetched before, manifest {cached.sha256[:12]}")
         return self.map_path
 
     def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:
-        """Ask the source, fetch what is missing, and return whether the site has changed.
+        """Ask the source, fetch missing layers, and return whether the site has changed.
 
         Args:
-            progress: is told.
-            check: compare layers that are there with their hashes, not with their lengths alone.
+            progress: called with bytes fetched, and bytes to fetch.
+            check: compare existing layers with their hashes, not only with their lengths.
 
         Raises:
-            TransportError: the source cannot be asked; what was fetched is kept. MapError: as of :meth:`open`.
+            TransportError: the source cannot be reached; fetched layers are kept. MapError: see :meth:`open`.
         """
         self.offline = ""
-        self._use()
+        with contextlib.suppress(OSError):
+            os.utime(self.directory)  # recently used: the cache keeps it
         raw = self.source.manifest()
         manifest = Manifest.from_bytes(raw, f"{self.source.name}/{FILE}")
         if self._verify_key is not None:
@@ -258,15 +252,15 @@ class Mirror:
             before = Manifest.load(self.directory)
         except MapError:
             before = None
-        keys = tiles_around(manifest, *self.circles) if self.circles else None
+        keys = None if self.around is None else tiles_around(manifest, self.around)
         wanted = {
             layer.sha256: (layer, tile)
             for tile in manifest.tiles
             if keys is None or (tile.column, tile.row) in keys
             for layer in tile.layers.values()
         }
-        there = self._store.is_whole if check else self._store.holds
-        missing = [each for each in wanted.values() if not there(each[0].sha256, each[0].bytes)]
+        exists = self._store.is_whole if check else self._store.holds
+        missing = [(layer, tile) for layer, tile in wanted.values() if not exists(layer.sha256, layer.bytes)]
         done, total = 0, sum(layer.bytes for layer, _ in missing)
         for layer, tile in missing:
             self._store.put(self._fetched(layer, tile))
@@ -277,24 +271,11 @@ class Mirror:
         if changed or before != manifest:
             self.directory.mkdir(parents=True, exist_ok=True)
             manifest.save(self.directory)
-        if changed and before is not None:  # one state back: somebody may still stand on it
+        if changed and before is not None:  # a process may still use the state before
             self._store.prune(manifest.hashes() | before.hashes())
         elif changed:
             evict(cache_folder(), self.directory)
         return changed or bool(missing)
-
-    def _use(self) -> None:
-        """Have the cache know that it is used: it keeps what was used last."""
-        with contextlib.suppress(OSError):
-            os.utime(self.directory)
-
-    def fetched(self, manifest: Manifest) -> set[Key]:
-        """Return the tiles of a manifest that are all there."""
-        return {
-            (tile.column, tile.row)
-            for tile in manifest.tiles
-            if all(self._store.holds(layer.sha256, layer.bytes) for layer in tile.layers.values())
-        }
 
     def _fetched(self, layer: LayerEntry, tile: TileEntry) -> bytes:
         for left in reversed(range(_TRIES)):

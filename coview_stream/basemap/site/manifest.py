@@ -1,14 +1,13 @@
-"""Manifest of a site: what its tiles are, by the hashes of their layers, and how they were made.
+"""Manifest of a site (settings, and tiles by the hashes of their layers), grid of its tiles, and parts of sites.
 
-A JSON file, ``manifest.json``. Its hash names the state of the whole site; a signature (ed25519) covers every byte that
-it names. Nothing is believed on reading: numbers and names are checked, and their count bounded.
+The manifest is a JSON file, ``manifest.json``. Its hash identifies the state of the whole site; a signature (ed25519)
+covers every byte of the layers. Readers check all numbers and names, and bound their count.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -28,13 +27,13 @@ from coview_stream.geometry.arrays import Floats, Ints, Reals
 
 FORMAT = "coview-site"
 VERSION = 2
-"""Of what is written; layers of sites of version 1, compressed otherwise, are read as well."""
+"""Version that is written; sites of version 1, with layers compressed otherwise, can be read."""
 FILE = "manifest.json"
 LAYERS = ("cloud", "stations", "features")
-"""Layers of a tile: its points with normals, its stations, and learned features, which need not be there."""
+"""Layers of a tile: points with normals, stations, and learned features, which are optional."""
 
 MAX_MANIFEST = 1 << 28
-"""Bytes of a manifest at most: 400,000 tiles; set by hand."""
+"""Largest manifest, bytes: 400,000 tiles."""
 
 _MAX_LAYER = 1 << 28  # bytes
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
@@ -48,7 +47,7 @@ class LayerEntry:
 
     Attributes:
         sha256: of its bytes.
-        bytes: how many they are.
+        bytes: their number.
     """
 
     sha256: str
@@ -63,8 +62,8 @@ class TileEntry:
         column, row: it covers ``[column, column + 1) * tile`` metres in x, likewise in y, from the site's origin.
         points: in its cloud.
         stations: on it.
-        area: square metres of it that hold points, in squares of a metre.
-        low, high: heights of its lowest and its highest point, metres from the origin.
+        area: number of squares of a metre that hold points.
+        low, high: heights of the lowest and the highest point, metres from the origin.
         layers: by name.
     """
 
@@ -88,13 +87,13 @@ class Manifest:
     """A site.
 
     Attributes:
-        origin: (3,) metres, in the frame of the sources; all else counts from it.
+        origin: (3,) metres, in the frame of the sources; zero of all other coordinates.
         tile: edge of a tile, metres.
         crs: reference system of the sources, None if they state none.
-        parameters: how the map was built: ``config``, ``sources`` and what else a map's file says of it.
+        parameters: of the build: ``config``, ``sources`` and others, as in a map file.
         tiles: by row and column.
-        signer: fingerprint of the key that it is signed with; empty for none.
-        signature: hexadecimal; empty for none.
+        signer: fingerprint of the signing key; empty if unsigned.
+        signature: hexadecimal; empty if unsigned.
         version: of the format.
     """
 
@@ -127,7 +126,7 @@ class Manifest:
         return json.dumps({"format": FORMAT} | plain, sort_keys=True, allow_nan=False).encode()
 
     def signed(self, key: SigningKey) -> Manifest:
-        """Return it with a signature."""
+        """Return a signed copy."""
         return replace(self, signer=key.fingerprint, signature=key.sign(_PURPOSE + self._content()).hex())
 
     def check_signature(self, key: VerifyKey, name: str) -> None:
@@ -160,10 +159,10 @@ class Manifest:
 
     @classmethod
     def from_bytes(cls, raw: bytes, name: str) -> Manifest:
-        """Read what :meth:`to_bytes` wrote, from anyone.
+        """Read untrusted bytes of :meth:`to_bytes`.
 
         Raises:
-            MapError: it is something else, or of a version that is not known.
+            MapError: they are no manifest, or of an unknown version.
         """
         try:
             data = json.loads(raw)
@@ -192,10 +191,10 @@ class Manifest:
 
     @classmethod
     def load(cls, directory: Path) -> Manifest:
-        """Read that of a site's directory.
+        """Read the manifest of a site's directory.
 
         Raises:
-            MapError: there is none, or it cannot be read.
+            MapError: it is missing, or cannot be read.
         """
         path = directory / FILE
         try:
@@ -212,7 +211,7 @@ class Manifest:
 
 
 def is_site(path: Path) -> bool:
-    """Tell whether a path is a directory with a manifest."""
+    """Return whether a path is a directory with a manifest."""
     return (path / FILE).is_file()
 
 
@@ -222,14 +221,14 @@ def in_order(tiles: Iterable[TileEntry]) -> tuple[TileEntry, ...]:
 
 
 def _manifest(data: dict[str, Any]) -> Manifest:
-    origin = tuple(_number(each) for each in data["origin"])
+    origin = tuple(_number(value) for value in data["origin"])
     if len(origin) != 3:
         raise ValueError("origin is no list of three numbers")
     tile, crs, parameters = _number(data["tile"]), data["crs"], data["parameters"]
     if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
-        raise ValueError("tile, crs or parameters are not what they should be")
-    tiles = tuple(_tile(each) for each in data["tiles"])
-    if len({(each.column, each.row) for each in tiles}) != len(tiles):
+        raise ValueError("tile, crs or parameters are invalid")
+    tiles = tuple(_tile(entry) for entry in data["tiles"])
+    if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
         raise ValueError("a tile is named twice")
     signed = str(data.get("signer", "")), str(data.get("signature", ""))
     return Manifest(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
@@ -238,10 +237,10 @@ def _manifest(data: dict[str, Any]) -> Manifest:
 def _tile(data: dict[str, Any]) -> TileEntry:
     column, row = (_whole(data[name], _MAX_INDEX, signed=True) for name in ("column", "row"))
     layers = {}
-    for name, each in data["layers"].items():
-        if name not in LAYERS or not SHA256.fullmatch(each["sha256"]):
+    for name, layer in data["layers"].items():
+        if name not in LAYERS or not SHA256.fullmatch(layer["sha256"]):
             raise ValueError(f"tile {column}, {row} has a layer {str(name)[:20]!r} that is none")
-        layers[name] = LayerEntry(each["sha256"], _whole(each["bytes"], _MAX_LAYER))
+        layers[name] = LayerEntry(layer["sha256"], _whole(layer["bytes"], _MAX_LAYER))
     if not {"cloud", "stations"} <= set(layers):
         raise ValueError(f"tile {column}, {row} lacks a layer")
     points, stations, area = (_whole(data[name], 1 << 31) for name in ("points", "stations", "area"))
@@ -261,21 +260,21 @@ def _number(value: Any) -> float:
 
 
 TILE = 320.0
-"""Edge of a tile, metres: a multiple of what else the map is cut into (20, 16 and 32 m, stations' blocks of 2 m)."""
+"""Edge of a tile, metres: a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)."""
 
 HALO = 64.0
-"""Metres around a tile whose points take part in what is found on it: radius of a virtual scan, and some more."""
+"""Metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin."""
 
 FEATURE_HALO = 112.0
-"""Metres around a tile that its learned features see: 64 for the network and 48 for the ground below those."""
+"""Metres around a tile whose points affect its learned features: 64 for the network, 48 for the ground below these."""
 
 
 @dataclass(frozen=True)
 class SiteGrid:
-    """Where a site's tiles lie, and how they are built.
+    """Grid of a site's tiles, and settings of their build.
 
     Attributes:
-        origin: (3,) metres, in the frame of the sources; a tile's corner lies there.
+        origin: (3,) metres, in the frame of the sources; corner of a tile.
         tile: metres, a multiple of 320.
         config: of the map.
     """
@@ -291,7 +290,7 @@ class SiteGrid:
             raise ConfigError(f"tile={self.config.tile} of the cloud: a site needs one that divides {TILE:g} m")
 
     def cells(self, xy: Reals) -> Ints:
-        """Return column and row (N, 2) of the tiles that positions (N, 2 or 3) in the sources' frame lie in."""
+        """Return column and row (N, 2) of the tiles at positions (N, 2 or 3) in the sources' frame."""
         return np.asarray(np.floor((xy[:, :2] - np.asarray(self.origin[:2])) / self.tile), dtype=np.int64)
 
     def corner(self, key: Key) -> Floats:
@@ -300,19 +299,17 @@ class SiteGrid:
 
     @staticmethod
     def around(key: Key) -> list[Key]:
-        """Return a tile and those that touch it, by row and column."""
+        """Return a tile and its neighbours, by row and column."""
         column, row = key
         return [(column + i, row + j) for j in (-1, 0, 1) for i in (-1, 0, 1)]
 
 
 def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, float]:
-    """Choose the origin of a site by the corners (3,) of its extent: in its middle, a multiple of 320 m, of 10 in z."""
+    """Return the origin of a site with corners (3,): in the middle, rounded to 320 m; the lowest z, rounded to 10 m."""
     middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
-    x, y = (math.floor(float(each) / TILE) * TILE for each in middle[:2])
+    x, y = (math.floor(float(value) / TILE) * TILE for value in middle[:2])
     return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0
 
-
-log = logging.getLogger("coview_stream.maps")
 
 PART_SUFFIX = ".tiles"
 _FORMAT = "coview-part"
@@ -320,10 +317,10 @@ _FORMAT = "coview-part"
 
 @dataclass(frozen=True)
 class Around:
-    """A circle.
+    """Circle on a site.
 
     Attributes:
-        x, y: its centre, in the frame of the site's sources, metres.
+        x, y: centre, in the frame of the site's sources, metres.
         radius: metres.
     """
 
@@ -332,13 +329,12 @@ class Around:
     radius: float
 
     def __post_init__(self) -> None:
-        """Check it; ConfigError where it is none."""
         if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
             raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
 
     @classmethod
     def parse(cls, text: str) -> Around:
-        """Return the circle that ``X,Y,RADIUS`` means; ConfigError where it means none."""
+        """Parse ``X,Y,RADIUS``; ConfigError if it is something else."""
         try:
             x, y, radius = map(float, text.split(","))
         except ValueError:
@@ -346,42 +342,35 @@ class Around:
         return cls(x, y, radius)
 
     def __str__(self) -> str:
-        """Return it as it is given."""
+        """Return ``X,Y,RADIUS``."""
         return ",".join(f"{value:.15g}" for value in (self.x, self.y, self.radius))
 
 
-def tiles_around(manifest: Manifest, *circles: Around) -> set[Key]:
-    """Return the tiles that circles meet.
+def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
+    """Return the tiles that touch a circle.
 
     Raises:
-        MapError: there is none; how far the nearest one is, is said.
+        MapError: there are none; the message has the distance of the nearest one.
     """
-    near, nearest = set(), []
-    for around in circles:
-        distances = _distances(manifest, around)
-        near |= {key for key, distance in distances.items() if distance <= around.radius}
-        nearest.append(min(distances.values(), default=math.inf))
+    x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
+    distances = {}
+    for entry in manifest.tiles:
+        outside = (
+            max(k * manifest.tile - value, 0.0, value - (k + 1) * manifest.tile)
+            for k, value in ((entry.column, x), (entry.row, y))
+        )
+        distances[entry.column, entry.row] = math.hypot(*outside)
+    near = {key for key, distance in distances.items() if distance <= around.radius}
     if not near:
-        away = f"the nearest is {min(nearest):.0f} m away" if manifest.tiles else "it has none"
-        raise MapError(f"around {circles[0]}: no tile of the site is there, {away}; check the coordinates")
+        nearest = f"the nearest is {min(distances.values()):.0f} m away" if distances else "it has none"
+        raise MapError(f"around {around}: no tile of the site is there, {nearest}; check the coordinates")
     return near
 
 
-def _distances(manifest: Manifest, around: Around) -> dict[Key, float]:
-    """Return how far each tile is from the middle of a circle, metres."""
-    x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
-
-    def away(column: int, row: int) -> float:
-        beside = (
-            max(k * manifest.tile - value, 0.0, value - (k + 1) * manifest.tile) for k, value in ((column, x), (row, y))
-        )
-        return math.hypot(*beside)
-
-    return {(tile.column, tile.row): away(tile.column, tile.row) for tile in manifest.tiles}
-
-
 def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
-    """Write which tiles of a site to open, and return the file, one for each site and name.
+    """Write a small file that is opened like a map, with the directory and some tiles of a site; return its path.
+
+    There is one file for each site and ``name``.
 
     Raises:
         MapError: the cache cannot be written.
@@ -392,10 +381,10 @@ def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
 
 
 def read_part(path: Path) -> tuple[Path, set[Key]]:
-    """Return the site's directory and the tiles that a file names.
+    """Return the site's directory and the tiles in a file of :func:`part_file`.
 
     Raises:
-        MapError: it is something else.
+        MapError: it is another file.
     """
     try:
         data = read_record(path)
@@ -407,7 +396,7 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
 
 
 def site_directory(path: Path) -> Path | None:
-    """Return the directory of the site that a map's path means, or is a part of; None for a file."""
+    """Return the directory of the site at a map's path, or of the site of a part; None for a map file."""
     if path.suffix == PART_SUFFIX and path.is_file():
         return read_part(path)[0]
     return path if path.is_dir() else None

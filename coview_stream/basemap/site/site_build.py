@@ -1,7 +1,6 @@
-"""Building of a site out of core: sources to parts, parts to thinned tiles, tiles to layers, and a manifest of them.
+"""Building of a site out of core: sources to parts, parts to thinned tiles, tiles to layers, and a manifest.
 
-Each step is a pure function of files that are complete, so the result is the same, byte for byte, with any number of
-workers and whatever the order, and a build that was broken off goes on where it was.
+The result is the same, byte for byte, with any number of workers and in any order; an interrupted build continues.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from coview_stream.errors import CoViewError, InputError, MapError, warn
 from coview_stream.geometry.arrays import Floats
 
 WORK = ".build"
-"""Folder in a site's directory for what a build has done; only its small records stay when it has ended."""
+"""Folder in a site's directory for intermediate results; its small records stay after the build."""
 
-_MIN_POINTS = 1000  # as of a map in one file
+_MIN_POINTS = 1000  # as for a map in one file
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -40,13 +39,13 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class SiteBuilt:
-    """What a build has come to.
+    """Result of a build.
 
     Attributes:
         manifest: of the site.
-        source_points: that were read.
-        reused: tiles that had been built before.
-        skipped: what was left out, and why, in a line each.
+        source_points: points read.
+        reused: tiles that existed already.
+        skipped: sources and tiles that failed, and the reason, one line each.
     """
 
     manifest: Manifest
@@ -60,10 +59,9 @@ def build_site(
     directory: Path,
     config: MapConfig,
     *,
-    executor: Executor | None = None,
-    tile: float = TILE,
     crs: str | None = None,
     key: SigningKey | None = None,
+    executor: Executor | None = None,
     keep_going: bool = False,
     progress: bool = False,
 ) -> SiteBuilt:
@@ -71,13 +69,12 @@ def build_site(
 
     Args:
         given: cloud files, folders or patterns of them.
-        directory: of the site; made where it is not there.
+        directory: of the site; made if it does not exist.
         config: of the map.
-        executor: runs the steps; None does so in this process.
-        tile: edge of the tiles, metres.
         crs: reference system of files that state none.
         key: signs the manifest.
-        keep_going: leave out sources and tiles that fail, instead of ending.
+        executor: runs the steps; None runs them in this process.
+        keep_going: skip sources and tiles that fail, instead of ending.
         progress: show bars on stderr.
 
     Raises:
@@ -94,43 +91,47 @@ def build_site(
     run = _Run(executor or SerialExecutor(), keep_going, progress)
     sources, low, high = _extent(sources, run)
     before = Manifest.load(directory) if is_site(directory) else None
-    origin = before.origin if before is not None and before.tile == tile else origin_of(low, high)
-    grid = SiteGrid(origin, tile, config)
+    origin = before.origin if before is not None and before.tile == TILE else origin_of(low, high)
+    grid = SiteGrid(origin, TILE, config)
 
     names = list(sources)
     jobs = [(sources[name], name, grid, work / "parts" / f"{k:06d}") for k, name in enumerate(names)]
     parts = run("reading", _partition, jobs, names)
     if not parts:
         raise MapError(f"{directory}: no source could be read")
-    warn(check_together([CloudHead(Path(each.name), each.crs) for each in parts]))
-    keys = sorted({key for each in parts for key in each.tiles}, key=lambda key: (key[1], key[0]))
-    thin_jobs = [ThinJob(grid, key, tuple(each for each in parts if key in each.tiles), work / "thin") for key in keys]
-    counts = run("thinning", _thin, thin_jobs, [_tile_name(job.key) for job in thin_jobs])
+    warn(check_together([CloudHead(Path(part.name), part.crs) for part in parts]))
+    keys = sorted({key for part in parts for key in part.tiles}, key=lambda key: (key[1], key[0]))
+    thin_jobs = [ThinJob(grid, key, tuple(part for part in parts if key in part.tiles), work / "thin") for key in keys]
+    counts = run("thinning", thin, thin_jobs, [_tile_name(job.key) for job in thin_jobs])
     if sum(counts) < _MIN_POINTS:
         raise MapError(
             f"{names[0]}: {sum(counts)} points are left; a base map needs {_MIN_POINTS}: are they in metres?"
         )
-    thinned = {job.key: job for job in thin_jobs if job.file.is_file()}
-    tile_jobs = [_tile_job(grid, key, thinned, directory) for key in thinned]
+    thinned = {job.key: (job.key, job.file, job.digest) for job in thin_jobs if job.file.is_file()}
+    tile_jobs = [
+        TileJob(grid, key, tuple(thinned[k] for k in grid.around(key) if k in thinned), directory, work / "records")
+        for key in thinned
+    ]
     built = run("building tiles", build_tile, tile_jobs, [_tile_name(job.key) for job in tile_jobs])
-    entries = in_order(each.entry for each in built if each.entry is not None)
-    manifest = _manifest(grid, parts, entries, directory)
+    manifest = _manifest(grid, parts, in_order(entry for entry, _ in built if entry is not None), directory)
     if key is not None:
         manifest = manifest.signed(key)
     manifest.save(directory)
     TileStore(directory).prune(manifest.hashes())
     for folder in ("parts", "thin"):
         shutil.rmtree(work / folder, ignore_errors=True)
-    _prune_records(work / "records", tile_jobs)
-    reused = sum(each.reused for each in built)
-    return SiteBuilt(manifest, sum(each.points for each in parts), reused, tuple(run.skipped))
+    records = {job.record for job in tile_jobs}
+    for path in (work / "records").glob("*.json"):
+        if path not in records:
+            path.unlink(missing_ok=True)
+    return SiteBuilt(manifest, sum(part.points for part in parts), sum(old for _, old in built), tuple(run.skipped))
 
 
 def check_directory(directory: Path) -> None:
     """Refuse to build into anything but a new or empty directory, or a site.
 
     Raises:
-        MapError: the path is a file, or a directory with something else in it.
+        MapError: the path is a file, or a directory with other content.
     """
     if directory.exists() and not directory.is_dir():
         raise MapError(f"{directory}: is a file; a site is a directory, a map in one file is called NAME.coview")
@@ -141,7 +142,7 @@ def check_directory(directory: Path) -> None:
 
 
 def _named(sources: list[Source]) -> dict[str, Source]:
-    """Return the sources by their names in the manifest, sorted: the order they were given in changes nothing."""
+    """Return the sources by their names in the manifest, sorted: the order of the arguments changes nothing."""
     if any(source.rows is not None for source in sources):
         raise InputError("a site is built of files; save the arrays as .npy first, or build one .coview file")
     paths = [source.path for source in sources]
@@ -151,37 +152,22 @@ def _named(sources: list[Source]) -> dict[str, Source]:
 
 
 def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], Floats, Floats]:
-    """Return the sources that can be read, and the corners of what they cover, by their heads where these tell."""
+    """Return the readable sources and the corners of their extent, from their heads where these state it."""
     names = list(sources)
-    heads = run("looking", _head, list(sources.values()), names)
+    heads = run("looking", Source.head, list(sources.values()), names)
     usable = {name: source for name, source in sources.items() if name not in run.left_out}
     if not usable:
         raise MapError(f"{names[0]}: no source could be read")
     warn(check_together(heads))
     unknown = [source for source, head in zip(usable.values(), heads, strict=True) if head.low is None]
     extents = [(head.low, head.high) for head in heads if head.low is not None and head.high is not None]
-    found = run("measuring", extent_of, unknown, [str(source.path) for source in unknown])
-    lows, highs = zip(*extents, *found, strict=True)
+    measured = run("measuring", extent_of, unknown, [str(source.path) for source in unknown])
+    lows, highs = zip(*extents, *measured, strict=True)
     return usable, np.min(lows, axis=0), np.max(highs, axis=0)
-
-
-def _head(source: Source) -> CloudHead:
-    return source.head()
 
 
 def _partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
     return partition(*job)
-
-
-def _thin(job: ThinJob) -> int:
-    return thin(job)
-
-
-def _tile_job(grid: SiteGrid, key: Key, thinned: dict[Key, ThinJob], directory: Path) -> TileJob:
-    around = tuple(
-        (other, thinned[other].file, thinned[other].digest) for other in grid.around(key) if other in thinned
-    )
-    return TileJob(grid, key, around, directory, directory / WORK / "records")
 
 
 def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ...], directory: Path) -> Manifest:
@@ -189,8 +175,8 @@ def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ..
         raise MapError(f"{directory}: no ground found; a base map needs points on the ground, z up")
     parameters: dict[str, Any] = {
         "config": asdict(grid.config),
-        "sources": {each.name: each.sha256 for each in parts},
-        "source_points": sum(each.points for each in parts),
+        "sources": {part.name: part.sha256 for part in parts},
+        "source_points": sum(part.points for part in parts),
         "ground_filter": ground_filter(np.zeros((1, 3), dtype=np.float32)),
         "learned": None,
     }
@@ -199,15 +185,8 @@ def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ..
         from coview_stream.descriptors.network import LOCAL_CELL
 
         parameters["learned"] = {"weights": weights_sha256(), "cell": LOCAL_CELL}
-    crs = next((each.crs for each in parts if each.crs is not None), None)
+    crs = next((part.crs for part in parts if part.crs is not None), None)
     return Manifest.from_bytes(Manifest(grid.origin, grid.tile, crs, parameters, tiles).to_bytes(), str(directory))
-
-
-def _prune_records(folder: Path, jobs: Sequence[TileJob]) -> None:
-    kept = {f"{job.key[0]}_{job.key[1]}.{job.digest[:16]}.json" for job in jobs}
-    for path in folder.glob("*.json"):
-        if path.name not in kept:
-            path.unlink(missing_ok=True)
 
 
 def _tile_name(key: Key) -> str:
@@ -218,7 +197,7 @@ class _Run:
     """Runs the steps of a build, one after the other.
 
     Attributes:
-        skipped: what failed and was left out, in a line each.
+        skipped: one line for each item that failed and was skipped.
         left_out: names of these.
     """
 
@@ -230,7 +209,7 @@ class _Run:
     def __call__(
         self, title: str, function: Callable[[Item], Result], items: Sequence[Item], names: Sequence[str]
     ) -> list[Result]:
-        """Return the results in the order of the items; without those that failed, where that is allowed."""
+        """Return the results in the order of the items, without those that failed if that is allowed."""
         results: dict[int, Result] = {}
         failed: dict[int, Exception] = {}
         with _bar(self.progress, title, len(items)) as advance:
@@ -242,16 +221,16 @@ class _Run:
                 if not isinstance(result, CoViewError | OSError):
                     raise result
                 if not self.keep_going:
-                    raise _told(names[number], result) from result
+                    raise _naming(names[number], result) from result
                 failed[number] = result
         for number in sorted(failed):
             self.left_out.add(names[number])
-            self.skipped.append(str(_told(names[number], failed[number])))
+            self.skipped.append(str(_naming(names[number], failed[number])))
         return [results[number] for number in sorted(results)]
 
 
-def _told(name: str, error: Exception) -> Exception:
-    """Return an error that names what it is about."""
+def _naming(name: str, error: Exception) -> Exception:
+    """Return the error with the name of the source or the tile."""
     if Path(name).name in str(error):
         return error
     reason = error.strerror if isinstance(error, OSError) else str(error)

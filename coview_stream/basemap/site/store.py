@@ -1,7 +1,7 @@
-"""Cache of what is made of sites or fetched: ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder.
+"""Store of a site's layers, files named by their sha256; and the cache of working files and mirrors.
 
-Of files that have not been used for longest as many are deleted as keep it within ``$COVIEW_CACHE_GB`` (20). What is in
-it is trusted as far as the user's other files are: it lies in a folder that nobody else can write.
+The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. Least recently used files are deleted
+to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted: nobody else can write them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FOLDER = "layers"
 
 
 def layer_path(sha256: str) -> str:
-    """Return the place of a layer below a site's directory; MapError where ``sha256`` is no hash."""
+    """Return the path of a layer relative to its site's directory; MapError if ``sha256`` is no hash."""
     if not SHA256.fullmatch(sha256):
         raise MapError(f"{sha256[:80]!r} is no sha256 of a layer")
     return f"{_FOLDER}/{sha256[:2]}/{sha256}"
@@ -36,14 +36,14 @@ class TileStore:
     """Layers in the folder ``layers`` of a site's directory, or of a cache.
 
     Attributes:
-        folder: of the files; they lie in folders by the first two digits of their names.
+        folder: of the files, in subfolders by the first two digits of their names.
     """
 
     def __init__(self, directory: Path) -> None:
         self.folder = directory / _FOLDER
 
     def path(self, sha256: str) -> Path:
-        """Return the file of a hash, which need not be there.
+        """Return the file of a layer, which need not exist.
 
         Raises:
             MapError: it is no hash.
@@ -51,7 +51,7 @@ class TileStore:
         return self.folder.parent / layer_path(sha256)
 
     def put(self, content: bytes) -> str:
-        """Write a layer, unless it is there, and return its hash.
+        """Write a layer, unless it exists, and return its hash.
 
         Raises:
             MapError: it cannot be written.
@@ -71,10 +71,10 @@ class TileStore:
         return sha256
 
     def get(self, sha256: str, size: int) -> bytes:
-        """Return a layer whose bytes are what they should be.
+        """Return a layer's bytes.
 
         Raises:
-            MapError: it is missing, cut off or changed; the file is named.
+            MapError: the file is missing, cut off or changed.
         """
         path = self.path(sha256)
         try:
@@ -87,38 +87,35 @@ class TileStore:
         return content
 
     def holds(self, sha256: str, size: int) -> bool:
-        """Tell whether a layer is there, by its length alone."""
+        """Return whether a layer exists with the right length."""
         try:
             return self.path(sha256).stat().st_size == size
         except OSError:
             return False
 
     def is_whole(self, sha256: str, size: int) -> bool:
-        """Tell whether a layer is there and its bytes are what they should be."""
+        """Return whether a layer exists with the right content."""
         try:
             self.get(sha256, size)
         except MapError:
             return False
         return True
 
-    def prune(self, kept: Collection[str]) -> int:
-        """Delete all layers but some, and return how many bytes that gave back."""
-        freed = 0
+    def prune(self, hashes: Collection[str]) -> None:
+        """Delete all other layers than these."""
         for path in self.folder.glob("[0-9a-f][0-9a-f]/*"):
-            if SHA256.fullmatch(path.name) and path.name not in kept:
-                freed += path.stat().st_size
+            if SHA256.fullmatch(path.name) and path.name not in hashes:
                 path.unlink(missing_ok=True)
-        return freed
 
 
 _GB = 1e9
-_MAX_GB = 20.0  # set by hand
+_MAX_GB = 20.0
 _MAX_RECORD = 1 << 24  # bytes
-_MARK = ".checked"  # suffix of the small file beside one that has been compared with its checksum
+_MARK = ".checked"  # suffix of the record of a file that has been compared with its checksum
 
 
 def cache_folder() -> Path:
-    """Return the folder of the cache, made if need be, which nobody else may write."""
+    """Return the folder of the cache, made if it does not exist; only its user can write it."""
     named = os.environ.get("COVIEW_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
     folder = Path(named) if named else Path(base) / "coview-stream"
@@ -132,7 +129,7 @@ def cache_folder() -> Path:
 
 
 def write_record(name: str, data: object) -> Path:
-    """Write plain data into a small file of the cache, ``parts/NAME``, and return it; MapError where that fails."""
+    """Write plain data into a small file of the cache, ``parts/NAME``, and return its path; MapError if that fails."""
     path = cache_folder() / "parts" / name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,22 +141,22 @@ def write_record(name: str, data: object) -> Path:
 
 
 def read_record(path: Path) -> Any:
-    """Return what :func:`write_record` has written; OSError or ValueError for anything else."""
+    """Return the data of :func:`write_record`; OSError or ValueError if there are none."""
     with path.open("rb") as file:
         return json.loads(file.read(_MAX_RECORD))
 
 
 def evict(folder: Path, *keep: Path) -> None:
-    """Delete what has not been used for longest, working files and mirrors, until the cache is within its bound.
+    """Delete the least recently used working files and mirrors until the cache is within its bound.
 
-    Files that a process holds (:func:`hold`) and those to keep stay.
+    Files that a process holds (:func:`hold`), and ``keep``, stay.
     """
-    found = []
+    files = []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):
-            found.append((_last_used(path), _size(path), path))
-    total, bound = sum(size for _, size, _ in found), _bound()
-    for _, size, path in sorted(found):
+            files.append((_last_used(path), _size(path), path))
+    total, bound = sum(size for _, size, _ in files), _bound()
+    for _, size, path in sorted(files):
         if total <= bound:
             break
         if path not in keep and not _is_held(path):
@@ -168,7 +165,7 @@ def evict(folder: Path, *keep: Path) -> None:
 
 
 def hold(file: BinaryIO) -> None:
-    """Have an open file of the cache stay there as long as it, or what is mapped of it, is open in any process."""
+    """Lock an open file against :func:`evict` as long as it, or a mapping of it, is open in any process."""
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -191,9 +188,9 @@ def _is_held(path: Path) -> bool:
 
 
 def checked(path: Path) -> FileIdentity | None:
-    """Return what a file of the cache was when its content was last compared with its checksum; None if it never was.
+    """Return the identity of a cached file when its content was last compared with its checksum, if it ever was.
 
-    It counts as used now.
+    This marks the file as used now.
     """
     mark = path.with_suffix(_MARK)
     try:
@@ -204,13 +201,13 @@ def checked(path: Path) -> FileIdentity | None:
 
 
 def remember_checked(path: Path, state: FileIdentity) -> None:
-    """Keep that the content of a file of the cache has been compared with its checksum."""
+    """Record that the content of a cached file has been compared with its checksum."""
     with contextlib.suppress(OSError), atomic_path(path.with_suffix(_MARK)) as part:
         part.write_text(json.dumps(list(state)))
 
 
 def remember_written(path: Path) -> None:
-    """Keep that a file of the cache has just been written with the checksum of its content."""
+    """Record that a cached file has just been written, with the checksum of its content."""
     with path.open("rb") as file:
         remember_checked(path, file_identity(file))
 
@@ -224,7 +221,7 @@ def _last_used(path: Path) -> float:
 
 def _size(path: Path) -> int:
     if path.is_dir():
-        return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+        return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     return path.stat().st_size
 
 
@@ -249,7 +246,7 @@ def _bound() -> float:
 
 @contextmanager
 def lock(path: Path) -> Iterator[None]:
-    """Let one process make a file at a time; where the system has no locks, several may make the same."""
+    """Let one process write a file at a time; on systems without locks several may write the same file."""
     try:
         import fcntl
     except ImportError:

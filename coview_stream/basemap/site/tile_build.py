@@ -1,16 +1,22 @@
-"""Building of one tile: a pure function of its points, of those around it, and of the site's settings."""
+"""Steps of a site's build, from a source to tiles: partition, thinning, and building of one tile.
+
+Each step is a pure function of complete files and of the settings; its result is not made again if it exists.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.site.layers import PACKING, cloud_layer, encode, square_metres, stations_layer
 from coview_stream.basemap.site.manifest import FEATURE_HALO, HALO, LayerEntry, SiteGrid, TileEntry
 from coview_stream.basemap.site.store import TileStore
@@ -22,23 +28,27 @@ from coview_stream.clouds.cloud import CloudBuilder
 from coview_stream.clouds.files import stream_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.errors import CloudError
-from coview_stream.geometry.arrays import Floats, Floats32, Reals
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
-_MAX_STRAYS = 1 << 15  # columns or rows from the origin: farther points are no part of any site
+_CODE = 2
+"""Version of the tiles' content: tiles of other versions are built again."""
+
+_MAX_STRAYS = 1 << 15  # columns or rows from the origin: farther points are on no site
+_SLAB = 8_000_000  # points thinned at a time: 0.6 GB
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Where the points of a source are.
+    """Points of a source, in files by tile.
 
     Attributes:
         folder: of a file ``COLUMN_ROW.f4`` for each tile, (N, 3) float32 metres about its corner.
         name: of the source.
         sha256: of the source.
-        crs: as it states it.
-        points: that it has and that can be used.
+        crs: stated by the source.
+        points: usable points of the source.
         tiles: number of points by column and row.
     """
 
@@ -62,26 +72,26 @@ class Parts:
 
 
 def extent_of(source: Source) -> tuple[Floats, Floats]:
-    """Return the corners (3,) of a source's extent, metres, for which it is read.
+    """Read a source and return the corners (3,) of its extent, metres.
 
     Raises:
-        CloudError: it cannot be read, or holds nothing.
+        CloudError: it cannot be read, or has no points.
     """
-    measure = _Extent()
-    stream_cloud(source.path, measure)
-    if measure.low is None or measure.high is None:
+    extent = _Extent()
+    stream_cloud(source.path, extent)
+    if extent.low is None or extent.high is None:
         raise CloudError(f"{source.path}: holds zero points; export the cloud again")
-    return measure.low, measure.high
+    return extent.low, extent.high
 
 
 def partition(source: Source, name: str, grid: SiteGrid, folder: Path) -> Parts:
-    """Write a source's points by tiles; what an earlier call has completed is not done again.
+    """Write the points of a source by tiles.
 
     Args:
         source: a file.
         name: of it in the manifest.
         grid: the tiles.
-        folder: for the parts, this source's own; ``FOLDER.json`` says that they are complete.
+        folder: for the parts of this source; ``FOLDER.json`` is written when they are complete.
 
     Raises:
         CloudError: the source cannot be read. OSError: the parts cannot be written.
@@ -89,27 +99,27 @@ def partition(source: Source, name: str, grid: SiteGrid, folder: Path) -> Parts:
     done = folder.with_suffix(".json")
     stat = source.path.stat()
     state = [str(source.path.resolve()), stat.st_size, stat.st_mtime_ns, list(grid.origin), grid.tile, source.crs]
-    known = _completed(done, state, folder, name)
-    if known is not None:
-        return known
+    complete = _complete_parts(done, state, folder, name)
+    if complete is not None:
+        return complete
     shutil.rmtree(folder, ignore_errors=True)
     done.unlink(missing_ok=True)
     folder.mkdir(parents=True)
     writer = _Writer(grid, folder)
-    crs = stream_cloud(source.path, writer)
+    crs = stream_cloud(source.path, writer) or source.crs
     if not writer.counts:
         raise CloudError(f"{source.path}: holds no points that can be used; export the cloud again")
-    sha256, points = source.sha256(), sum(writer.counts.values())
+    parts = Parts(folder, name, source.sha256(), crs, sum(writer.counts.values()), writer.counts)
     facts = {
-        "state": state, "sha256": sha256, "crs": crs or source.crs, "points": points,
+        "state": state, "sha256": parts.sha256, "crs": crs, "points": parts.points,
         "tiles": [[*key, count] for key, count in sorted(writer.counts.items())],
     }  # fmt: skip
     with atomic_file(done) as file:
         file.write(json.dumps(facts).encode())
-    return Parts(folder, name, sha256, crs or source.crs, points, writer.counts)
+    return parts
 
 
-def _completed(done: Path, state: list[object], folder: Path, name: str) -> Parts | None:
+def _complete_parts(done: Path, state: list[object], folder: Path, name: str) -> Parts | None:
     try:
         facts = json.loads(done.read_bytes())
         if facts["state"] != state:
@@ -123,7 +133,7 @@ def _completed(done: Path, state: list[object], folder: Path, name: str) -> Part
 
 
 class _Extent(CloudBuilder):
-    """Builder that keeps nothing but the extent."""
+    """Builder that stores only the extent."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -139,7 +149,7 @@ class _Extent(CloudBuilder):
 
 
 class _Writer(CloudBuilder):
-    """Builder that hands the chunks on to the tiles' files instead of keeping them."""
+    """Builder that writes the chunks into the tiles' files."""
 
     def __init__(self, grid: SiteGrid, folder: Path) -> None:
         super().__init__()
@@ -170,20 +180,14 @@ def _usable(raw: Reals) -> Floats:
     return np.asarray(raw if usable.all() else raw[usable], dtype=np.float64)
 
 
-_CODE = 2
-"""Counts changes of what a tile is made of: tiles of other code are not taken for done."""
-
-_SLAB = 8_000_000  # points that are thinned at a time: 0.6 GB; set by hand
-
-
 @dataclass(frozen=True)
 class ThinJob:
-    """What :func:`thin` is told.
+    """Arguments of :func:`thin`.
 
     Attributes:
         grid: the tiles.
         key: the tile.
-        parts: of the sources that have points there, in the order of their names.
+        parts: of the sources with points there, in the order of their names.
         folder: for the thinned points.
     """
 
@@ -194,26 +198,26 @@ class ThinJob:
 
     @property
     def digest(self) -> str:
-        """Hash of all that the result depends on."""
-        of = [[part.sha256, part.crs, part.tiles[self.key]] for part in self.parts]
-        return _hash([_settings(self.grid), self.key, of])
+        """Hash of all inputs."""
+        points = [[part.sha256, part.crs, part.tiles[self.key]] for part in self.parts]
+        return _hash([_settings(self.grid), self.key, points])
 
     @property
     def file(self) -> Path:
-        """Where the result goes: (N, 3) float32 metres about the tile's corner."""
+        """File of the result: (N, 3) float32 metres about the tile's corner."""
         return self.folder / f"{self.key[0]}_{self.key[1]}.{self.digest[:16]}.npy"
 
 
 @dataclass(frozen=True)
 class TileJob:
-    """What :func:`build_tile` is told.
+    """Arguments of :func:`build_tile`.
 
     Attributes:
         grid: the tiles.
         key: the tile.
-        thinned: of the tiles around and of itself: key, file of the thinned points, and hash of what they are.
+        thinned: of the tile and the tiles around it: key, file of the thinned points, and hash of their inputs.
         site: directory of the site.
-        records: folder of the entries of tiles that are done.
+        records: folder for the entries of tiles that are done.
     """
 
     grid: SiteGrid
@@ -223,139 +227,138 @@ class TileJob:
     records: Path
 
     @property
-    def digest(self) -> str:
-        """Hash of all that the result depends on."""
-        of = [[key, digest] for key, _, digest in self.thinned]
-        return _hash([_CODE, _settings(self.grid), self.key, of, _weights(self.grid)])
+    def record(self) -> Path:
+        """File of the tile's entry; its name has the hash of all inputs."""
+        weights = ""
+        if self.grid.config.learned:
+            from coview_stream.descriptors.feature_map import weights_sha256
 
-
-@dataclass(frozen=True)
-class BuiltTile:
-    """What :func:`build_tile` tells.
-
-    Attributes:
-        entry: of the manifest; None for a tile on which nothing is left after cleaning.
-        reused: whether it was done already.
-    """
-
-    entry: TileEntry | None
-    reused: bool
+            weights = weights_sha256()
+        points = [[key, digest] for key, _, digest in self.thinned]
+        digest = _hash([_CODE, _settings(self.grid), self.key, points, weights])
+        return self.records / f"{self.key[0]}_{self.key[1]}.{digest[:16]}.json"
 
 
 def thin(job: ThinJob) -> int:
-    """Write the centroids of a tile's occupied voxels, and return their number; what is there is not done again."""
+    """Write the centroids of a tile's occupied voxels, and return their number."""
     if job.file.is_file():
         return len(np.load(job.file, mmap_mode="r"))
     voxel, total = job.grid.config.voxel, sum(part.tiles[job.key] for part in job.parts)
     slabs = max(1, -(-total // _SLAB))
-    rows = int(np.ceil(job.grid.tile / voxel))
-    edges = np.linspace(0, rows, slabs + 1).astype(int)
-    found = [
-        voxel_grid(
-            _slab(job, edges[k] * voxel if k else -np.inf, edges[k + 1] * voxel if k + 1 < slabs else np.inf), voxel
-        )
-        for k in range(slabs)
-    ]
+    edges = np.linspace(0, int(np.ceil(job.grid.tile / voxel)), slabs + 1).astype(int) * voxel
+    edges[0], edges[-1] = -np.inf, np.inf
+    centroids = []
+    for low, high in pairwise(edges):
+        several = (part.read(job.key) for part in job.parts)
+        slab = [np.array(points[(points[:, 1] >= low) & (points[:, 1] < high)]) for points in several]
+        centroids.append(voxel_grid(np.concatenate(slab), voxel))
     job.folder.mkdir(parents=True, exist_ok=True)
-    points = np.concatenate(found)
+    points = np.concatenate(centroids)
     with atomic_file(job.file) as file:
         np.save(file, points, allow_pickle=False)
     return len(points)
 
 
-def _slab(job: ThinJob, begin: float, end: float) -> Points:
-    found = []
-    for part in job.parts:
-        points = part.read(job.key)
-        found.append(np.array(points[(points[:, 1] >= begin) & (points[:, 1] < end)]))
-    return np.concatenate(found)
+def build_tile(job: TileJob) -> tuple[TileEntry | None, bool]:
+    """Write a tile's layers into the site's store.
 
-
-def build_tile(job: TileJob) -> BuiltTile:
-    """Write a tile's layers into the site's store, unless they are there, and return its entry."""
-    store, record = TileStore(job.site), job.records / f"{job.key[0]}_{job.key[1]}.{job.digest[:16]}.json"
-    known = _recorded(record, store)
-    if known is not None:
-        return replace(known, reused=True)
+    Returns:
+        The tile's entry, None if no points are left after cleaning; and whether it existed already.
+    """
+    store, record = TileStore(job.site), job.record
+    try:
+        plain = json.loads(record.read_bytes())
+        if plain is None:
+            return None, True
+        layers = {name: LayerEntry(**layer) for name, layer in plain.pop("layers").items()}
+        if all(store.is_whole(layer.sha256, layer.bytes) for layer in layers.values()):
+            return TileEntry(layers=layers, **plain), True
+    except (OSError, ValueError):
+        pass
     entry = _build(job, store)
     job.records.mkdir(parents=True, exist_ok=True)
     with atomic_file(record) as file:
         file.write(json.dumps(None if entry is None else asdict(entry)).encode())
-    return BuiltTile(entry, reused=False)
-
-
-def _recorded(record: Path, store: TileStore) -> BuiltTile | None:
-    try:
-        plain = json.loads(record.read_bytes())
-    except (OSError, ValueError):
-        return None
-    if plain is None:
-        return BuiltTile(None, reused=True)
-    layers = {name: LayerEntry(**each) for name, each in plain.pop("layers").items()}
-    if not all(store.is_whole(layer.sha256, layer.bytes) for layer in layers.values()):
-        return None
-    return BuiltTile(TileEntry(layers=layers, **plain), reused=True)
+    return entry, False
 
 
 def _build(job: TileJob, store: TileStore) -> TileEntry | None:
-    config = job.grid.config
+    config, tile = job.grid.config, job.grid.tile
     region = _region(job, FEATURE_HALO if config.learned else HALO)
     if config.outlier_neighbours:
         region, _ = remove_outliers(region, config.outlier_neighbours, config.outlier_std_ratio)
-    near = region[_within(region, job.grid.tile, HALO)]
-    inside = _within(near, job.grid.tile, 0.0)
+    near = region[_within(region, tile, HALO)]
+    inside = _within(near, tile, 0.0)
     if not inside.any():
         return None
     normals, planarity = estimate_normals(near, config.normal_neighbours, config.normal_radius)
     corner = job.grid.corner(job.key)
-    # in the site's frame: blocks are the same whichever tile they are found from
+    # in the site's frame: neighbouring tiles find the same blocks
     stations = find_stations((near + corner).astype(np.float32), config.block, config.levels)
-    stations = stations[_within((stations - corner).astype(np.float32), job.grid.tile, 0.0)]
-    layers = {
-        "cloud": cloud_layer(near[inside], normals[inside], planarity[inside], job.grid.tile, config.voxel),
-        "stations": stations_layer(stations, config.block),
-    }
+    stations = stations[_within((stations - corner).astype(np.float32), tile, 0.0)]
+    features = None
     if config.learned:
         from coview_stream.descriptors.feature_map import features_of_square
 
-        layers["features"] = features_of_square(
-            (region + corner).astype(np.float32), np.rint(corner[:2]).astype(np.int64), round(job.grid.tile)
+        features = features_of_square(
+            (region + corner).astype(np.float32), np.rint(corner[:2]).astype(np.int64), round(tile)
         )
-    entries = {}
-    for name, arrays in layers.items():
-        content = encode(arrays, PACKING[name])
-        entries[name] = LayerEntry(store.put(content), len(content))
-    heights = near[inside][:, 2]
-    low, high = round(float(heights.min()), 2), round(float(heights.max()), 2)
-    return TileEntry(*job.key, int(inside.sum()), len(stations), square_metres(near[inside]), low, high, entries)
+    return write_tile(store, job.grid, job.key, (near[inside], normals[inside], planarity[inside]), stations, features)
+
+
+def write_tile(
+    store: TileStore,
+    grid: SiteGrid,
+    key: Key,
+    cloud: tuple[Points, Points, Floats32],
+    stations: Floats32,
+    features: Arrays | None,
+) -> TileEntry:
+    """Write the layers of a tile, and return its entry.
+
+    Args:
+        store: of the site.
+        grid: the tiles.
+        key: the tile.
+        cloud: points (N, 3) about the tile's corner, unit normals (N, 3) and planarity (N,).
+        stations: (M, 3) relative to the site's origin.
+        features: learned features, None without.
+    """
+    points = cloud[0]
+    layers = {
+        "cloud": put_layer(store, "cloud", cloud_layer(*cloud, grid.tile, grid.config.voxel)),
+        "stations": put_layer(store, "stations", stations_layer(stations, grid.config.block)),
+    }
+    if features is not None:
+        layers["features"] = put_layer(store, "features", features)
+    low, high = (round(float(height), 2) for height in (points[:, 2].min(), points[:, 2].max()))
+    return TileEntry(*key, len(points), len(stations), square_metres(points), low, high, layers)
+
+
+def put_layer(store: TileStore, name: str, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LayerEntry:
+    """Write a layer, and return its entry."""
+    content = encode(arrays, PACKING[name])
+    return LayerEntry(store.put(content), len(content))
 
 
 def _region(job: TileJob, halo: float) -> Points:
-    """Return the thinned points (N, 3) of a tile and around it, about its corner."""
-    found = []
+    """Return the thinned points (N, 3) on a tile and around it, about its corner."""
+    region = []
     for key, file, _ in job.thinned:
         points = np.load(file, mmap_mode="r", allow_pickle=False)
         shift = np.array([key[0] - job.key[0], key[1] - job.key[1], 0.0]) * job.grid.tile
         moved = (points + shift).astype(np.float32)
-        found.append(moved[_within(moved, job.grid.tile, halo)])
-    return np.concatenate(found)
+        region.append(moved[_within(moved, job.grid.tile, halo)])
+    return np.concatenate(region)
 
 
-def _within(points: Points, tile: float, margin: float) -> np.ndarray:
+def _within(points: Points, tile: float, margin: float) -> Bools:
     low, high = np.float32(-margin), np.float32(tile + margin)
     return np.asarray(((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1))
 
 
 def _settings(grid: SiteGrid) -> object:
     return [list(grid.origin), grid.tile, asdict(grid.config)]
-
-
-def _weights(grid: SiteGrid) -> str:
-    if not grid.config.learned:
-        return ""
-    from coview_stream.descriptors.feature_map import weights_sha256
-
-    return weights_sha256()
 
 
 def _hash(content: object) -> str:
