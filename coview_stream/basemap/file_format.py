@@ -46,9 +46,9 @@ class Loaded(NamedTuple):
 
     Attributes:
         arrays: memory-mapped, read-only.
-        parameters: how it was built.
+        parameters: of the build.
         sha256: of both.
-        identity: of the file that the arrays are mapped from.
+        identity: of the file.
     """
 
     arrays: Arrays
@@ -58,7 +58,7 @@ class Loaded(NamedTuple):
 
 
 _DAMAGE = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, MemoryError, OSError)
-_MAX_ARRAYS = 256  # set by hand: ten times what a map has
+_MAX_ARRAYS = 256  # ten times as many as a map has
 _CHUNK = 1 << 22  # bytes written or hashed at a time
 _CACHE_LINE = 64  # bytes
 _TYPES = {
@@ -78,7 +78,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
         key: signs the file; None leaves it unsigned.
 
     Raises:
-        MapError: the directory does not exist or cannot be written, or the path holds something else than a map.
+        MapError: the directory does not exist or cannot be written, or the path is another kind of file.
     """
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)
@@ -121,8 +121,7 @@ def check_target(path: Path) -> None:
 def _layout(arrays: Arrays, metadata: dict[str, str]) -> tuple[list[str], dict[str, Any]]:
     """Return the order of the arrays, and the header."""
     header: dict[str, Any] = {"__metadata__": metadata}
-    # those that fill cache lines first, so that each of them begins with one; then the wide types, so that every array
-    # begins at a multiple of its item size
+    # arrays that fill cache lines come first, and begin with one; then by item size: each begins at a multiple of it
     names = sorted(arrays, key=lambda name: (arrays[name].nbytes % _CACHE_LINE > 0, -arrays[name].dtype.itemsize, name))
     end = 0
     for name in names:
@@ -133,14 +132,14 @@ def _layout(arrays: Arrays, metadata: dict[str, str]) -> tuple[list[str], dict[s
 
 
 def _header_bytes(header: dict[str, Any]) -> bytes:
-    """Return a header with its length, padded to fill cache lines."""
+    """Return a header with its length, padded to whole cache lines."""
     text = serialized(header)
     text += b" " * (-(8 + len(text)) % _CACHE_LINE)
     return len(text).to_bytes(8, "little") + text
 
 
 def _is_exact(file: BinaryIO, header: dict[str, Any], start: int) -> bool:
-    """Return whether a file begins as we would write its header."""
+    """Return whether a file begins with the header as :func:`save` writes it."""
     try:
         file.seek(0)
         return file.read(start) == _header_bytes(header)
@@ -170,17 +169,16 @@ def open_file(
 ) -> Loaded:
     """Memory-map a map, signed or not.
 
-    The whole file is read once, to compare it with its checksum, if ``check``; after that only the pages used are in
-    memory. Everything is read from the file as it was opened, even if another file takes its name.
+    With ``check`` the whole file is read once, to compare it with its checksum; after that only used pages are in
+    memory. All is read from the file that was opened, even if another file takes its name.
 
     Args:
         path: the file.
-        check: compare its content with its checksum. A file that has to be signed is compared with its signed hashes
-            in any case, unless ``trust`` says that this has been done.
-        trust: demands a signature.
-        checked: of a file whose content has been compared with its checksum already; it is not read again if it is
-            still that.
-        opened: called with the file before anything is read of it.
+        check: compare the content with its checksum. A file that must be signed is always compared with its signed
+            hashes, unless ``trust`` states that this has been done.
+        trust: requires a signature.
+        checked: identity of a file whose content has been compared with its checksum; if equal, it is not read again.
+        opened: called with the file before it is read.
 
     Raises:
         MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
@@ -232,7 +230,7 @@ def open_file(
 
 
 def signer(path: Path) -> str | None:
-    """Return the fingerprint of the key that a map says it is signed with, unverified; None if it is not signed.
+    """Return the unverified fingerprint of the key that signed a map; None if it is not signed.
 
     Raises:
         MapError: it is not a map.
@@ -258,7 +256,7 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
         if isinstance(error, MapError):
             raise
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
-    # only blanks may pad it: JSON would also accept a blank damaged into a line end
+    # padded by blanks only: JSON would also accept a blank damaged into a line end
     padded = text.rstrip(b" ").endswith(b"}")
     if not (padded and isinstance(header, dict) and isinstance(header.get("__metadata__", {}), dict)):
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again")
@@ -291,7 +289,7 @@ def _read(file: BinaryIO, start: int, entry: dict[str, Any]) -> Iterator[bytes]:
 
 
 def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
-    """Cut an array's bytes into chunks; the memory of one that is mapped from a file goes as they are used."""
+    """Yield an array's bytes in chunks, and release mapped pages as they are consumed."""
     data = array.reshape(-1).view(np.uint8)
     for begin in range(0, len(data), _CHUNK):
         yield data[begin : begin + _CHUNK].data
@@ -325,9 +323,9 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "surveyed": ("|u1", ("rows", "columns")),
     "surveyed_corner": ("<f8", (2,)),
     **{
-        f"station_codes{tier}{part}": what
+        f"station_codes{tier}{part}": expected
         for tier in ("", ".rest")
-        for part, what in {
+        for part, expected in {
             "": ("<i2", ("stations", 16, 16)),
             ".basis": ("<f4", (16, 16, "columns of the basis", 2)),
             ".step": ("<f4", (16, 2, 16)),
@@ -344,16 +342,16 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "learned.place": ("|i1", ("places", "numbers")),
     "learned.place_at": ("<f4", ("places", 2)),
 }
-"""Type and shape of each array; a dimension with a name is as long wherever it occurs."""
+"""Type and shape of each array; dimensions of the same name have the same length."""
 
-_MAX_METRES = 1e7  # set by hand, of a corner or a station: no map of the Earth is larger
+_MAX_METRES = 1e7  # of a corner or a station: no map of the Earth is larger
 
 
 def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> None:
-    """Compare type, shape and what else is read as an index.
+    """Check types and shapes of a map's arrays, and values that are used as indices.
 
     Raises:
-        MapError: an array is not what a map of this configuration has; the message names it.
+        MapError: an array does not fit a map of this configuration; the message names it.
     """
     descriptor = ("<f2", ("stations", config.descriptor.rings, config.descriptor.sectors))
     expected = _EXPECTED | {f"descriptor.{name}": descriptor for name in config.descriptor.channels}
@@ -361,15 +359,15 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> N
     for name, (kind, dimensions) in expected.items():
         array = arrays.get(name)
         if array is None:
-            continue  # which ones there have to be, the map says itself
+            continue  # BaseMap requires the arrays that must exist
         if array.dtype != np.dtype(kind) or array.ndim != len(dimensions):
             raise _refused(
                 name, f"is {array.dtype} {array.shape}, not {np.dtype(kind)} in {len(dimensions)} dimensions"
             )
-        for found, dimension in zip(array.shape, dimensions, strict=True):
-            length = dimension if isinstance(dimension, int) else known.setdefault(dimension, found)
-            if found != length:
-                raise _refused(name, f"has the shape {array.shape}, with {found} where {length} were expected")
+        for actual, dimension in zip(array.shape, dimensions, strict=True):
+            length = dimension if isinstance(dimension, int) else known.setdefault(dimension, actual)
+            if actual != length:
+                raise _refused(name, f"has the shape {array.shape}, with {actual} where {length} were expected")
     _check_values(arrays)
 
 
@@ -386,5 +384,5 @@ def _check_values(arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         raise _refused("tile_index", "names points that are not there")
 
 
-def _refused(name: str, what: str) -> MapError:
-    return MapError(f"the map's {name} {what}; copy or build it again")
+def _refused(name: str, flaw: str) -> MapError:
+    return MapError(f"the map's {name} {flaw}; copy or build it again")

@@ -1,4 +1,8 @@
-"""Several maps joined into one, named by a small file, and loaded like one map."""
+"""Several maps as one: placed next to each other in one frame, so that one search compares places on all of them.
+
+The search does not know of it: places on other maps are rivals like those of the same map, and a robot that fits two
+storeys alike stays without a pose. Between two maps is a gap wider than any scan.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +16,8 @@ import numpy as np
 
 from coview_kernels.reference.field import CELL as FIELD_CELL
 from coview_kernels.reference.field import TILE as FIELD_TILE
-from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.file_format import Arrays
+from coview_stream.basemap.file_format import Arrays, save
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, layers_arrays
 from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.basemap.signature import VerifyKey
@@ -25,189 +28,39 @@ from coview_stream.descriptors.feature_map import TILE as FEATURE_TILE
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats, Ints
 
-_CODE = 2
-"""Counts changes of what is made of the same maps."""
+JOINED_SUFFIX = ".joined"
+
+_NAMES_FORMAT = "coview-joined"
+_VERSION = 2  # of the arrays made of the same maps
 
 _MIN_GAP = 300.0
-"""Metres between two maps at least, set by hand: a lidar's range, and what a robot that leaves a map may drive on."""
+"""Metres between two maps at least: a lidar's range, and a margin for a robot that drives off its map."""
 
 _SHARED = ("block", "voxel", "tile", "descriptor")
 
 
-def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
-    """Return one map of several.
+def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
+    """Load one map, or several as one.
 
     Args:
-        maps: by name, in the order in which they are put from west to east.
+        path: as for :meth:`BaseMap.load`; or a file of :func:`write_names`.
+        verify_key: must have signed the map, or each of several.
 
     Raises:
-        MapError: there are none, or they were built with different settings; both and the setting are named.
+        As :meth:`BaseMap.load`; MapError: maps cannot be joined.
     """
-    if not maps:
-        raise MapError("no maps to join: name two or more")
-    _check_alike(maps)
-    config = next(iter(maps.values())).config
-    step = _step(config.block, config.tile)
-    gap = max(_MIN_GAP, 3.0 * config.descriptor.radius)
-    parts, moves, edge = [], [], 0.0
-    for name, base_map in maps.items():
-        low, high = (np.asarray(each, dtype=np.float64) for each in _extent(base_map))
-        move = np.append(np.ceil((np.array([edge, 0.0]) - low[:2]) / step) * step, 0.0)  # local to local
-        begin, end = low[0] + move[0], high[0] + move[0]
-        shift = move - base_map.origin
-        parts.append(
-            MapPart(name, base_map.sha256, base_map.crs, tuple(shift.tolist()), begin - gap / 2, end + gap / 2)
-        )
-        moves.append(move)
-        edge = end + gap
-    several = list(maps.values())
-    arrays: Arrays = {"origin": np.zeros(3)}
-    arrays |= _clouds(several, moves, config.tile)
-    arrays["stations"] = np.concatenate([
-        (each.stations.astype(np.float64) + move).astype(np.float32) for each, move in zip(several, moves, strict=True)
-    ])  # fmt: skip
-    arrays |= _surveyed(several, moves, config.block)
-    arrays |= _fields(several, moves)
-    learned = all(each.learned is not None for each in several)
-    if learned:
-        arrays |= _features(several, moves)
-    described = {
-        name: np.concatenate([each.descriptors(name) for each in several]) for name in config.descriptor.channels
-    }
-    arrays |= StationIndex.of(described).arrays()
-    return BaseMap(arrays, _parameters(maps, parts, learned))
-
-
-def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None = None) -> Path:
-    """Return the file of several maps joined, made now if it is not in the cache.
-
-    Args:
-        paths: names and files, directories or parts of sites.
-        verify_key: has to have signed each of them.
-
-    Raises:
-        MapError: a map cannot be loaded, or they cannot be joined.
-    """
-    maps = {name: BaseMap.load(path, verify_key=verify_key) for name, path in paths}
-    key = repr([(name, each.sha256) for name, each in maps.items()])
-    path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_CODE}.coview"
-    if not path.is_file():
-        joined = join_maps(maps)
-        layers = layers_arrays(joined.arrays) if FIELD_ARRAYS[0] in joined.arrays else {}
-        file_format.save(path, joined.arrays | layers, joined.parameters)
-        remember_written(path)
-        evict(cache_folder(), path)
-    return path
-
-
-def _check_alike(maps: Mapping[str, BaseMap]) -> None:
-    (first, one), *others = maps.items()
-    for name, other in others:
-        for setting in _SHARED:
-            mine, its = (getattr(each.config, setting) for each in (one, other))
-            if mine != its:
-                raise MapError(f"{first} and {name} differ in {setting} ({mine} and {its}): build them with the same")
-        if one.learned is not None and other.learned is not None and one.learned.weights != other.learned.weights:
-            raise MapError(f"{first} and {name} hold features of different networks: build one of them again")
-
-
-def _step(block: float, tile: float) -> float:
-    """Metres by which maps are moved: whole stations, and tiles of all kinds."""
-    edges = (block, tile, FIELD_CELL * FIELD_TILE, float(FEATURE_TILE))
-    return math.lcm(*(round(1000 * edge) for edge in edges)) / 1000.0
-
-
-def _extent(base_map: BaseMap) -> tuple[Floats, Floats]:
-    """Corners (2,) of what a map covers, relative to its origin, metres."""
-    points, surveyed = base_map.points, base_map.arrays["surveyed"]
-    corner, block = base_map.arrays["surveyed_corner"], base_map.config.block
-    low = np.minimum(points[:, :2].min(axis=0), corner)
-    return low, np.maximum(points[:, :2].max(axis=0), corner + block * np.array(surveyed.shape[::-1]))
-
-
-def _clouds(maps: Sequence[BaseMap], moves: Sequence[Floats], tile: float) -> Arrays:
-    points, index, begin = [], [], 0
-    for each, move in zip(maps, moves, strict=True):
-        points.append((each.points.astype(np.float64) + move).astype(np.float32))
-        rows = np.array(each.arrays["tile_index"])
-        rows[:, :2] += _tiles(move, tile)
-        rows[:, 2:] += begin
-        index.append(rows)
-        begin += len(each.points)
-    return {
-        "points": np.concatenate(points),
-        "normals": np.concatenate([np.asarray(each.arrays["normals"]) for each in maps]),
-        "tile_index": np.concatenate(index),
-    }
-
-
-def _surveyed(maps: Sequence[BaseMap], moves: Sequence[Floats], block: float) -> Arrays:
-    """One raster of what has been surveyed: the gaps are not."""
-    corners = [each.arrays["surveyed_corner"] + move[:2] for each, move in zip(maps, moves, strict=True)]
-    low = np.min(corners, axis=0)
-    starts = [np.rint((corner - low) / block).astype(np.int64)[::-1] for corner in corners]
-    shapes = [np.array(each.arrays["surveyed"].shape) for each in maps]
-    whole = np.zeros(np.max([start + shape for start, shape in zip(starts, shapes, strict=True)], axis=0), np.uint8)
-    for each, (row, column), (height, width) in zip(maps, starts, shapes, strict=True):
-        whole[row : row + height, column : column + width] = each.arrays["surveyed"]
-    return {"surveyed": whole, "surveyed_corner": low}
-
-
-def _fields(maps: Sequence[BaseMap], moves: Sequence[Floats]) -> Arrays:
-    if any(name not in each.arrays for each in maps for name in FIELD_ARRAYS):
-        return {}  # it is made when it is first used
-    found: Arrays = {
-        name: np.concatenate([np.asarray(each.arrays[name]) for each in maps])
-        for name in FIELD_ARRAYS
-        if name != "field.tiles"
-    }
-    tiles = []
-    for each, move in zip(maps, moves, strict=True):
-        rows = np.array(each.arrays["field.tiles"])
-        rows[:, :2] += _tiles(move, FIELD_CELL * FIELD_TILE)[::-1].astype(np.int32)
-        tiles.append(rows)
-    return {**found, "field.tiles": np.concatenate(tiles)}
-
-
-def _features(maps: Sequence[BaseMap], moves: Sequence[Floats]) -> Arrays:
-    kept = ("local", "sigma", "place")
-    found: Arrays = {
-        f"learned.{name}": np.concatenate([np.asarray(each.arrays[f"learned.{name}"]) for each in maps])
-        for name in kept
-    }
-    tiles, places = [], []
-    for each, move in zip(maps, moves, strict=True):
-        tiles.append(each.arrays["learned.tiles"] + _tiles(move, float(FEATURE_TILE)).astype(np.int32))
-        places.append((each.arrays["learned.place_at"] + move[:2]).astype(np.float32))
-    return {**found, "learned.tiles": np.concatenate(tiles), "learned.place_at": np.concatenate(places)}
-
-
-def _tiles(move: Floats, edge: float) -> Ints:
-    """How many tiles a map is moved by, east and north."""
-    return np.rint(move[:2] / edge).astype(np.int64)
-
-
-def _parameters(maps: Mapping[str, BaseMap], parts: Sequence[MapPart], learned: bool) -> dict[str, Any]:
-    several = list(maps.values())
-    first = dict(several[0].parameters)
-    return first | {
-        "crs": None,
-        "parts": MapParts(parts).to_json(),
-        "sources": {f"{name}/{source}": sha for name, each in maps.items() for source, sha in each.sources.items()},
-        "source_points": sum(int(each.parameters.get("source_points", 0)) for each in several),
-        "learned": first.get("learned") if learned else None,
-    }
-
-
-JOINED_SUFFIX = ".joined"
-_NAMES_FORMAT = "coview-joined"
+    if path.suffix != JOINED_SUFFIX:
+        return BaseMap.load(path, verify_key=verify_key)
+    maps = read_names(path)
+    joined, _ = open_made(lambda: joined_file(maps, verify_key))
+    return BaseMap.load(joined, check=False)
 
 
 def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
-    """Write names and paths of maps, and return the file, one for each list.
+    """Write names and paths of maps into a small file that :func:`load_map` takes, and return its path.
 
     Raises:
-        MapError: two have one name, or the cache cannot be written.
+        MapError: two have the same name, or the cache cannot be written.
     """
     names = [name for name, _ in maps]
     for name, path in maps:
@@ -219,10 +72,10 @@ def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
 
 
 def read_names(file: Path) -> list[tuple[str, Path]]:
-    """Return the names and paths that a file has.
+    """Return the names and paths in a file of :func:`write_names`.
 
     Raises:
-        MapError: it is something else.
+        MapError: it is another file.
     """
     try:
         data = read_record(file)
@@ -233,19 +86,150 @@ def read_names(file: Path) -> list[tuple[str, Path]]:
         raise MapError(f"{file}: names no maps ({error}); name the maps themselves again") from error
 
 
-def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
-    """Return a map.
+def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None = None) -> Path:
+    """Return the cached file of several maps as one, and write it if it does not exist.
 
     Args:
-        path: as :meth:`BaseMap.load` takes it; or a file of names (:func:`write_names`), whose joined map is made
-            first where it is not there.
-        verify_key: has to have signed it, or each of several.
+        paths: names, and files, directories or parts of sites.
+        verify_key: must have signed each of them.
 
     Raises:
-        As :meth:`BaseMap.load`; MapError: maps cannot be joined.
+        MapError: a map cannot be loaded, or they cannot be joined.
     """
-    if path.suffix != JOINED_SUFFIX:
-        return BaseMap.load(path, verify_key=verify_key)
-    maps = read_names(path)
-    joined, _ = open_made(lambda: joined_file(maps, verify_key))
-    return BaseMap.load(joined, check=False)
+    maps = {name: BaseMap.load(path, verify_key=verify_key) for name, path in paths}
+    key = repr([(name, base_map.sha256) for name, base_map in maps.items()])
+    path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_VERSION}.coview"
+    if not path.is_file():
+        joined = join_maps(maps)
+        layers = layers_arrays(joined.arrays) if FIELD_ARRAYS[0] in joined.arrays else {}
+        save(path, joined.arrays | layers, joined.parameters)
+        remember_written(path)
+        evict(cache_folder(), path)
+    return path
+
+
+def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
+    """Join several maps.
+
+    Args:
+        maps: by name, from west to east in the joined frame.
+
+    Raises:
+        MapError: there are none, or two were built with different settings.
+    """
+    if not maps:
+        raise MapError("no maps to join: name two or more")
+    _check_alike(maps)
+    several = list(maps.values())
+    config = several[0].config
+    parts, moves = _placed(maps)
+    arrays: Arrays = {"origin": np.zeros(3), **_clouds(several, moves, config.tile)}
+    arrays["stations"] = np.concatenate([
+        (base_map.stations.astype(np.float64) + move).astype(np.float32)
+        for base_map, move in zip(several, moves, strict=True)
+    ])  # fmt: skip
+    arrays |= _surveyed(several, moves, config.block)
+    if all(name in base_map.arrays for base_map in several for name in FIELD_ARRAYS):
+        arrays |= _united(several, FIELD_ARRAYS)
+        shifts = [_tiles(move, FIELD_CELL * FIELD_TILE)[::-1] for move in moves]
+        arrays["field.tiles"] = _shifted_tiles(several, "field.tiles", shifts)
+    learned = all(base_map.learned is not None for base_map in several)
+    if learned:
+        arrays |= _united(several, ("learned.local", "learned.sigma", "learned.place"))
+        arrays["learned.tiles"] = _shifted_tiles(
+            several, "learned.tiles", [_tiles(m, float(FEATURE_TILE)) for m in moves]
+        )
+        arrays["learned.place_at"] = np.concatenate([
+            (base_map.arrays["learned.place_at"] + move[:2]).astype(np.float32)
+            for base_map, move in zip(several, moves, strict=True)
+        ])  # fmt: skip
+    channels = config.descriptor.channels
+    described = {name: np.concatenate([base_map.descriptors(name) for base_map in several]) for name in channels}
+    arrays |= StationIndex.of(described).arrays()
+    first = several[0].parameters
+    parameters: dict[str, Any] = dict(first) | {
+        "crs": None,
+        "parts": MapParts(parts).to_json(),
+        "sources": {f"{name}/{source}": sha for name, m in maps.items() for source, sha in m.sources.items()},
+        "source_points": sum(int(base_map.parameters.get("source_points", 0)) for base_map in several),
+        "learned": first.get("learned") if learned else None,
+    }
+    return BaseMap(arrays, parameters)
+
+
+def _check_alike(maps: Mapping[str, BaseMap]) -> None:
+    (first, one), *others = maps.items()
+    for name, other in others:
+        for setting in _SHARED:
+            mine, its = getattr(one.config, setting), getattr(other.config, setting)
+            if mine != its:
+                raise MapError(f"{first} and {name} differ in {setting} ({mine} and {its}): build them with the same")
+        if one.learned is not None and other.learned is not None and one.learned.weights != other.learned.weights:
+            raise MapError(f"{first} and {name} hold features of different networks: build one of them again")
+
+
+def _placed(maps: Mapping[str, BaseMap]) -> tuple[list[MapPart], list[Floats]]:
+    """Return the parts of the joined map, and the moves (3,) of the maps from their zeros, metres."""
+    config = next(iter(maps.values())).config
+    # whole blocks of stations, and whole tiles of all kinds
+    edges = (config.block, config.tile, FIELD_CELL * FIELD_TILE, float(FEATURE_TILE))
+    step = math.lcm(*(round(1000 * edge) for edge in edges)) / 1000.0
+    gap = max(_MIN_GAP, 3.0 * config.descriptor.radius)
+    parts, moves, edge = [], [], 0.0
+    for name, base_map in maps.items():
+        points, corner = base_map.points, base_map.arrays["surveyed_corner"]
+        low = np.minimum(points[:, :2].min(axis=0), corner)
+        size = config.block * np.array(base_map.arrays["surveyed"].shape[::-1])
+        high = np.maximum(points[:, :2].max(axis=0), corner + size)
+        low, high = low.astype(np.float64), high.astype(np.float64)
+        move = np.append(np.ceil((np.array([edge, 0.0]) - low) / step) * step, 0.0)
+        begin, end = low[0] + move[0], high[0] + move[0]
+        shift = tuple((move - base_map.origin).tolist())
+        parts.append(MapPart(name, base_map.sha256, base_map.crs, shift, begin - gap / 2, end + gap / 2))
+        moves.append(move)
+        edge = end + gap
+    return parts, moves
+
+
+def _clouds(maps: Sequence[BaseMap], moves: Sequence[Floats], tile: float) -> Arrays:
+    points, index, begin = [], [], 0
+    for base_map, move in zip(maps, moves, strict=True):
+        points.append((base_map.points.astype(np.float64) + move).astype(np.float32))
+        rows = np.array(base_map.arrays["tile_index"])
+        rows[:, :2] += _tiles(move, tile)
+        rows[:, 2:] += begin
+        index.append(rows)
+        begin += len(base_map.points)
+    return {"points": np.concatenate(points), "tile_index": np.concatenate(index), **_united(maps, ("normals",))}
+
+
+def _surveyed(maps: Sequence[BaseMap], moves: Sequence[Floats], block: float) -> Arrays:
+    """Return one raster of surveyed cells; the gaps are not surveyed."""
+    corners = [base_map.arrays["surveyed_corner"] + move[:2] for base_map, move in zip(maps, moves, strict=True)]
+    low = np.min(corners, axis=0)
+    starts = [np.rint((corner - low) / block).astype(np.int64)[::-1] for corner in corners]
+    rasters = [base_map.arrays["surveyed"] for base_map in maps]
+    ends = [start + raster.shape for start, raster in zip(starts, rasters, strict=True)]
+    whole = np.zeros(np.max(ends, axis=0), np.uint8)
+    for raster, (row, column), (end_row, end_column) in zip(rasters, starts, ends, strict=True):
+        whole[row:end_row, column:end_column] = raster
+    return {"surveyed": whole, "surveyed_corner": low}
+
+
+def _united(maps: Sequence[BaseMap], names: Sequence[str]) -> Arrays:
+    return {name: np.concatenate([np.asarray(base_map.arrays[name]) for base_map in maps]) for name in names}
+
+
+def _shifted_tiles(maps: Sequence[BaseMap], name: str, shifts: Sequence[Ints]) -> Ints:
+    """Return the tiles (T, 2 or 3) of all maps, moved by whole tiles (2,) in the order of the first two columns."""
+    moved = []
+    for base_map, shift in zip(maps, shifts, strict=True):
+        rows = np.array(base_map.arrays[name])
+        rows[:, :2] += shift.astype(np.int32)
+        moved.append(rows)
+    return np.concatenate(moved)
+
+
+def _tiles(move: Floats, edge: float) -> Ints:
+    """Return the number of tiles of a move, east and north."""
+    return np.rint(move[:2] / edge).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Parts of a joined map: which map a place is on, and poses from the joined frame to that map's own, and back."""
+"""Parts of a joined map: the part at a place, and poses between the joined frame and a part's own frame."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class MapPart:
     """One of the maps.
 
     Attributes:
-        name: of it.
-        sha256: of the map that it was.
-        crs: reference system of its own frame, None if it is not known.
-        shift: (3,) metres; what is added to coordinates in its own frame for those in the joined one.
-        begin, end: it reaches over these x in the joined frame, half of the gaps to its neighbours included.
+        name: of the map.
+        sha256: of the map.
+        crs: reference system of its own frame, None if unknown.
+        shift: (3,) metres, from its own frame to the joined frame.
+        begin, end: its range of x in the joined frame, with half of the gaps to its neighbours.
     """
 
     name: str
@@ -37,11 +37,11 @@ class MapPart:
     end: float
 
     def own(self, T: Pose) -> Pose:
-        """Return a pose (4, 4) in the joined frame in this map's own."""
+        """Transform a pose (4, 4) from the joined frame to this map's own."""
         return _shifted(T, -np.array(self.shift))
 
     def joined(self, T: Pose) -> Pose:
-        """Return a pose (4, 4) in this map's own frame in the joined one."""
+        """Transform a pose (4, 4) from this map's own frame to the joined frame."""
         return _shifted(T, np.array(self.shift))
 
 
@@ -54,16 +54,16 @@ class MapParts(Sequence[MapPart]):
 
     @classmethod
     def of(cls, parameters: Mapping[str, Any]) -> MapParts | None:
-        """Return the parts that a map's parameters name; None of a map that was not joined.
+        """Return the parts in a map's parameters; None for a map that was not joined.
 
         Raises:
             MapError: they cannot be read.
         """
-        told = parameters.get("parts")
-        if told is None:
+        rows = parameters.get("parts")
+        if rows is None:
             return None
         try:
-            parts = [_part(each) for each in told]
+            parts = [_part(row) for row in rows]
             if not 0 < len(parts) <= _MAX_PARTS or len({part.name for part in parts}) < len(parts):
                 raise ValueError("none, too many, or two of one name")
         except (TypeError, KeyError, ValueError) as error:
@@ -75,42 +75,42 @@ class MapParts(Sequence[MapPart]):
         return self._parts[index]
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of parts."""
         return len(self._parts)
 
     def at(self, position: Floats) -> MapPart:
-        """Return the part that a place (3,) in the joined frame is on."""
-        found = int(np.searchsorted(self._begins, position[0], side="right")) - 1
-        return self._parts[max(found, 0)]
+        """Return the part at a place (3,) in the joined frame."""
+        number = int(np.searchsorted(self._begins, position[0], side="right")) - 1
+        return self._parts[max(number, 0)]
 
     def named(self, name: str | None) -> MapPart:
         """Return a part by its name.
 
         Raises:
-            InputError: there is none; those that there are, are named.
+            InputError: there is none; the message names the parts.
         """
         for part in self._parts:
             if part.name == name:
                 return part
         known = ", ".join(part.name for part in self._parts)
-        what = "no map is named" if name is None else f"no map is called {name[:_MAX_NAME]!r}"
-        raise InputError(f"{what}: this node has {known}")
+        missing = "no map is named" if name is None else f"no map is called {name[:_MAX_NAME]!r}"
+        raise InputError(f"{missing}: this node has {known}")
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return them as a map's parameters hold them."""
+        """Return the parts as plain data for a map's parameters."""
         return [
             {"name": p.name, "sha256": p.sha256, "crs": p.crs, "shift": list(p.shift), "x": [p.begin, p.end]}
             for p in self._parts
         ]
 
 
-def _part(told: Mapping[str, Any]) -> MapPart:
-    numbers = [float(value) for value in (*told["shift"], *told["x"])]
-    name, sha256, crs = told["name"], told["sha256"], told["crs"]
+def _part(row: Mapping[str, Any]) -> MapPart:
+    numbers = [float(value) for value in (*row["shift"], *row["x"])]
+    name, sha256, crs = row["name"], row["sha256"], row["crs"]
     if len(numbers) != 5 or not all(abs(value) <= _MAX_METRES for value in numbers):
         raise ValueError("shift or x are no lengths")
     if not (isinstance(name, str) and 0 < len(name) <= _MAX_NAME and name.isprintable()):
-        raise ValueError("a name is none")
+        raise ValueError("a name is empty, too long or not printable")
     if not isinstance(sha256, str) or not isinstance(crs, str | None):
         raise ValueError("sha256 or crs is no text")
     return MapPart(name, sha256, crs, (numbers[0], numbers[1], numbers[2]), numbers[3], numbers[4])

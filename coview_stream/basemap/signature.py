@@ -162,7 +162,7 @@ def _read(path: str | os.PathLike[str]) -> bytes:
 
 
 class FileIdentity(NamedTuple):
-    """State of a file by which a change of it is noticed: one that is written to, or replaced, has another."""
+    """State of a file; it changes when the file is written or replaced."""
 
     device: int
     inode: int

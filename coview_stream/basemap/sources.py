@@ -21,7 +21,7 @@ from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
 
 Given = str | os.PathLike[str] | npt.NDArray[Any]
-"""What a caller may name as a source: a file, or (N, 3) points."""
+"""A source as callers give it: a file, or (N, 3) points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +39,12 @@ class Source:
     crs: str | None = None
 
     def head(self) -> CloudHead:
-        """Return what is known before the points are read; CloudError where the file cannot be used."""
+        """Read the file's head, without the points; CloudError if it cannot be used."""
         head = CloudHead(self.path) if self.rows is not None else read_head(self.path)
         return replace(head, crs=head.crs or self.crs)
 
     def read(self) -> Cloud:
-        """Return its points; CloudError where there are none, or no map can be made in its reference system."""
+        """Return the points; CloudError if there are none, or if no map can be made in their reference system."""
         if self.rows is None:
             cloud = read_cloud(self.path)
         else:
@@ -73,10 +73,10 @@ class Source:
 
 
 def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[Source]:
-    """Return the sources that a caller names, each once.
+    """Return the sources of a caller's arguments.
 
     Args:
-        given: a file, a folder or pattern of them, or an array (N, 3), further columns are not used; or several.
+        given: a file, a folder or pattern of files, or an array (N, 3) whose further columns are ignored; or several.
         crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT.
 
     Raises:
@@ -111,8 +111,8 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 def _rows(values: Any, name: str) -> Reals:
     array = np.asarray(values) if hasattr(values, "__array__") else None  # tables of pandas and tensors have it, too
     if array is None or array.ndim != 2 or array.shape[1] < 3:
-        what = f"is a {type(values).__name__}" if array is None else f"has shape {array.shape}"
-        raise CloudError(f"{name} {what}; give a cloud file, or an array (N, 3) of metres")
+        flaw = f"is a {type(values).__name__}" if array is None else f"has shape {array.shape}"
+        raise CloudError(f"{name} {flaw}; give a cloud file, or an array (N, 3) of metres")
     if array.dtype == np.float32:
         return to_array(array[:, :3], np.float32, name)
     return to_array(array[:, :3], np.float64, name)
