@@ -1,4 +1,8 @@
-"""ROS recordings: topics, and messages as CDR in order of arrival."""
+"""ROS recordings, read by rosbags: topics, and messages as CDR in order of arrival.
+
+rosbags unpacks whole chunks, and a chunk of a few kB may claim gigabytes. Its decompressors are replaced by bounded
+ones.
+"""
 
 from __future__ import annotations
 
@@ -17,19 +21,117 @@ from coview_stream.messages import ros2
 from coview_stream.messages.validation import stamp_join
 
 LIMIT = 1 << 29
-"""Bytes that a chunk or a message may unpack to, set by hand: recorders begin a new chunk after a few MB."""
+"""Bytes of an unpacked chunk or message; recorders begin a new chunk after a few MB."""
 
 RATIO = 100
-"""Times its size, besides :data:`LIMIT`, that a whole file may unpack to, set by hand: clouds come to less than ten."""
+"""Times its size, besides :data:`LIMIT`, that a whole file may unpack to; clouds reach less than ten."""
+
+_REMEDIES = (  # the first whose word occurs in the reason
+    ("ompression", "write it again with zstd or without compression (ros2 bag convert)"),
+    ("rofile", "record or export it as ROS 2 (CDR) messages"),
+    ("empty", "copy or record it again"),
+    ("denied", "check its permissions"),
+    ("metadata", "repair it with: ros2 bag reindex"),
+    ("", "repair it (mcap recover, ros2 bag reindex, rosbag reindex) or copy it again"),
+)
+
+
+@contextmanager
+def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
+    """Turn any error that rosbags raises on a damaged recording into one line that names it and the remedy."""
+    try:
+        yield
+    except CoViewError:
+        raise
+    except Exception as error:  # on hostile bytes rosbags raises KeyError, TypeError, AssertionError and more
+        words = " ".join(str(error).split())[:200].rstrip(".")
+        reason = words if " " in words else f"{type(error).__name__} {words}".rstrip()
+        remedy = next(text for word, text in _REMEDIES if word in reason)
+        raise kind(f"{name}: cannot be read ({reason}); {remedy}") from error
+
+
+class BagReader:
+    """An open recording, closed when it is garbage-collected; messages are read one by one.
+
+    Reads rosbag2 directories (sqlite3 and mcap, several files, compressed or not), single ``.mcap`` and ``.db3`` files,
+    and ROS 1 ``.bag`` files, whose messages are converted to CDR.
+
+    Raises:
+        RunError: it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._ros1 = path.suffix == ".bag" and path.is_file()
+        with readable(path):
+            self._reader = _reader_of(path, self._ros1)
+            self._reader.open()
+        weakref.finalize(self, self._reader.close)
+
+    def counts(self) -> dict[tuple[str, str], int]:
+        """Count the messages of each (type, topic); RunError for a topic without a name."""
+        counts: dict[tuple[str, str], int] = {}
+        for connection in self._reader.connections:
+            key = (connection.msgtype, connection.topic)
+            if not all(isinstance(name, str) for name in key):  # a database accepts anything
+                raise RunError(f"{self.path}: cannot be read (a topic without name or type); record or copy it again")
+            counts[key] = counts.get(key, 0) + connection.msgcount
+        return counts
+
+    def messages(self, topics: Mapping[str, str], start: int | None = None) -> Iterator[tuple[str, int, bytes]]:
+        """Yield (topic, arrival in ns, CDR) of the topics (name: type), in order of arrival, from ``start`` on.
+
+        Arrival is on the recorder's clock; it serves only to find a message again.
+
+        Raises:
+            Exception: any that rosbags raises; see :func:`readable`.
+        """
+        connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
+        for connection, arrived, data in self._reader.messages(connections, start=start):
+            payload = ros2.store().ros1_to_cdr(data, connection.msgtype) if self._ros1 else data
+            yield connection.topic, arrived, bytes(payload)
+
+
+def _reader_of(path: Path, ros1: bool) -> Any:
+    _bound_rosbags()
+    if ros1:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+
+        return Ros1Reader(path)
+    from rosbags.rosbag2 import Reader
+
+    return Reader(path)
+
+
+def header_stamp(payload: bytes) -> int:
+    """Read the stamp (ns) of the header at the start of a CDR message; MessageError if there is none."""
+    return stamp_join(*_unpack("iI", payload, 4))
+
+
+def frame_id(payload: bytes, skip: int = 0) -> str:
+    """Read the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
+    offset = 12
+    for _ in range(skip):
+        (length,) = _unpack("I", payload, offset)
+        offset += 4 + length + 3 & ~3
+    (length,) = _unpack("I", payload, offset)
+    return payload[offset + 4 : offset + 4 + length].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+
+def _unpack(kinds: str, payload: bytes, offset: int) -> tuple[int, ...]:
+    if payload[:2] not in (b"\0\0", b"\0\1"):
+        raise MessageError("not a message in CDR")
+    try:
+        return struct.unpack_from((">", "<")[payload[1]] + kinds, payload, offset)
+    except struct.error as error:
+        raise MessageError("the message is truncated") from error
 
 
 def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return a function that unpacks all frames of its argument.
+    """Return a function that unpacks all frames of its argument, to :data:`LIMIT` bytes at most (else ValueError).
 
     Args:
-        make: returns a decompressor like that of bz2: ``decompress(data, max_length)``, ``eof``, ``unused_data``.
-
-    The function raises ValueError where that is more than :data:`LIMIT` bytes, or the data end early.
+        make: returns a decompressor like bz2's: ``decompress(data, max_length)``, ``eof``, ``unused_data``.
     """
 
     def decompress(data: bytes, _: int = 0) -> bytes:
@@ -52,7 +154,7 @@ def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
 
 
 class BoundedFile:
-    """A file that is unpacked while it is read, up to a number of bytes; ValueError beyond."""
+    """A compressed file, unpacked while it is read, up to a number of bytes; ValueError beyond."""
 
     def __init__(self, unpacked: Any, left: int) -> None:
         self._unpacked, self._left = unpacked, left
@@ -73,7 +175,7 @@ class BoundedFile:
 
 
 def bounded_open(opener: Callable[..., Any]) -> Callable[..., BoundedFile]:
-    """Return a function that opens a compressed file as ``opener`` does, to be unpacked within :data:`RATIO`."""
+    """Return a function that opens a compressed file as ``opener`` does, bounded by :data:`RATIO`."""
 
     def opened(file: Any, mode: str = "rb") -> BoundedFile:
         return BoundedFile(opener(file, mode), LIMIT + RATIO * os.fstat(file.fileno()).st_size)
@@ -81,118 +183,17 @@ def bounded_open(opener: Callable[..., Any]) -> Callable[..., BoundedFile]:
     return opened
 
 
-def bound_rosbags() -> None:
-    """Let rosbags' readers, of this process, use such functions instead of their own."""
+def _bound_rosbags() -> None:
+    """Replace the decompressors of rosbags' readers, in this process, by bounded ones."""
     from lz4.frame import LZ4FrameDecompressor
-    from rosbags.rosbag1 import reader as ros1
-    from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_mcap as mcap
+    from rosbags.rosbag1 import reader as ros1_reader
+    from rosbags.rosbag2 import reader as ros2_reader
+    from rosbags.rosbag2 import storage_mcap
 
-    if isinstance(ros2.zstd, SimpleNamespace):
+    library = ros2_reader.zstd
+    if isinstance(library, SimpleNamespace):
         return
-    library = ros2.zstd
     zstd, lz4 = bounded(library.ZstdDecompressor), bounded(LZ4FrameDecompressor)
-    mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
-    ros1.decompressors.update(bz2=bounded(bz2.BZ2Decompressor), lz4=lz4)
-    ros2.zstd = SimpleNamespace(decompress=zstd, open=bounded_open(library.open))
-
-
-_REMEDIES = (  # the first whose word occurs in the reason
-    ("ompression", "write it again with zstd or without compression (ros2 bag convert)"),
-    ("rofile", "record or export it as ROS 2 (CDR) messages"),
-    ("empty", "copy or record it again"),
-    ("denied", "check its permissions"),
-    ("metadata", "repair it with: ros2 bag reindex"),
-    ("", "repair it (mcap recover, ros2 bag reindex, rosbag reindex) or copy it again"),
-)
-
-
-@contextmanager
-def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
-    """Turn any error that rosbags raises on a damaged recording into one line that names it and the remedy."""
-    try:
-        yield
-    except CoViewError:
-        raise
-    except Exception as error:  # a parser of others' bytes: KeyError, TypeError, AssertionError and more
-        words = " ".join(str(error).split())[:200].rstrip(".")
-        reason = words if " " in words else f"{type(error).__name__} {words}".rstrip()
-        remedy = next(text for word, text in _REMEDIES if word in reason)
-        raise kind(f"{name}: cannot be read ({reason}); {remedy}") from error
-
-
-class BagReader:
-    """An open recording, closed when it is garbage-collected; messages are read one by one.
-
-    rosbag2 directories (sqlite3 and mcap, several files, compressed or not), single ``.mcap`` and ``.db3`` files, and
-    ROS 1 ``.bag`` files, whose messages are turned into CDR.
-
-    Raises:
-        RunError: it cannot be opened.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._ros1 = path.suffix == ".bag" and path.is_file()
-        with readable(path):
-            self._reader = _reader_of(path, self._ros1)
-            self._reader.open()
-        weakref.finalize(self, self._reader.close)
-
-    def counts(self) -> dict[tuple[str, str], int]:
-        """Count the messages of each (type, topic); RunError if one of them has no name."""
-        found: dict[tuple[str, str], int] = {}
-        for connection in self._reader.connections:
-            key = (connection.msgtype, connection.topic)
-            if not all(isinstance(name, str) for name in key):  # a database accepts anything
-                raise RunError(f"{self.path}: cannot be read (a topic without name or type); record or copy it again")
-            found[key] = found.get(key, 0) + connection.msgcount
-        return found
-
-    def messages(self, topics: Mapping[str, str], start: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, arrival in ns, CDR) of the topics (name: type), in order of arrival, from ``start`` on.
-
-        Arrival is the recorder's clock, good for finding a message again and for nothing else.
-
-        Raises:
-            Exception: any that rosbags raises; see :func:`readable`.
-        """
-        wanted = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
-        for connection, arrived, data in self._reader.messages(wanted, start=start):
-            payload = ros2.store().ros1_to_cdr(data, connection.msgtype) if self._ros1 else data
-            yield connection.topic, arrived, bytes(payload)
-
-
-def _reader_of(path: Path, ros1: bool) -> Any:
-    bound_rosbags()
-    if ros1:
-        from rosbags.rosbag1 import Reader as Ros1Reader
-
-        return Ros1Reader(path)
-    from rosbags.rosbag2 import Reader
-
-    return Reader(path)
-
-
-def header_stamp(payload: bytes) -> int:
-    """Read the stamp (ns) of the header that a CDR message starts with; MessageError if there is none."""
-    return stamp_join(*_unpack("iI", payload, 4))
-
-
-def frame_id(payload: bytes, skip: int = 0) -> str:
-    """Read the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
-    offset = 12
-    for _ in range(skip):
-        (length,) = _unpack("I", payload, offset)
-        offset += 4 + length + 3 & ~3
-    (length,) = _unpack("I", payload, offset)
-    return payload[offset + 4 : offset + 4 + length].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
-
-
-def _unpack(kinds: str, payload: bytes, offset: int) -> tuple[int, ...]:
-    if payload[:2] not in (b"\0\0", b"\0\1"):
-        raise MessageError("not a message in CDR")
-    try:
-        return struct.unpack_from((">", "<")[payload[1]] + kinds, payload, offset)
-    except struct.error as error:
-        raise MessageError("the message is truncated") from error
+    storage_mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
+    ros1_reader.decompressors.update(bz2=bounded(bz2.BZ2Decompressor), lz4=lz4)
+    ros2_reader.zstd = SimpleNamespace(decompress=zstd, open=bounded_open(library.open))

@@ -1,7 +1,7 @@
-"""Runs out of ROS recordings: PointCloud2 frames, each with the odometry at its stamp.
+"""Runs from ROS recordings: PointCloud2 frames, each with the odometry at its stamp.
 
-A recording is a recorded stream: its messages go through the decoders and the deskewing of the live one. Clouds are
-read when they are asked for, and deskewed where their points have times.
+Messages go through the decoders and the deskewing of the live stream. Clouds are read on demand, and deskewed if their
+points have times.
 """
 
 from __future__ import annotations
@@ -29,13 +29,16 @@ from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stam
 from coview_stream.recordings.run import Run, SweepCorrection
 
 SAME_NS = 1000
-"""Stamps this close are one moment: text files and float64 seconds are good to a microsecond."""
+"""Stamps this close are equal: text files and float64 seconds are good to a microsecond."""
 
-_JUMP_DISTANCE = 1.0  # metres, set by hand: shorter steps are no jump at any rate
+_NS = 1e-9
+_JUMP_DISTANCE = 1.0  # metres; a shorter step is never a jump
+_MAX_SETBACK_NS = 5_000_000_000  # stamps that go back by less are messages out of order
+_MAX_STRAYS = 0.01  # share of stamps that may go back farther, and are left out
 
 
 class Track:
-    """Odometry by stamp, interpolated, but not across gaps and jumps: neither does the node.
+    """Odometry by stamp, interpolated but not across gaps and jumps, as in the node.
 
     Attributes:
         stamps: (K,) nanoseconds, increasing.
@@ -43,7 +46,7 @@ class Track:
     """
 
     def __init__(self, stamps: Ints, poses: Poses) -> None:
-        """Sort the samples; of equal stamps the first counts. At least one sample."""
+        """Sort the samples, at least one; of equal stamps the first counts."""
         config = NodeConfig()
         self.stamps, first = np.unique(stamps, return_index=True)
         self.poses = poses[first]
@@ -53,7 +56,7 @@ class Track:
         self._part = np.concatenate([[0], np.cumsum(~steady)])
 
     def at(self, stamps: Ints) -> tuple[Poses, Bools]:
-        """Interpolate poses (N, 4, 4) at the stamps (N,); also return whether each is known (N,)."""
+        """Interpolate poses (N, 4, 4) at the stamps (N,); also return where they are known (N,)."""
         last = len(self.stamps) - 1
         after = np.clip(np.searchsorted(self.stamps, stamps), 0, last)
         before = np.clip(after - 1, 0, last)
@@ -78,12 +81,8 @@ class Track:
         return Segment(self.stamps[chosen], self.poses[chosen])
 
 
-_NS = 1e-9
-_MAX_SETBACK_NS = 5_000_000_000  # set by hand: stamps that go back by less are messages out of order
-_MAX_STRAYS = 0.01  # set by hand: share of stamps that may go back farther, and are left out
-
 OdometryFromClouds = Callable[["BagClouds"], Track]
-"""Makes odometry of nothing but the clouds, which are not deskewed."""
+"""Makes odometry from the clouds alone, which are not deskewed."""
 
 
 def open_bag(
@@ -94,17 +93,17 @@ def open_bag(
     from_clouds: OdometryFromClouds | None = None,
     mount: Mount | None = None,
 ) -> Run:
-    """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
+    """Read all stamps and odometry of a recording in one pass, and remember where each cloud is.
 
-    Clouds pass through memory one at a time; 16 bytes of each stay, and 150 of each odometry sample.
+    One cloud at a time is in memory; 16 bytes per cloud and 150 per odometry sample stay.
 
     Args:
-        path: as :func:`~coview_stream.recordings.layouts.find_bag` found it.
-        explicit: TUM file to be taken for the odometry, with any stamps; None takes the recording's.
-        cloud_topic: needed where there is more than one topic with PointCloud2.
-        odometry_topic: likewise with Odometry.
-        from_clouds: makes the odometry, also where the recording has some.
-        mount: where the lidar sits; clouds are read into the body frame.
+        path: as returned by :func:`~coview_stream.recordings.layouts.find_bag`.
+        explicit: TUM file of the odometry, with any stamps; None takes the recording's.
+        cloud_topic: required if several topics have PointCloud2.
+        odometry_topic: required if several topics have Odometry.
+        from_clouds: makes the odometry, even if the recording has some.
+        mount: pose of the lidar; clouds are read into the body frame.
 
     Raises:
         RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
@@ -130,7 +129,7 @@ def open_bag(
 class BagClouds:
     """Clouds of a recording by index.
 
-    Read in order, they cost one pass over the recording; read in another order, each is sought by its arrival.
+    Read in order, they cost one pass over the recording; in another order, each is found by its arrival.
     """
 
     def __init__(
@@ -143,7 +142,7 @@ class BagClouds:
         self._next = -1
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
-        """Read frame ``index`` in the body frame at its stamp, deskewed by odometry, which ``correction`` corrects.
+        """Read frame ``index`` in the body frame at its stamp, deskewed by odometry as corrected by ``correction``.
 
         Raises:
             CloudError: it is damaged or has no usable point.
@@ -156,7 +155,7 @@ class BagClouds:
         return builder.finish(self._name(index))
 
     def message(self, index: int) -> CloudMessage:
-        """Read frame ``index`` as it was recorded, but in the body frame; CloudError if it is damaged."""
+        """Read frame ``index`` as recorded, but in the body frame; CloudError if it is damaged."""
         name = self._name(index)
         with self._lock, readable(name, CloudError):
             payload = self._payload(index)
@@ -171,26 +170,33 @@ class BagClouds:
 
     def _payload(self, index: int) -> bytes:
         reads_on = index == self._next and self.arrivals[index] > self.arrivals[index - 1]
-        self._next = -1  # should this fail, the next one is sought
+        self._next = -1  # after a failure the next one is searched for
         for _ in range(2):
             if not reads_on:
                 start = int(self.arrivals[index])
                 self._pending = self.reader.messages({self.topic: ros2.CLOUD}, start)
             for _, arrived, payload in self._pending:
-                if arrived == self.arrivals[index] and _is_of(payload, int(self.stamps[index])):
+                if arrived == self.arrivals[index] and _has_stamp(payload, int(self.stamps[index])):
                     self._next = index + 1
                     return payload
             reads_on = False
         raise ValueError("it is not there any more")
 
-    def _deskewed(self, index: int, message: CloudMessage, usable: Bools, known: SweepCorrection) -> Points:
+    def _deskewed(self, index: int, message: CloudMessage, usable: Bools, correction: SweepCorrection) -> Points:
         points = message.points[usable]
         if message.times is None or not len(points):
             return points
         stamp, times = message.stamp_ns, message.times[usable]
         begin, end = (stamp + round(t / _NS) for t in (min(0.0, times.min()), max(0.0, times.max())))
         sweep = self.track.around(begin, end, stamp)
-        return deskew(points, times, sweep, stamp, self.poses[index], known.R_body_cloud, known.scale)
+        return deskew(points, times, sweep, stamp, self.poses[index], correction.R_body_cloud, correction.scale)
+
+
+def _has_stamp(payload: bytes, stamp_ns: int) -> bool:
+    try:
+        return header_stamp(payload) == stamp_ns
+    except MessageError:
+        return False
 
 
 @dataclass
@@ -227,7 +233,7 @@ def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
 
 def _choose(path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: str | None, option: str) -> str:
     """Return the only topic of the type, or the wanted one."""
-    all_of_kind = {topic: count for (found, topic), count in counts.items() if found == kind}
+    all_of_kind = {topic: count for (name, topic), count in counts.items() if name == kind}
     full = {topic: count for topic, count in all_of_kind.items() if count} or all_of_kind
     listed = ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(all_of_kind.items()))
     if wanted is not None:
@@ -237,7 +243,7 @@ def _choose(path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: s
     if len(full) > 1:
         raise RunError(f"{path}: {len(full)} topics with {kind}; choose by {option}: {listed}")
     if not full:
-        others = ", ".join(f"{topic} ({found})" for found, topic in sorted(counts)[:8]) or "no topics at all"
+        others = ", ".join(f"{topic} ({name})" for name, topic in sorted(counts)[:8]) or "no topics at all"
         remedy = "give --odometry FILE, or " if kind == ros2.ODOMETRY else ""
         raise RunError(f"{path}: no topic with {kind}; {remedy}record one: it has {others}")
     return next(iter(full))
@@ -254,8 +260,21 @@ def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Tr
     if not survey.odometry:
         raise RunError(f"{path}: not one usable odometry message; give --odometry FILE")
     stamps = np.array([stamp for stamp, _ in survey.odometry], np.int64)
-    kept = _steady(path, stamps, "odometry")
-    return Track(stamps[kept], np.array([T for _, T in survey.odometry])[kept])
+    steady = _steady(path, stamps, "odometry")
+    return Track(stamps[steady], np.array([T for _, T in survey.odometry])[steady])
+
+
+def _steady(path: Path, stamps: Ints, noun: str) -> Bools:
+    """Return which stamps (N,) follow all earlier ones, nearly; RunError if the clock was reset."""
+    back = np.maximum.accumulate(stamps) - stamps
+    strays = back > _MAX_SETBACK_NS
+    if strays.sum() > _MAX_STRAYS * len(stamps):
+        at = int(np.argmax(strays))
+        raise RunError(
+            f"{path}: stamps of {noun} go back by {_NS * back[at]:.1f} s at message {at}: the clock started anew; "
+            "split the recording there"
+        )
+    return ~strays
 
 
 @dataclass(frozen=True)
@@ -264,8 +283,8 @@ class _Order:
 
     stamps: Ints  # (K,) ns
     arrivals: Ints  # (K,) ns
-    fresh: Bools  # (K,) no cloud before has the same stamp
-    steady: Bools  # (N,) in order of arrival: the stamp goes not far back, so the cloud is one of the K
+    fresh: Bools  # (K,) no earlier cloud has the same stamp
+    steady: Bools  # (N,) in order of arrival: among the K, since the stamp does not go far back
 
 
 def _in_order(path: Path, survey: _Survey) -> _Order:
@@ -277,35 +296,22 @@ def _in_order(path: Path, survey: _Survey) -> _Order:
     return _Order(in_order, arrivals[steady][order], fresh, steady)
 
 
-def _steady(path: Path, stamps: Ints, what: str) -> Bools:
-    """Return whether each stamp (N,) comes after those before it; RunError if the clock started anew."""
-    back = np.maximum.accumulate(stamps) - stamps
-    strays = back > _MAX_SETBACK_NS
-    if strays.sum() > _MAX_STRAYS * len(stamps):
-        at = int(np.argmax(strays))
-        raise RunError(
-            f"{path}: stamps of {what} go back by {_NS * back[at]:.1f} s at message {at}: the clock started anew; "
-            "split the recording there"
-        )
-    return ~strays
-
-
 def _without_odometry(reader: BagReader, topic: str, survey: _Survey, mount: Mount) -> BagClouds:
-    """Return all clouds that have a stamp of their own, without odometry."""
+    """Return all clouds with distinct stamps, with the identity as odometry."""
     order = _in_order(reader.path, survey)
     stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
-    nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
-    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere, mount)
+    identities = np.tile(np.eye(4), (len(stamps), 1, 1))
+    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, identities), identities, mount)
 
 
 def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: Mount) -> Run:
-    """Return the run of the clouds in order of their stamps, those without odometry left out."""
+    """Return the run of the clouds in order of their stamps, without those that have no odometry."""
     path = reader.path
     order = _in_order(path, survey)
     fresh, steady, stamps = order.fresh, order.steady, order.stamps
     poses, known = track.at(stamps)
-    kept = fresh & known
-    if not kept.any():
+    chosen = fresh & known
+    if not chosen.any():
         raise RunError(
             f"{path}: not one of {len(steady)} clouds has odometry at its stamp: clouds are stamped "
             f"{_span(stamps)}, odometry {_span(track.stamps)}; are their clocks the same, and their headers stamped?"
@@ -316,9 +322,9 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: M
         (int((~steady).sum()), "with a stamp that goes far back"),
     )
     notes = []
-    if not kept.all() or not steady.all():
+    if not chosen.all() or not steady.all():
         text = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
-        notes.append(f"{path}: {len(steady) - int(kept.sum())} of {len(steady)} clouds left out: {text}")
+        notes.append(f"{path}: {len(steady) - int(chosen.sum())} of {len(steady)} clouds left out: {text}")
     if survey.damaged:
         notes.append(f"{path}: {survey.damaged} damaged messages left out")
     if survey.lidar and survey.body and survey.lidar != survey.body and mount == Mount():
@@ -326,15 +332,8 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: M
             f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
             "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
         )
-    source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept], mount)
+    source = BagClouds(reader, topic, stamps[chosen], order.arrivals[chosen], track, poses[chosen], mount)
     return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes), mount)
-
-
-def _is_of(payload: bytes, stamp_ns: int) -> bool:
-    try:
-        return header_stamp(payload) == stamp_ns
-    except MessageError:
-        return False
 
 
 def _span(stamps: Ints) -> str:

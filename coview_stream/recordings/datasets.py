@@ -1,7 +1,13 @@
-"""MulRan's folders: Ouster sweeps named by their stamps, and poses of the vehicle in ``global_pose.csv``."""
+"""Runs of public datasets with layouts of their own: drives of KITTI's raw data, and MulRan.
+
+Both have sweeps and poses at different stamps. Sweeps without poses around their stamps are left out and counted in the
+run's notes. The poses serve as odometry; nothing is read as the truth.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -13,62 +19,110 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, Poses, exp_so3, interpolate, inverse, orthonormal, pose_from, rot_z
 from coview_stream.recordings.run import Run
 
-_SWEEPS, _INERTIAL = "velodyne_points", "oxts"
-_CALIBRATION = "calib_imu_to_velo.txt"
-_EARTH = 6_378_137.0  # metres, of the sphere that the data's own tools take
-_COLUMNS = 6  # latitude, longitude, height, roll, pitch, yaw; more follow
-_MAX_GAP = 0.5  # seconds between two poses; set by hand
+_MAX_GAP = 0.5  # seconds between two poses
+
+_KITTI_SWEEPS, _KITTI_INERTIAL = "velodyne_points", "oxts"
+_KITTI_CALIBRATION = "calib_imu_to_velo.txt"
+_KITTI_COLUMNS = 6  # latitude, longitude, height, roll, pitch, yaw; more follow
+_EARTH = 6_378_137.0  # metres; radius of the sphere in the dataset's own tools
+
+_MULRAN_SWEEPS = ("sensor_data/Ouster", "Ouster")
+_MULRAN_POSES = "global_pose.csv"
+_MULRAN_COLUMNS = 13  # stamp and the first three rows of world <- vehicle
+_MAX_SKEW = 1e-3  # of a rotation matrix in text
 
 
 def is_kitti_raw(path: Path) -> bool:
-    """Tell whether a directory is such a drive."""
-    return (path / _SWEEPS / "data").is_dir()
+    """Return whether a directory is a drive of KITTI's raw data."""
+    return (path / _KITTI_SWEEPS / "data").is_dir()
 
 
 def open_kitti_raw(path: Path, mount: Mount | None = None) -> Run:
-    """Open a drive; sweeps without poses around their stamps are left out and counted in its notes.
+    """Open a drive of KITTI's raw data, with the poses of the car's inertial system (OXTS) as odometry.
 
-    The body is the lidar where ``calib_imu_to_velo.txt`` lies beside the drive or in the folder of its day; otherwise
-    the lidar is taken to sit at the inertial system.
+    The first pose lies at zero; its heading is kept, so the odometry frame is level. The body is the lidar if
+    ``calib_imu_to_velo.txt`` is in the drive's folder or its parent; otherwise the lidar is taken to sit at the
+    inertial system.
 
     Raises:
-        RunError: no sweeps, no poses, or a line that is none; the message names file and line.
+        RunError: no sweeps, no poses, or a malformed line; the message names file and line.
     """
-    files = sorted(file for file in (path / _SWEEPS / "data").glob("*.bin") if file.stem.isdecimal())
+    files = sorted(file for file in (path / _KITTI_SWEEPS / "data").glob("*.bin") if file.stem.isdecimal())
     if not files:
-        raise RunError(f"{path / _SWEEPS / 'data'}: no sweeps (0000000000.bin); unpack the drive's velodyne_points")
-    stamps = _stamps(path / _SWEEPS / "timestamps.txt")
-    if int(files[-1].stem) >= len(stamps):
         raise RunError(
-            f"{path / _SWEEPS / 'timestamps.txt'}: has {len(stamps)} stamps, and sweep {files[-1].name} none"
+            f"{path / _KITTI_SWEEPS / 'data'}: no sweeps (0000000000.bin); unpack the drive's velodyne_points"
         )
-    when = stamps[[int(file.stem) for file in files]]
-    known, T_odom_imu = _inertial_poses(path / _INERTIAL)
-    T_velo_imu, note = _calibration(path)
-    after = np.clip(np.searchsorted(known, when, side="left"), 1, len(known) - 1)
-    inside = (when >= known[0]) & (when <= known[-1]) & (known[after] - known[after - 1] <= _MAX_GAP)
+    stamps_file = path / _KITTI_SWEEPS / "timestamps.txt"
+    stamps = _kitti_stamps(stamps_file)
+    if int(files[-1].stem) >= len(stamps):
+        raise RunError(f"{stamps_file}: has {len(stamps)} stamps, and sweep {files[-1].name} none")
+    T_velo_imu, notes = _kitti_calibration(path)
+    pose_stamps, T_odom_imu = _kitti_poses(path / _KITTI_INERTIAL)
+    sweeps = stamps[[int(file.stem) for file in files]]
+    run = _paired(path, files, sweeps, pose_stamps, T_odom_imu, _KITTI_INERTIAL, notes, mount)
+    return replace(run, poses=run.poses @ inverse(T_velo_imu))
+
+
+def find_sweeps(path: Path) -> Path | None:
+    """Return the folder of a MulRan run's sweeps; None if ``path`` is no such run."""
+    return next((path / name for name in _MULRAN_SWEEPS if (path / name).is_dir()), None)
+
+
+def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
+    """Open a MulRan run: Ouster sweeps named by their stamps, and the vehicle's poses in ``global_pose.csv``.
+
+    The clouds are the lidar's, the poses the vehicle's: ``mount`` (``--mount``) is the lidar's place on the vehicle.
+
+    Raises:
+        RunError: no sweeps, no poses, or a malformed line; the message names file and line.
+    """
+    poses_file = next((folder / _MULRAN_POSES for folder in (path, sweeps.parent)
+                       if (folder / _MULRAN_POSES).is_file()), None)  # fmt: skip
+    if poses_file is None:
+        raise RunError(f"{path / _MULRAN_POSES}: no such file; MulRan's sweeps need it for their odometry")
+    files = sorted((file for file in sweeps.glob("*.bin") if file.stem.isdecimal()), key=lambda file: int(file.stem))
+    if not files:
+        raise RunError(f"{sweeps}: no sweeps named by their stamps (1564718964270138112.bin)")
+    pose_stamps, T = _mulran_poses(poses_file)
+    stamps = np.array([int(file.stem) for file in files], dtype=np.int64)
+    return _paired(path, files, stamps, pose_stamps, T, poses_file.name, (), mount)
+
+
+def _paired(
+    path: Path,
+    files: Sequence[Path],
+    stamps: Floats | Ints,
+    pose_stamps: Floats | Ints,
+    T: Poses,
+    source: str,
+    notes: tuple[str, ...],
+    mount: Mount | None,
+) -> Run:
+    """Return the run of the sweeps (N) between poses (K, 4, 4); stamps in float seconds or integer nanoseconds."""
+    unit = 1e-9 if stamps.dtype.kind == "i" else 1.0
+    after = np.clip(np.searchsorted(pose_stamps, stamps), 1, len(pose_stamps) - 1)
+    inside = (stamps >= pose_stamps[0]) & (stamps <= pose_stamps[-1])
+    inside &= unit * (pose_stamps[after] - pose_stamps[after - 1]) <= _MAX_GAP
     if not inside.any():
-        raise RunError(f"{path}: none of {len(files)} sweeps has a pose around its stamp in {_INERTIAL}")
+        raise RunError(f"{path}: none of {len(files)} sweeps has a pose around its stamp in {source}")
     end = after[inside]
-    share = (when[inside] - known[end - 1]) / (known[end] - known[end - 1])
-    between: Poses = np.asarray(interpolate(T_odom_imu[end - 1], T_odom_imu[end], share), dtype=np.float64)
+    share = (stamps[inside] - pose_stamps[end - 1]) / (pose_stamps[end] - pose_stamps[end - 1])
     left_out = len(files) - int(inside.sum())
-    notes = [f"{left_out} of {len(files)} sweeps have no pose around them in {_INERTIAL} and are left out"] * (
-        left_out > 0
-    )
+    if left_out:
+        notes = (f"{left_out} of {len(files)} sweeps have no pose around them in {source} and are left out", *notes)
     return Run(
         path,
         tuple(file for file, keep in zip(files, inside, strict=True) if keep),
-        when[inside],
-        between @ inverse(T_velo_imu),
-        notes=(*notes, *note),
+        np.asarray(stamps[inside] * unit, dtype=np.float64),
+        np.asarray(interpolate(T[end - 1], T[end], share), dtype=np.float64),
+        notes=notes,
         mount=mount,
     )
 
 
-def _stamps(path: Path) -> Floats:
+def _kitti_stamps(path: Path) -> Floats:
     """Read stamps (N,) seconds, one a line: ``2011-09-26 13:02:25.964389445``."""
-    found = []
+    stamps = []
     try:
         lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError as error:
@@ -79,18 +133,18 @@ def _stamps(path: Path) -> Floats:
         whole, _, fraction = line.strip().partition(".")
         try:
             seconds = datetime.fromisoformat(f"{whole}+00:00").timestamp()
-            found.append(seconds + (float(f"0.{int(fraction):0{len(fraction)}d}") if fraction else 0.0))
+            stamps.append(seconds + (float(f"0.{int(fraction):0{len(fraction)}d}") if fraction else 0.0))
         except ValueError as error:
             raise RunError(f"{path}:{number}: no stamp ({error}); restore the file") from error
-    if not found or (np.diff(found) < 0).any():
+    if not stamps or (np.diff(stamps) < 0).any():
         raise RunError(f"{path}: has no stamps, or some that go back; restore the file")
-    return np.array(found)
+    return np.array(stamps)
 
 
-def _inertial_poses(folder: Path) -> tuple[Floats, Poses]:
+def _kitti_poses(folder: Path) -> tuple[Floats, Poses]:
     """Read stamps (N,) seconds and poses (N, 4, 4) of the inertial system, the first position at zero."""
     files = sorted((folder / "data").glob("*.txt"))
-    stamps = _stamps(folder / "timestamps.txt")
+    stamps = _kitti_stamps(folder / "timestamps.txt")
     if len(files) != len(stamps) or len(files) < 2:
         raise RunError(f"{folder}: {len(files)} poses and {len(stamps)} stamps; unpack the drive's oxts whole")
     rows = []
@@ -99,24 +153,25 @@ def _inertial_poses(folder: Path) -> tuple[Floats, Poses]:
             row = [float(word) for word in file.read_text(encoding="ascii").split()]
         except (OSError, ValueError) as error:
             raise RunError(f"{file}: no pose ({error}); restore the file") from error
-        if len(row) < _COLUMNS or not np.isfinite(row[:_COLUMNS]).all() or abs(row[0]) >= 89.0:
+        if len(row) < _KITTI_COLUMNS or not np.isfinite(row[:_KITTI_COLUMNS]).all() or abs(row[0]) >= 89.0:
             raise RunError(f"{file}: no latitude, longitude, height, roll, pitch and yaw; restore the file")
-        rows.append(row[:_COLUMNS])
+        rows.append(row[:_KITTI_COLUMNS])
     table = np.array(rows)
     latitude, longitude = np.radians(table[:, 0]), np.radians(table[:, 1])
-    scale = _EARTH * np.cos(latitude[0])  # of Mercator's projection there: metres on the ground
-    places = np.column_stack([scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), table[:, 2]])
-    places -= places[0]
+    scale = _EARTH * np.cos(latitude[0])  # of Mercator's projection: metres on the ground
+    positions = np.column_stack([scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), table[:, 2]])
+    positions -= positions[0]
     turns = [rot_z(yaw) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0]) for roll, pitch, yaw in table[:, 3:]]
     once = np.append(True, np.diff(stamps) > 0)
-    return stamps[once], np.array([pose_from(R, t) for R, t in zip(turns, places, strict=True)])[once]
+    return stamps[once], np.array([pose_from(R, t) for R, t in zip(turns, positions, strict=True)])[once]
 
 
-def _calibration(path: Path) -> tuple[Pose, tuple[str, ...]]:
-    """Return lidar <- inertial system, and a note where it is not known."""
-    file = next((each / _CALIBRATION for each in (path, path.parent) if (each / _CALIBRATION).is_file()), None)
+def _kitti_calibration(path: Path) -> tuple[Pose, tuple[str, ...]]:
+    """Return lidar <- inertial system, and a note if it is unknown."""
+    name = _KITTI_CALIBRATION
+    file = next((folder / name for folder in (path, path.parent) if (folder / name).is_file()), None)
     if file is None:
-        return np.eye(4), (f"no {_CALIBRATION} beside the drive: the lidar is taken to sit at the inertial system",)
+        return np.eye(4), (f"no {name} beside the drive: the lidar is taken to sit at the inertial system",)
     values = {}
     for line in file.read_text(encoding="ascii", errors="replace").splitlines():
         name, _, numbers = line.partition(":")
@@ -128,81 +183,30 @@ def _calibration(path: Path) -> tuple[Pose, tuple[str, ...]]:
     if {name: value.size for name, value in values.items()} != {"R": 9, "T": 3}:
         raise RunError(f"{file}: has no R of nine and T of three numbers; restore the file")
     R = values["R"].reshape(3, 3)
-    if not np.isfinite(R).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+    if not np.isfinite(R).all() or np.abs(R @ R.T - np.eye(3)).max() > _MAX_SKEW:
         raise RunError(f"{file}: R is no rotation; restore the file")
     return pose_from(R, values["T"]), ()
 
 
-_SWEEP_FOLDERS = ("sensor_data/Ouster", "Ouster")
-_POSE_FILE = "global_pose.csv"
-_POSE_COLUMNS = 13  # stamp and the first three rows of world <- vehicle
-_MAX_POSE_GAP = 0.5  # seconds between two poses; set by hand
-_LAST_DIGITS = 1e-3  # that poses may be off an exact rotation; set by hand
-
-
-def find_sweeps(path: Path) -> Path | None:
-    """Return the folder of the sweeps, if ``path`` is such a run."""
-    return next((path / each for each in _SWEEP_FOLDERS if path.is_dir() and (path / each).is_dir()), None)
-
-
-def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
-    """Open a run; sweeps outside the poses, or in a gap of them, are left out and counted in its notes.
-
-    The poses are the vehicle's, and the clouds the lidar's: give the lidar's place by ``mount`` (``--mount``).
-
-    Raises:
-        RunError: there are no sweeps, no poses, or lines that are none; the message names file and line.
-    """
-    poses_file = next((each for each in (path / _POSE_FILE, sweeps.parent / _POSE_FILE) if each.is_file()), None)
-    if poses_file is None:
-        raise RunError(f"{path / _POSE_FILE}: no such file; MulRan's sweeps need it for their odometry")
-    files = sorted((file for file in sweeps.glob("*.bin") if file.stem.isdecimal()), key=lambda file: int(file.stem))
-    if not files:
-        raise RunError(f"{sweeps}: no sweeps named by their stamps (1564718964270138112.bin)")
-    stamps_ns, T = _mulran_poses(poses_file)
-    wanted = np.array([int(file.stem) for file in files], dtype=np.int64)
-    after = np.searchsorted(stamps_ns, wanted)
-    inside = (after > 0) & (after < len(stamps_ns))
-    gap = np.full(len(wanted), np.inf)
-    gap[inside] = (stamps_ns[after[inside]] - stamps_ns[after[inside] - 1]) * 1e-9
-    kept = gap <= _MAX_POSE_GAP
-    if not kept.any():
-        raise RunError(f"{path}: none of {len(files)} sweeps has a pose around its stamp in {poses_file.name}")
-    end = after[kept]
-    share = (wanted[kept] - stamps_ns[end - 1]) / (stamps_ns[end] - stamps_ns[end - 1])
-    between: Poses = np.asarray(interpolate(T[end - 1], T[end], share), dtype=np.float64)
-    left_out = int(len(files) - kept.sum())
-    notes = (f"{left_out} of {len(files)} sweeps have no pose around them in {poses_file.name} and are left out",)
-    chosen = tuple(file for file, keep in zip(files, kept, strict=True) if keep)
-    return Run(
-        path,
-        chosen,
-        np.asarray(wanted[kept] * 1e-9, dtype=np.float64),
-        between,
-        notes=notes if left_out else (),
-        mount=mount,
-    )
-
-
 def _mulran_poses(path: Path) -> tuple[Ints, Poses]:
-    """Read stamps (N,) int64 nanoseconds and poses (N, 4, 4), increasing."""
-    stamps, rows = [], []
+    """Read stamps (N,) int64 nanoseconds, increasing, and poses (N, 4, 4)."""
+    stamps, poses = [], []
     with path.open(encoding="ascii", errors="replace") as stream:
         for number, line in enumerate(stream, start=1):
             cells = line.strip().split(",")
             if cells == [""]:
                 continue
             try:
-                if len(cells) != _POSE_COLUMNS:
-                    raise ValueError(f"{len(cells)} columns, {_POSE_COLUMNS} expected")
+                if len(cells) != _MULRAN_COLUMNS:
+                    raise ValueError(f"{len(cells)} columns, {_MULRAN_COLUMNS} expected")
                 stamps.append(int(cells[0]))
                 values = np.array([float(cell) for cell in cells[1:]]).reshape(3, 4)
             except ValueError as error:
                 raise RunError(f"{path}:{number}: no pose ({error}); restore the file") from error
             T = pose_from(values[:, :3], values[:, 3])
-            if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > _LAST_DIGITS:
+            if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > _MAX_SKEW:
                 raise RunError(f"{path}:{number}: its rotation is none; restore the file")
-            rows.append(orthonormal(T))
-    if len(rows) < 2 or (np.diff(stamps) <= 0).any():
+            poses.append(orthonormal(T))
+    if len(poses) < 2 or (np.diff(stamps) <= 0).any():
         raise RunError(f"{path}: has fewer than two poses, or stamps that do not increase; restore the file")
-    return np.array(stamps, dtype=np.int64), np.array(rows)
+    return np.array(stamps, dtype=np.int64), np.array(poses)

@@ -19,9 +19,9 @@ _FOLDERS = {
     "frames": ("odometry.tum",),
     "velodyne": ("odometry.tum", "poses.txt"),  # KITTI's
     "velodyne_points/data": ("odometry.tum",),  # KITTI's raw data, whose own poses lie elsewhere
-    "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # what SC-LIO-SAM and SC-A-LOAM save
+    "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # saved by SC-LIO-SAM and SC-A-LOAM
 }
-"""Folders of frames, and the files beside them that may hold the odometry: the first that is there."""
+"""Folders of frames, and files of odometry next to them; the first existing file counts."""
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
     "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
@@ -50,7 +50,7 @@ def find_layout(path: Path) -> Layout:
     """Find the files of the run at ``path``, a directory or a single cloud file.
 
     Raises:
-        RunError: nothing there, no layout that is known, or no frames; the message says what is expected.
+        RunError: missing, of an unknown layout, or without frames; the message names the layouts.
     """
     if not path.exists():
         raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
@@ -64,7 +64,7 @@ def find_layout(path: Path) -> Layout:
             odometry = next((path / name for name in names if (path / name).exists()), None)
             times = path / "times.txt"
             return Layout(path, frames, odometry, times if times.exists() else None)
-    if fused := next((each for each in (path, path / "PCD") if any(each.glob("scans*.pcd"))), None):
+    if fused := next((folder for folder in (path, path / "PCD") if any(folder.glob("scans*.pcd"))), None):
         raise RunError(
             f"{fused}: scans*.pcd, as FAST-LIO saves them, lie in its own world frame: a map, and no run; record its "
             "/cloud_registered_body and /Odometry in a bag, and give that"
@@ -85,7 +85,7 @@ def find_bag(path: Path) -> Path | None:
     """Find the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
 
     Raises:
-        RunError: a directory holds several recordings, and no ``metadata.yaml`` says that they belong together.
+        RunError: a directory holds several recordings and no ``metadata.yaml``.
     """
     if not path.is_dir():
         return path if path.suffix in _BAGS and path.is_file() else None
@@ -103,10 +103,10 @@ def find_bag(path: Path) -> Path | None:
 
 
 def _frames(folder: Path) -> tuple[Path, ...]:
-    """List the cloud files of a folder by number, or by name where a name is no number.
+    """List the cloud files of a folder by number, or by name if one is no number.
 
     Raises:
-        RunError: none at all, two files of one number, or one that is no file.
+        RunError: no cloud, two files of one number, or an entry that is no file.
     """
     files = [file for file in folder.iterdir() if is_cloud_name(file)]
     if not files:
@@ -142,7 +142,7 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats,
 
 
 def read_stamps(layout: Layout) -> Floats | None:
-    """Read stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
+    """Read stamps (N,) in seconds, one per frame, without the odometry; None if the run has none.
 
     Raises:
         RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
@@ -157,10 +157,10 @@ def read_stamps(layout: Layout) -> Floats | None:
     return stamps
 
 
-def _check_count(file: Path, count: int, what: str, layout: Layout) -> None:
+def _check_count(file: Path, count: int, noun: str, layout: Layout) -> None:
     if count != len(layout.frames):
         relation = "too short" if count < len(layout.frames) else "too long"
-        raise RunError(f"{file}: {relation}, {count} {what} for {len(layout.frames)} frames; give one line per frame")
+        raise RunError(f"{file}: {relation}, {count} {noun} for {len(layout.frames)} frames; give one line per frame")
 
 
 def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
@@ -197,7 +197,7 @@ def _calibration(path: Path) -> Pose | None:
 
 
 def _refuse_camera_poses(poses: Poses, file: Path) -> None:
-    """Refuse KITTI's camera poses, whose z points forward: as body poses they would fly into the sky."""
+    """Refuse KITTI's camera poses: their z axis points forward, so as body poses they would drive upwards."""
     steps = np.einsum("nij,ni->nj", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
     x, _, z = np.abs(steps).sum(axis=0)
     if z > 5.0 and z > 5.0 * x:

@@ -1,12 +1,12 @@
-"""Runs whose odometry is made of their clouds, and runs without odometry.
+"""Runs with odometry made from their clouds, and runs without odometry.
 
-Lidar odometry takes a first pass over the clouds; they are read again where they are used.
+Lidar odometry takes a first pass over the clouds; they are read again on use.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,23 +22,8 @@ from coview_stream.recordings.run import Run, single_frame_run
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames)."""
 
-_PERIOD = 0.1  # seconds, set by hand: between frames that have no stamps
-_MIN_WALLS = 15  # patches, set by hand: with fewer the slope of the ground decides
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Result of lidar odometry over a run.
-
-    Attributes:
-        kept: indices of the frames that have a pose.
-        poses: (K, 4, 4) theirs, odometry <- body, metres.
-        notes: remarks for people, a line each.
-    """
-
-    kept: list[int]
-    poses: Poses
-    notes: tuple[str, ...]
+_PERIOD = 0.1  # seconds between frames without stamps
+_MIN_WALLS = 15  # patches; with fewer the slope of the ground decides the vertical
 
 
 def open_lidar_run(
@@ -49,13 +34,13 @@ def open_lidar_run(
     progress: Progress | None = None,
     mount: Mount | None = None,
 ) -> Run:
-    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, with odometry made of its clouds.
+    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, with odometry made from its clouds.
 
-    Frames in files count as deskewed; their stamps are those of ``times.txt``, of an ``odometry.tum`` beside them, or
-    else 0.1 s apart. Frames that odometry cannot place are left out, and notes say why.
+    Frames in files count as deskewed; their stamps come from ``times.txt``, from ``odometry.tum``, or are 0.1 s apart.
+    Frames that odometry cannot place are left out and counted in the notes.
 
     Raises:
-        RunError: no frames, or none that odometry could place. DependencyError: kiss-icp is missing.
+        RunError: no frames, or odometry could place none. DependencyError: kiss-icp is missing.
     """
     if odometry_topic is not None:
         raise RunError(f"{path}: --odometry kiss-icp and --odometry-topic {odometry_topic}; give one of them")
@@ -74,9 +59,9 @@ def open_lidar_run(
         frame = run.read(index)
         return lidar.step(frame.points, None, frame.stamp)
 
-    placed = _place_all(path, lidar, len(run), place, progress)
-    files = tuple(run.frames_paths[index] for index in placed.kept)
-    return Run(path, files, run.stamps[placed.kept], placed.poses, notes=(*run.notes, *placed.notes), mount=mount)
+    placed, poses, notes = _place_all(path, lidar, len(run), place, progress)
+    files = tuple(run.frames_paths[index] for index in placed)
+    return Run(path, files, run.stamps[placed], poses, notes=(*run.notes, *notes), mount=mount)
 
 
 def _of_bag(
@@ -90,9 +75,9 @@ def _of_bag(
             message = clouds.message(index)
             return odometry.step(message.points, message.times, message.stamp_ns * 1e-9)
 
-        placed = _place_all(bag, odometry, len(clouds.stamps), place, progress)
-        notes.extend(placed.notes)
-        return Track(clouds.stamps[placed.kept], placed.poses)
+        placed, poses, remarks = _place_all(bag, odometry, len(clouds.stamps), place, progress)
+        notes.extend(remarks)
+        return Track(clouds.stamps[placed], poses)
 
     run = open_bag(bag, None, topic, None, track, mount)
     return replace(run, notes=(*notes, *run.notes))
@@ -100,22 +85,25 @@ def _of_bag(
 
 def _place_all(
     path: Path, lidar: LidarOdometry, count: int, place: Callable[[int], Pose], progress: Progress | None = None
-) -> Placed:
-    """Place ``count`` frames one after the other, and leave out those that cannot be placed.
+) -> tuple[list[int], Poses, list[str]]:
+    """Place ``count`` frames in order.
+
+    Returns:
+        Indices of the frames that could be placed, their poses (K, 4, 4), odometry <- body, and notes.
 
     Raises:
-        RunError: none can be placed; the message ends with the first one's.
+        RunError: none could be placed; the message ends with the first error.
     """
-    kept, poses, failed = [], [], []
+    placed, poses, failed = [], [], []
     for index in range(count):
         try:
             poses.append(place(index))
-            kept.append(index)
+            placed.append(index)
         except (CloudError, RunError) as error:
             failed.append(str(error))
         if progress is not None:
             progress(index + 1, count)
-    if not kept:
+    if not placed:
         raise RunError(f"{path}: lidar odometry could place not one of {count} frames; first: {failed[0]}")
     notes = []
     if lidar.ground is not None:
@@ -131,32 +119,25 @@ def _place_all(
         notes.append(f"{path}: lidar odometry could not place {len(failed)} of {count} frames; first: {failed[0]}")
     if lidar.restarts:
         notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; what was driven there is missing")
-    return Placed(kept, np.array(poses), tuple(notes))
+    return placed, np.array(poses), notes
 
 
 def open_bare_run(path: Path, cloud_topic: str | None = None, mount: Mount | None = None) -> Run:
-    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but with the identity for all poses.
+    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but with the identity as every pose.
 
-    Stamps of frames in files are those of ``times.txt``, of an ``odometry.tum`` beside them, or else 0.1 s apart.
-    Clouds of recordings are not deskewed.
+    Stamps of frames in files come from ``times.txt``, from ``odometry.tum``, or are 0.1 s apart. Clouds of recordings
+    are not deskewed.
 
     Raises:
         RunError: no frames, or stamps that do not fit.
     """
     if (bag := find_bag(path)) is not None:
-        return open_bag(bag, None, cloud_topic, None, _identity_track, mount)
+        return open_bag(bag, None, cloud_topic, None, lambda clouds: Track(clouds.stamps, clouds.poses), mount)
     layout = find_layout(path)
     stamps = read_stamps(layout)
     notes: tuple[str, ...] = ()
     if stamps is None:
         stamps = _PERIOD * np.arange(len(layout.frames), dtype=np.float64)
         notes = (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",)
-    return Run(path, layout.frames, stamps, _identities(len(stamps)), notes=notes, mount=mount)
-
-
-def _identity_track(clouds: BagClouds) -> Track:
-    return Track(clouds.stamps, _identities(len(clouds.stamps)))
-
-
-def _identities(count: int) -> Poses:
-    return np.tile(np.eye(4), (count, 1, 1))
+    identities = np.tile(np.eye(4), (len(stamps), 1, 1))
+    return Run(path, layout.frames, stamps, identities, notes=notes, mount=mount)

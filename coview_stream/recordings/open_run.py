@@ -1,4 +1,4 @@
-"""Opening of runs: directories, ROS recordings and single clouds, with their odometry or one made of the clouds."""
+"""Opening of runs: directories, ROS recordings and single clouds, with given odometry or odometry from the clouds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 KISS_ICP = "kiss-icp"
-"""In place of an odometry file: make the odometry out of the clouds."""
+"""In place of an odometry file: make odometry from the clouds."""
 
 
 def open_run(
@@ -30,29 +30,29 @@ def open_run(
     progress: Progress | None = None,
     mount: Mount | None = None,
 ) -> Run:
-    """Open a run and validate all but the clouds themselves.
+    """Open a run and validate everything but the clouds themselves.
 
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
     ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
     ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); a drive of
-    KITTI's raw data (``velodyne_points/``, ``oxts/``); one cloud file, or
-    one frame without odometry, is a run of one frame with stamp 0 and the identity; a recording with PointCloud2 and
-    Odometry (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry at the stamps
-    in their headers, interpolated, and are deskewed by it where their points have times.
+    KITTI's raw data (``velodyne_points/``, ``oxts/``); and recordings with PointCloud2 and Odometry (rosbag2 directory,
+    ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry interpolated at their header stamps, and are
+    deskewed by it if their points have times. One cloud file, or one frame without odometry, is a run of one frame with
+    stamp 0 and the identity.
 
     Args:
         path: directory, cloud file or recording.
-        odometry: ``"auto"`` takes what the layout brings; otherwise a TUM file, or KITTI poses (12 columns)
-            where the run has a ``times.txt``. For a recording a TUM file with poses at any stamps. ``"kiss-icp"``
-            makes odometry out of the clouds, each of which is read for that: :mod:`coview_stream.odometry`.
-        cloud_topic: which clouds of a recording, if it has several topics with PointCloud2.
-        odometry_topic: which odometry of a recording, if it has several topics with Odometry.
-        lidar: makes the odometry that ``"kiss-icp"`` asks for, instead of a ``LidarOdometry()``.
-        progress: called with (frames done, frames) while it does.
-        mount: where the lidar sits; clouds are read into the body frame, whose odometry it is.
+        odometry: ``"auto"`` takes the layout's own; otherwise a TUM file, or KITTI poses (12 columns) if the run has a
+            ``times.txt``. For a recording a TUM file with any stamps. ``"kiss-icp"`` makes odometry from the clouds, in
+            a pass over all of them: :mod:`coview_stream.odometry`.
+        cloud_topic: topic of the clouds, if a recording has several with PointCloud2.
+        odometry_topic: topic of the odometry, if a recording has several with Odometry.
+        lidar: used for ``"kiss-icp"`` instead of a ``LidarOdometry()``.
+        progress: called with (frames done, frames) during ``"kiss-icp"``.
+        mount: pose of the lidar; clouds are read into the body frame, the frame of the odometry.
 
     Raises:
-        RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
+        RunError: no frames, no odometry, or odometry that does not match; the message names file and line.
         DependencyError: kiss-icp is missing.
     """
     path = Path(path)

@@ -29,8 +29,8 @@ class Frame:
         points: (N, 3) float32 in the body frame (x forward, z up), metres, relative to ``origin``.
         T_odom_body: (4, 4), odometry <- body.
         origin: (3,) float64 metres. Zeros, except for a single terrestrial scan in map-like coordinates.
-        path: the file it came from.
-        dropped: rows of the file that were not usable.
+        path: source file.
+        dropped: unusable rows of the file.
     """
 
     index: int
@@ -48,11 +48,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class SweepCorrection:
-    """What is known of sensor and odometry when a sweep is deskewed.
+    """Calibration of sensor and odometry, for deskewing a sweep.
 
     Attributes:
         R_body_cloud: (3, 3) rotation that levels the sensor's clouds; None for none.
-        scale: what odometry's distances have to be multiplied with, less one.
+        scale: factor for odometry's distances, minus one.
     """
 
     R_body_cloud: Floats | None = None
@@ -60,7 +60,7 @@ class SweepCorrection:
 
 
 class CloudSource(Protocol):
-    """Reader of a run's clouds, where they are not in a file each."""
+    """Reader of a run's clouds that are not in one file each."""
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
         """Read frame ``index`` in the body frame at its stamp, metres; CloudError if it is damaged."""
@@ -69,18 +69,13 @@ class CloudSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _SelectedClouds:
-    """Reader of some of a source's clouds.
-
-    Attributes:
-        source: reads all of them.
-        indices: of those that are selected.
-    """
+    """Reader of the clouds ``indices`` of a source."""
 
     source: CloudSource
     indices: range
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
-        """Read one, by its place among those that are selected."""
+        """Read a cloud by its position in ``indices``."""
         return self.source.read(self.indices[index], correction)
 
 
@@ -88,17 +83,17 @@ class _SelectedClouds:
 class Run:
     """A validated run. Iterating reads lazily: one frame is in memory at a time.
 
-    ``run[3]`` reads a frame, ``run[-1]`` the last one; ``run[10:20]`` and ``run[::5]`` are runs of some of its frames,
-    numbered from zero again.
+    ``run[3]`` reads a frame, ``run[-1]`` the last one; ``run[10:20]`` and ``run[::5]`` are runs of these
+    frames, numbered from zero.
 
     Attributes:
         path: the directory, the single cloud file, or the recording.
-        frames_paths: (N) files in order; of a recording its path, N times.
+        frames_paths: (N) files in order; for a recording its path, N times.
         stamps: (N,) seconds, strictly increasing.
         poses: (N, 4, 4), odometry <- body, metres.
         source: reads the clouds of a recording; None if each is a file.
-        notes: what was left out or taken for granted when the run was opened, a line each.
-        mount: where the lidar sits, whose clouds are read into the body frame; None where it is the body.
+        notes: frames left out and assumptions made when the run was opened, a line each.
+        mount: pose of the lidar, whose clouds are read into the body frame; None if it is the body.
     """
 
     path: Path
@@ -113,7 +108,7 @@ class Run:
         return len(self.frames_paths)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield every frame in order; raises like ``read`` (use ``read`` to skip a damaged frame)."""
+        """Yield every frame in order; raises like ``read``, so use ``read`` to skip a damaged frame."""
         return (self.read(index) for index in range(len(self)))
 
     @overload
@@ -123,7 +118,7 @@ class Run:
     def __getitem__(self, index: slice) -> Run: ...
 
     def __getitem__(self, index: SupportsIndex | slice) -> Frame | Run:
-        """Read one frame, negative indices from the end, as :meth:`read`; or return the run of a slice.
+        """Read one frame as :meth:`read`, negative indices from the end; or return the run of a slice.
 
         Raises:
             RunError: the slice is empty or goes backwards.
@@ -134,7 +129,7 @@ class Run:
         return self.read(at + len(self) if -len(self) <= at < 0 else at)
 
     def __repr__(self) -> str:
-        """Return path, number of frames, duration and way driven in one line."""
+        """Return path, number of frames, duration and distance in one line."""
         driven = float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
         return (
             f"Run({str(self.path)!r}: {len(self)} frames, {self.stamps[-1] - self.stamps[0]:.1f} s, "
@@ -144,8 +139,8 @@ class Run:
     def _selected(self, part: slice) -> Run:
         indices = range(len(self))[part]
         if not indices or indices.step < 0:
-            what = "goes backwards" if indices else "holds no frame"
-            raise RunError(f"{self.path}: the slice {part.start}:{part.stop}:{part.step} of {len(self)} frames {what}")
+            fault = "goes backwards" if indices else "holds no frame"
+            raise RunError(f"{self.path}: the slice {part.start}:{part.stop}:{part.step} of {len(self)} frames {fault}")
         return replace(
             self,
             frames_paths=self.frames_paths[part],
@@ -155,7 +150,7 @@ class Run:
         )
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Frame:
-        """Read frame ``index``; a raw sweep of a recording is deskewed by odometry, which ``correction`` corrects.
+        """Read frame ``index``; a raw sweep of a recording is deskewed by odometry as corrected by ``correction``.
 
         Raises:
             IndexError: there is no such frame.
@@ -179,5 +174,5 @@ class Run:
 
 
 def single_frame_run(layout: Layout, mount: Mount | None = None) -> Run:
-    """Return the run of one frame, which needs no odometry."""
+    """Return the run of one frame; it needs no odometry."""
     return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None], mount=mount)
