@@ -21,7 +21,7 @@ from bench.harness.run import BENCHMARKS, counted, run
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import CoViewError
 
-_BUSY = 0.7  # load average above which another process computes
+BUSY = 0.7  # load average above which another process computes
 
 
 def parser_of(name: str) -> argparse.ArgumentParser:
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 for row in measured(name, words, asked):
                     print(json.dumps(row.to_dict(), allow_nan=False), file=out, flush=True)
             return 0
-        if (load := os.getloadavg()[0]) > _BUSY:
+        if (load := os.getloadavg()[0]) > BUSY:
             print(f"bench {name}: the machine is busy (load {load:.1f}); times suffer", file=sys.stderr)
         print(line(HEAD, WIDTHS), rule(WIDTHS), sep="\n", flush=True)
         for row in measured(name, words, asked):

@@ -17,7 +17,7 @@ from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.__main__ import parser_of, tables_of
+from bench.__main__ import BUSY, parser_of, tables_of
 from bench.harness.files import ROOT, commit, environment
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
@@ -115,11 +115,13 @@ def main(arguments: Sequence[str]) -> int:
     for name in names:
         command = f"{COMMANDS[name]}{' --quick' * asked.quick}"
         print(f"=== {command}", file=sys.stderr, flush=True)
+        load = os.getloadavg()[0]
         if not (text := measured(command)):
             missing.append(name)
             continue
         title = f"{name}, quick" if asked.quick else name
-        part = block(title, command, text, time.strftime("%Y-%m-%d"), commit(), asked.machine)
+        machine = f"{asked.machine}, load {load:.0f} from other work" if load > BUSY else asked.machine
+        part = block(title, command, text, time.strftime("%Y-%m-%d"), commit(), machine)
         page = asked.page.read_text() if asked.page.is_file() else HEAD
         with atomic_path(asked.page) as file:
             file.write_text(replaced(page, title, part))

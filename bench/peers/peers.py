@@ -26,8 +26,7 @@ from bench.harness.files import folder, isolated
 from bench.harness.rows import Row, bounded, failed, informs, number, table
 from bench.harness.run import run
 from bench.harness.worlds import WORLDS, map_of, places
-from bench.peers.libraries import Features, KissMatcher, MapClosures, NearbyGicp
-from bench.peers.methods import Keyframes, Method, OneScan, Tracking
+from bench.peers.libraries import Features, Keyframes, KissMatcher, MapClosures, Method, NearbyGicp, OneScan, Tracking
 from coview_stream import BaseMap
 from coview_stream.errors import CoViewError
 

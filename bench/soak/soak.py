@@ -23,7 +23,7 @@ import numpy as np
 from bench.harness.files import folder
 from bench.harness.rows import Row, judged, table
 from bench.soak.faults import ENDS_PROCESSES, FAULTS
-from bench.soak.sites import KINDS, prepare
+from bench.soak.robots import KINDS, prepare
 from bench.soak.stage import Node, Stage, slope
 from coview_stream.errors import InputError
 

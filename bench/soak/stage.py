@@ -21,10 +21,8 @@ import psutil
 
 from bench.harness.files import ROOT, environment
 from bench.soak.link import forward
-from bench.soak.robots import REOPEN, SIGNED, Manner, Robot, Watch, drive_on
-from bench.soak.sites import Site
-from bench.stream.drive import EPOCH_NS
-from bench.stream.processes import Helper, free_port, open_session, route, rubbish
+from bench.soak.robots import REOPEN, SIGNED, Manner, Robot, Site, Watch, drive_on
+from bench.stream.processes import EPOCH_NS, Helper, free_port, open_session, route, rubbish
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage
 

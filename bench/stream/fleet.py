@@ -24,8 +24,7 @@ from bench.harness import worlds
 from bench.harness.files import ROOT, environment, folder
 from bench.harness.rows import Row, bounded, informs, judged, reached
 from bench.stream import scores
-from bench.stream.drive import Drive, RobotPlan
-from bench.stream.processes import Helper, Recorder, free_port, route, send, wait_until
+from bench.stream.processes import Drive, Helper, Recorder, RobotPlan, free_port, route, send, wait_until
 from bench.stream.stage import processor_seconds
 from coview_stream.sim import SimulationConfig
 

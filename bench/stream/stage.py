@@ -19,8 +19,7 @@ from bench.accuracy.scores import rms
 from bench.harness.files import ROOT, environment
 from bench.harness.rows import Row, judged
 from bench.stream import scores
-from bench.stream.drive import Drive, RobotPlan
-from bench.stream.processes import Helper, Recorder, Sent, free_port, route, send, wait_until
+from bench.stream.processes import Drive, Helper, Recorder, RobotPlan, Sent, free_port, route, send, wait_until
 
 _READY = 90.0  # seconds in which the node must announce all its robots
 _GRACE = 10.0  # seconds from SIGTERM to SIGKILL

@@ -20,8 +20,7 @@ from bench.harness import worlds
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, failed
 from bench.stream import scores
-from bench.stream.drive import RobotPlan
-from bench.stream.processes import vandalise, wait_until
+from bench.stream.processes import RobotPlan, vandalise, wait_until
 from bench.stream.scores import Told
 from bench.stream.stage import MAX_FIRST_FIX, MAX_JITTER, Findings, Setting, Stage, processor_seconds
 from coview_stream import BaseMap

@@ -18,7 +18,7 @@ import numpy as np
 from bench.accuracy.scores import errors
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, number, table
-from bench.tracking import drives
+from bench.tracking.drives import start
 from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, tail, upper_bound
 from bench.tracking.tracking import follow
 from bench.tracking.worlds import World, map_of, open_world
@@ -110,7 +110,7 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
 
     def work() -> dict[str, Any]:
         recorded = open_world(below, world)
-        drive = drives.start(recorded.truth, world.drift, world.seed)
+        drive = start(recorded.truth, world.drift, world.seed)
         track = follow(map_of(below, world, variant), recorded, drive)
         error = errors(track, drive.truth)
         sample = Sample.of(track, error, drive.driven)

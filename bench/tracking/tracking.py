@@ -1,6 +1,6 @@
 """Errors, covariance, loss and recovery of a tracked robot.
 
-Ten plain drives, and drives with an event (:mod:`bench.tracking.scenarios`). NAME picks the scenarios whose names
+Ten plain drives, and drives with an event (:mod:`bench.tracking.drives`). NAME picks the scenarios whose names
 contain it; worlds, maps and answers stay in ``--work``, so a run can be made in portions.
 
 Coverage is the share of poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by itself,
@@ -21,10 +21,21 @@ import numpy as np
 from bench.accuracy.scores import Track, errors, score
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, number, table
-from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, honest, pooled, shares, spread
-from bench.tracking.drives import Drive, drift_share, seen
-from bench.tracking.levels import TO_ALERT, Sample, beyond_alert_limit, level_table
-from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
+from bench.tracking.drives import QUICK, SEEDS, Drive, Scenario, drift_share, scenarios, seen
+from bench.tracking.levels import (
+    PARTS,
+    TO_ALERT,
+    WITHIN,
+    Sample,
+    Squares,
+    beyond_alert_limit,
+    coverage_table,
+    honest,
+    level_table,
+    pooled,
+    shares,
+    spread,
+)
 from bench.tracking.worlds import Recorded, map_of, open_world
 from coview_stream import BaseMap, Localizer
 from coview_stream.errors import CloudError, InputError, RunError

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import ablation, accuracy, conditions, odometry
-from bench.accuracy.spoil import Variant, rings, spoilt
+from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.accuracy.stages import Seen, right
 from bench.harness.worlds import TUNED_SEEDS
-from bench.tracking.scenarios import scenarios
+from bench.tracking.drives import scenarios
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.sim import Dirt, SimulationConfig

@@ -9,8 +9,7 @@ from drives_with_truth import track
 from bench.forest import runs
 from bench.forest.forest import STEPS, false, metric_table, recall, success
 from bench.forest.methods import METHODS, distinct
-from bench.forest.places import read_sites
-from bench.forest.recognition import rank, recalls
+from bench.forest.recognition import rank, read_sites, recalls
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 

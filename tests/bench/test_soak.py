@@ -16,8 +16,7 @@ from nightly import nightly
 from bench.harness.files import ROOT, environment
 from bench.harness.rows import Row
 from bench.soak.faults import ENDS_PROCESSES, FAULTS
-from bench.soak.robots import Manner, Robot, content_of, stamp
-from bench.soak.sites import Site
+from bench.soak.robots import Manner, Robot, Site, content_of, stamp
 from bench.soak.soak import chosen
 from bench.soak.stage import Sampled, slope
 from coview_stream.clouds import write_tum

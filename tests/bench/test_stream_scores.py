@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.stream import scores as stream_scores
-from bench.stream.drive import EPOCH_NS
+from bench.stream.processes import EPOCH_NS
 from bench.stream.scores import Posed, Told
 from coview_stream.geometry.transforms import pose_from, rot_z
 

@@ -7,10 +7,22 @@ import pytest
 from drives_with_truth import track, way
 
 from bench.accuracy.scores import errors, losses, recovery, score
-from bench.tracking import coverage as tracking_coverage
 from bench.tracking import protection, tracking
-from bench.tracking.coverage import AXES, NOMINAL, coverage, pooled, shares, spread
-from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, tail, upper_bound
+from bench.tracking.levels import (
+    AXES,
+    NOMINAL,
+    PRODUCT,
+    Sample,
+    beyond_alert_limit,
+    coverage,
+    pooled,
+    shares,
+    since_fix,
+    spread,
+    squares,
+    tail,
+    upper_bound,
+)
 from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 
@@ -58,7 +70,7 @@ def test_a_covariance_of_wrong_size_is_detected(covariance, scale, one_sigma, ne
 
 def test_a_broken_covariance_covers_nothing():
     broken = np.stack([np.full((6, 6), np.nan), np.diag([1.0, 1, 1, 1, 1, -1]), np.zeros((6, 6)), np.eye(6)])
-    squared = tracking_coverage.squares(np.full((4, 6), 0.1), broken, AXES["pose"])
+    squared = squares(np.full((4, 6), 0.1), broken, AXES["pose"])
     np.testing.assert_allclose(squared, [np.inf, np.inf, np.inf, 0.06])
     assert coverage(squared, 6)["inside"][2] == 0.25
     assert coverage(np.zeros(0), 6)["inside"] is None
@@ -97,7 +109,7 @@ def test_recovery_is_counted_from_the_end_of_the_event_to_the_first_right_pose()
 
 def test_a_fix_ends_with_a_search_but_not_with_a_doubt():
     states = ["SEARCHING", "TRACKING", "AMBIGUOUS", "TRACKING", "LOST", "AMBIGUOUS", "TRACKING"]
-    age = tracking_coverage.since_fix(track(states))
+    age = since_fix(track(states))
     np.testing.assert_allclose(age, [np.nan, 0.0, np.nan, 0.2, np.nan, np.nan, 0.0])
 
 
