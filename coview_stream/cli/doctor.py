@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, local_map
-from coview_stream.cli.options import add_mount, add_topics, check_codec, mount_of
+from coview_stream.cli.options import add_mount, add_network, add_topics, check_codec, mount_of
 from coview_stream.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
@@ -35,14 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="of the run, as for locate (auto)")
     add_mount(recorded)
     add_topics(recorded)
-    network = parser.add_argument_group("network (looked at if one of these, or --robot, is given)")
-    network.add_argument("--connect", action="append", default=[], metavar="EP", help="(tcp/127.0.0.1:7447)")
-    network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for others here")
-    network.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
-    network.add_argument("--seconds", type=float, default=3.0, metavar="S", help="to listen to robots (3)")
+    add_network(parser, "not checked, but with --robot --connect tcp/127.0.0.1:7447")
+    parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="to listen to robots (3)")
     keys = parser.add_argument_group("keys and encodings, as for serve")
     keys.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
-    keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's")
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
@@ -101,7 +97,9 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     sha256 = base_map = None
     if args.map is not None:
         try:
-            path = local_map(args.map, args.around, base=args.base, connect=args.connect or (), config=args.config).path
+            path = local_map(
+                args.map, args.around, base=args.base, connect=args.connect or (), config=args.zenoh_config
+            ).path
         except CoViewError as error:
             finding = from_error("map", error)
         else:
@@ -143,7 +141,7 @@ def _check_zenoh_config(args: argparse.Namespace, connect: list[str]) -> bool:
         return False
     from coview_stream.stream.transport.zenoh_config import compose
 
-    compose(connect, args.listen, args.config)
+    compose(connect, args.listen, args.zenoh_config)
     return True
 
 
@@ -151,9 +149,9 @@ def _endpoints(args: argparse.Namespace) -> list[str] | None:
     """Return the endpoints to connect to; None if the network is not asked for."""
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-    if not (args.robot or args.connect or args.listen or args.config):
+    if not (args.robot or args.connect or args.listen or args.zenoh_config):
         return None
-    return args.connect or ([] if args.listen or args.config else [DEFAULT_ENDPOINT])
+    return args.connect or ([] if args.listen or args.zenoh_config else [DEFAULT_ENDPOINT])
 
 
 def _network(
@@ -165,7 +163,7 @@ def _network(
 
     try:
         with _silent("coview_stream.stream"):  # what the transport would log is a finding here
-            transport = open_transport(connect, args.listen, args.config)
+            transport = open_transport(connect, args.listen, args.zenoh_config)
     except TransportError as error:
         yield from_error("network", error)
         return

@@ -29,12 +29,15 @@ def add_topics(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
 
 
-def add_client_network(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--connect``, ``--listen``, ``--config`` and ``--base`` of a command that joins a running node."""
-    parser.add_argument("--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)")
-    parser.add_argument("--listen", action="append", metavar="EP", help="endpoint to be connected to on")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
-    parser.add_argument("--base", default="coview", help="first part of the keys (coview)")
+def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/127.0.0.1:7447") -> None:
+    """Declare ``--connect``, ``--listen``, ``--zenoh-config`` and ``--base``; ``default`` names the endpoint of none."""
+    network = parser.add_argument_group(f"network (with none of these: {default})")
+    network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT to connect to")
+    network.add_argument("--listen", action="append", default=[], metavar="EP", help="endpoint to wait for others on")
+    network.add_argument(
+        "--zenoh-config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ..."
+    )
+    network.add_argument("--base", default="coview", metavar="KEY", help="first part of the keys (coview)")
 
 
 def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:

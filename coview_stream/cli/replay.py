@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from coview_stream.cli.options import KISS_ICP, add_client_network, add_mount, add_run_path, add_topics, mount_of
+from coview_stream.cli.options import KISS_ICP, add_mount, add_network, add_run_path, add_topics, mount_of
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by ReplayConfig."""
     add_run_path(parser)
     parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
-    add_client_network(parser)
+    add_network(parser)
     parser.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)")
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, mount=mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
-    transport = open_client(args.connect, args.listen, args.config)
+    transport = open_client(args.connect, args.listen, args.zenoh_config)
     try:
         sender = Sender(transport, keys, args.encoding, args.odometry_encoding)
         if not bare and (spacing := odometry_spacing(recorded, config)) > _MAX_SPACING:

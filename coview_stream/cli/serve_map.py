@@ -6,6 +6,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
+from coview_stream.cli.options import add_network
 from coview_stream.errors import ConfigError
 
 MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"  # as stream.maps.fetch_map has it; --help imports nothing
@@ -17,11 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("directories", nargs="+", type=Path, metavar="SITE/", help="that `build -o SITE/` made")
     parser.add_argument("--name", help="of the site in its keys (the directory's name)")
-    parser.add_argument("--base", default="coview", metavar="KEY", help="first part of the keys (coview)")
-    network = parser.add_argument_group(f"network (with none of these: --listen {MAP_SERVER_ENDPOINT})")
-    network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router")
-    network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for nodes here")
-    network.add_argument("--config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ...")
+    add_network(parser, f"--listen {MAP_SERVER_ENDPOINT}")
     parser.add_argument("--quiet", action="store_true", help="log errors only")
 
 
@@ -41,18 +38,18 @@ def run(args: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise ConfigError(f"two directories are called {next(n for n in names if names.count(n) > 1)}; rename one")
     keys = [MapKeys.of(name, args.base) for name in names]
-    by_default = not (args.connect or args.listen or args.config)
+    by_default = not (args.connect or args.listen or args.zenoh_config)
     listen = [MAP_SERVER_ENDPOINT] if by_default else args.listen
     with contextlib.ExitStack() as opened, stop_on_signals() as stop:
         for number, (directory, each) in enumerate(zip(args.directories, keys, strict=True)):
             # one session listens, and the others connect to it
             server = MapServer(
                 directory, each, args.connect or ([] if number == 0 else listen), listen if number == 0 else [],
-                args.config,
+                args.zenoh_config,
             )  # fmt: skip
             opened.callback(server.close)
             site = server.manifest
-            where = ", ".join([*args.connect, *listen]) or str(args.config)
+            where = ", ".join([*args.connect, *listen]) or str(args.zenoh_config)
             print(
                 f"{each.prefix}: {directory}, {len(site.tiles)} tiles, {site.nbytes / 1e6:.1f} MB, manifest "
                 f"{site.sha256[:12]}; at {where}",

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from coview_stream.cli.map_argument import local_map
-from coview_stream.cli.options import add_client_network
+from coview_stream.cli.options import add_network
 from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
 
@@ -35,7 +35,7 @@ _MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)")
-    add_client_network(parser)
+    add_network(parser)
     parser.add_argument(
         "--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson; needs --robot (native)"
     )
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         open_sinks(args),
         None,
     )
-    transport = open_client(args.connect, args.listen, args.config)
+    transport = open_client(args.connect, args.listen, args.zenoh_config)
     try:
         with stop_on_signals() as stop:
             feed = feed_of_watch(args, transport, sinks, view)
@@ -179,6 +179,6 @@ class _Watch:
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)
         connected = f"connected to {count} other(s)" if count else "not connected"
-        at = ", ".join(self._args.connect or self._args.listen or [str(self._args.config or DEFAULT_ENDPOINT)])
+        at = ", ".join(self._args.connect or self._args.listen or [str(self._args.zenoh_config or DEFAULT_ENDPOINT)])
         keys = ", ".join(topic.key for topic in self._topics)
         print(f"nothing yet on {keys}; {connected} ({at})", file=sys.stderr, flush=True)

@@ -140,7 +140,7 @@ def test_doctor_without_robot_checks_machine_and_map(world_file, tmp_path, capsy
         ["--robot", "a/b"],
         ["--preset", "ros1"],
         ["--connect", "localhost"],
-        ["--config", "/no/such/file.json5"],
+        ["--zenoh-config", "/no/such/file.json5"],
         ["--cloud-encoding", "json"],
         ["--odometry-encoding", "xyz"],
     ],

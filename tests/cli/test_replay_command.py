@@ -170,7 +170,7 @@ def test_signal_ends_replay_loop_cleanly(node, run_folder, number):
         (["--preset", "ros1"], "--preset"),
         (["--encoding", "zip"], "zip"),
         (["--connect", "nonsense"], "nonsense"),
-        (["--config", "none.json5"], "none.json5"),
+        (["--zenoh-config", "none.json5"], "none.json5"),
         (["--odometry", "none.tum"], "none.tum"),
         (["--odometry", "kiss-icp"], "`serve --odometry kiss-icp`"),
         (["--odometry", "kiss-icp"], "`replay --odometry none`"),
