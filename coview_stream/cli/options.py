@@ -30,13 +30,11 @@ def add_topics(parser: argparse._ActionsContainer) -> None:
 
 
 def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/127.0.0.1:7447") -> None:
-    """Declare ``--connect``, ``--listen``, ``--zenoh-config`` and ``--base``; ``default`` names the endpoint of none."""
+    """Declare ``--connect``, ``--listen``, ``--zenoh-config`` and ``--base``; else ``default``."""
     network = parser.add_argument_group(f"network (with none of these: {default})")
     network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT to connect to")
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="endpoint to wait for others on")
-    network.add_argument(
-        "--zenoh-config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ..."
-    )
+    network.add_argument("--zenoh-config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, ...")
     network.add_argument("--base", default="coview", metavar="KEY", help="first part of the keys (coview)")
 
 
