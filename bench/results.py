@@ -76,7 +76,10 @@ def replaced(page: str, name: str, part: str) -> str:
 
 
 def measured(command: str) -> str:
-    """Run a benchmark in a process of its own; return its tables, then its targets or all rows. Empty: it failed."""
+    """Run a benchmark in a process of its own; return its tables, then its targets or all rows, without padding.
+
+    Empty if it failed.
+    """
     name, *words = command.split()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows.json"
@@ -91,7 +94,7 @@ def measured(command: str) -> str:
     shown = [row for row in rows if row.target] if own else rows
     if shown:
         parts.append(table(COLUMNS, [[_short(row.name, name), *row.cells()[1:]] for row in shown]))
-    return "\n\n".join(parts)
+    return re.sub(r"(?m)^\|.*$", lambda line: re.sub(r" *\| *", "|", line[0]), "\n\n".join(parts))
 
 
 def _short(row: str, name: str) -> str:
