@@ -1,4 +1,4 @@
-"""Files that are complete or not there: written under another name beside their place, then renamed."""
+"""Files that are complete or not there: written under a temporary name in the same directory, then renamed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_ABANDONED = 86_400.0  # seconds since the last write, after which a partial file is deleted; set by hand
+_ABANDONED = 86_400.0  # seconds since the last write after which any partial file is deleted
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -21,12 +21,12 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """Yield a name that becomes ``path`` at the end of the block, or is deleted if the block raises.
 
-    What processes that were killed have left of the same file is deleted first: those of this host and its process
-    numbers at once, others, whose processes cannot be seen from here or were before the host's last start, after a day.
+    Partial files of the same name left by killed processes are deleted first: those of this host and process
+    namespace at once, all others after a day, because their processes cannot be seen from here.
 
     Args:
-        path: the file's name; a file that is there stays whole until the new one is complete.
-        temporary: the name to write under, in the same directory; by default one of this process's own.
+        path: the file's name; an existing file stays whole until the new one is complete.
+        temporary: name to write under, in the same directory; default: unique to this process.
 
     Raises:
         OSError: the file cannot be renamed.
@@ -42,28 +42,28 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_left(path: Path) -> None:
-    """Delete partial files of ``path`` whose writer has ended; any other file of such a name stays."""
+    """Delete partial files of ``path`` whose writer has ended."""
     form = re.compile(re.escape(f".{path.name}.") + r"(?:([0-9a-f]{8})\.)?([0-9]{1,10})\.part")
-    with contextlib.suppress(OSError):  # the writing that follows says what is wrong with the directory
+    with contextlib.suppress(OSError):  # the write that follows reports a bad directory
         for entry in os.scandir(path.parent):
-            found = form.fullmatch(entry.name)
-            if found is None or not 0 < (process := int(found[2])) < 1 << 31:
+            match = form.fullmatch(entry.name)
+            if match is None or not 0 < (process := int(match[2])) < 1 << 31:
                 continue
-            ours = found[1] == _host() and not _lives(process)
-            if ours or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
+            dead = match[1] == _host() and not _lives(process)
+            if dead or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
                 Path(entry.path).unlink(missing_ok=True)
 
 
 def _host() -> str:
-    """Return a short name of this start of this host and of its process numbers, of which each container has its own.
+    """Return a short name of this host, its process namespace (one per container) and its boot.
 
-    Hosts that are copies of one image have the same name, and the same number for the processes outside of containers.
+    The boot id tells apart hosts cloned from one image, which share name and namespace number.
     """
     try:
-        numbers, start = Path("/proc/self/ns/pid").stat().st_ino, _BOOT.read_text()
+        namespace, boot = Path("/proc/self/ns/pid").stat().st_ino, _BOOT.read_text()
     except OSError:
-        numbers, start = 0, ""
-    return f"{zlib.crc32(f'{platform.node()} {numbers} {start}'.encode()):08x}"
+        namespace, boot = 0, ""
+    return f"{zlib.crc32(f'{platform.node()} {namespace} {boot}'.encode()):08x}"
 
 
 def _lives(process: int) -> bool:
@@ -71,7 +71,7 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # it is of another user
+    except OSError:  # another user's process
         return True
     return True
 
@@ -82,7 +82,7 @@ def atomic_file(path: Path, *, sync: bool = False, temporary: Path | None = None
 
     Args:
         path: as for :func:`atomic_path`.
-        sync: wait until the disk has the bytes before the name changes, so that a power cut leaves no empty file.
+        sync: flush to disk before renaming; otherwise a power cut may leave an empty file.
         temporary: as for :func:`atomic_path`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Point clouds near their own float64 origins, put together without loss of precision."""
+"""Point clouds in float32 near their own float64 origins, joined without loss of precision."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
 LOCAL_LIMIT = 10_000.0
-"""Coordinates below this (metres), set by hand, keep a zero origin: float32 still resolves 1 mm there."""
+"""Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm."""
 
 ORIGIN_STEP = 100.0
-"""An origin is a multiple of this (metres), so that neighbouring tiles have readable, exact offsets."""
+"""Origins are multiples of this (metres): readable, exact offsets between neighbouring tiles."""
 
 COARSE_FLOAT32 = 1e6
-"""From here on (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""
+"""Beyond this (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points, and the float64 origin that they are relative to.
+    """Points relative to a float64 origin.
 
     Attributes:
         points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
         origin: (3,) float64 metres. Zeros if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero,
             otherwise the rounded (``ORIGIN_STEP``) median of the points.
-        crs: coordinate reference system as the file states it (WKT or ``EPSG:code``), if it does.
+        crs: coordinate reference system as stated in the file (WKT or ``EPSG:code``), else None.
         classification: (N,) uint8 LAS classes, if the format has them.
         dropped: rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.
     """
@@ -73,7 +73,7 @@ class CloudBuilder:
     _classes: list[npt.NDArray[np.uint8]] = field(default_factory=list)
 
     def add(self, raw: Reals, classification: npt.NDArray[np.uint8] | None = None, dropped: int = 0) -> None:
-        """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows the reader left out before."""
+        """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows that the reader left out."""
         with np.errstate(invalid="ignore"):
             # false for NaN as well
             usable = (np.abs(raw) < MAX_COORDINATE).all(axis=1)
@@ -99,10 +99,10 @@ class CloudBuilder:
             self._classes.append(classification)
 
     def finish(self, name: str) -> Cloud:
-        """Return the cloud of all chunks; ``name`` is the file for the error message.
+        """Return the cloud of all chunks; ``name`` is the file in the error message.
 
         Raises:
-            CloudError: not one usable point was added.
+            CloudError: no usable point was added.
         """
         if self.origin is None:
             if self.dropped:
@@ -117,9 +117,9 @@ class CloudBuilder:
 
 
 def choose_origin(raw: Reals) -> Floats:
-    """Choose a float64 origin (3,) for (N, 3) coordinates in metres; zeros if they are all local.
+    """Choose a float64 origin (3,) for (N, 3) coordinates in metres; zeros if all are local.
 
-    A sparse median rather than the bounding box: one stray point must not move the origin away.
+    A sparse median, not the bounding box: one stray point must not move the origin.
     """
     if np.abs(raw).max() < LOCAL_LIMIT:
         return np.zeros(3)
@@ -131,7 +131,7 @@ def choose_origin(raw: Reals) -> Floats:
 def merge(clouds: Sequence[Cloud]) -> Cloud:
     """Join several clouds of the same frame, re-based in float64 to the origin of the first.
 
-    Classes survive only if every cloud has them; dropped rows add up.
+    Classes are kept only if every cloud has them; dropped rows add up.
 
     Raises:
         CloudError: no cloud was given, or the clouds name different reference systems.
@@ -151,7 +151,7 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     return Cloud(
         np.concatenate(shifted),
         origin,
-        max(systems, key=lambda text: "+" in text or "VERT" in text, default=None),  # one that states heights as well
+        max(systems, key=lambda text: "+" in text or "VERT" in text, default=None),  # prefer one that states heights
         np.concatenate(classes) if len(classes) == len(clouds) else None,
         sum(cloud.dropped for cloud in clouds),
     )

@@ -1,4 +1,4 @@
-"""E57 files: all their scans, each by its pose, in the file's frame. Needs ``pye57`` (extra ``e57``)."""
+"""E57 files: all scans, placed by their poses in the file's frame. Needs ``pye57`` (extra ``e57``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filters on local (N, 3) float32 points: outliers, voxel grid, normals."""
+"""Filters on local (N, 3) float32 points: outliers, voxel grid, normals. Some need Open3D, imported on first use."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.arrays import Bools, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Points
 
-# Debian and Ubuntu packages that carry the system libraries Open3D's wheel links against.
-_DEBIAN_PACKAGES = {
+_MAX_CELLS = 2**62  # voxel keys must fit a signed 64-bit integer
+_DEBIAN_PACKAGES = {  # of the system libraries that Open3D's wheel links against
     "libusb-1.0": "libusb-1.0-0",
     "libgomp": "libgomp1",
     "libGL": "libgl1",
@@ -27,11 +27,10 @@ _DEBIAN_PACKAGES = {
 
 @functools.cache
 def open3d() -> ModuleType:
-    """Import Open3D, on first use (about a second), with its console output silenced.
+    """Import Open3D on first use (about a second), with its console output silenced.
 
     Raises:
-        DependencyError: Open3D or a system library that it links against is missing; the message names both
-            the library and the remedy.
+        DependencyError: Open3D or a system library of it is missing; the message names library and remedy.
     """
     try:
         module = _import_open3d()
@@ -60,7 +59,7 @@ def _import_open3d() -> ModuleType:
 
 
 def _preload_libusb() -> bool:
-    """Load the libusb of the ``libusb-package`` wheel so that the linker finds it already there."""
+    """Load the libusb of the ``libusb-package`` wheel, for the linker to find."""
     try:
         path = importlib.import_module("libusb_package").get_library_path()
         if path is None:
@@ -85,23 +84,18 @@ def _remedy(error: ImportError) -> str:
     return f"Open3D cannot be loaded ({reason}); reinstall it with `pip install --force-reinstall open3d-cpu`"
 
 
-_MAX_CELLS = 2**62
-"""Voxel keys must fit a signed 64-bit integer."""
-
-
 def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0) -> tuple[Points, Bools]:
-    """Drop points that lie unusually far from their neighbours (Open3D's statistical filter).
+    """Drop points unusually far from their neighbours (Open3D's statistical filter).
 
-    Costs about 1.6 s per million points on two cores, so run it after ``voxel_grid`` on large maps.
+    It takes about 1.6 s per million points on two cores: run it after ``voxel_grid`` on large maps.
 
     Args:
         points: (N, 3) float32 metres, finite.
-        neighbours: how many nearest points the mean distance is taken over.
+        neighbours: number of nearest points for the mean distance.
         std_ratio: mean distances above mean + ``std_ratio`` * standard deviation of the cloud are outliers.
 
     Returns:
-        The kept points (K, 3) and the mask (N,) that kept them. Clouds with no more than ``neighbours``
-        points are kept whole.
+        The remaining points (K, 3) and their mask (N,). Clouds of at most ``neighbours`` points stay whole.
 
     Raises:
         ConfigError: ``neighbours`` < 1 or ``std_ratio`` <= 0.
@@ -111,21 +105,20 @@ def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0
     mask = np.ones(len(points), dtype=bool)
     if len(points) <= neighbours:
         return points, mask
-    _, kept = _legacy(points).remove_statistical_outlier(neighbours, std_ratio)
+    _, inliers = _legacy(points).remove_statistical_outlier(neighbours, std_ratio)
     mask[:] = False
-    mask[np.asarray(kept, dtype=np.intp)] = True
+    mask[np.asarray(inliers, dtype=np.intp)] = True
     return points[mask], mask
 
 
 def voxel_grid(points: Points, voxel: float) -> Points:
     """Return the centroids of the occupied voxels, in the order of their keys (x slowest, z fastest).
 
-    In NumPy because it is several times quicker than Open3D's filter on clouds of 10 M points, and its order
-    does not depend on threads.
+    NumPy is several times faster here than Open3D's filter on 10 M points, and its order does not depend on threads.
 
     Args:
         points: (N, 3) float32 metres, finite.
-        voxel: edge length in metres; voxel borders are multiples of it.
+        voxel: edge length in metres; borders are multiples of it.
 
     Raises:
         ConfigError: ``voxel`` is not positive, or so small for this extent that keys would overflow.
@@ -137,14 +130,14 @@ def voxel_grid(points: Points, voxel: float) -> Points:
     order, starts = _voxel_groups(points, voxel)
     counts = np.diff(np.append(starts, len(points)))
     centroids = np.empty((len(starts), 3), dtype=np.float32)
-    for axis in range(3):  # one axis at a time bounds the float64 copies
+    for axis in range(3):  # one axis at a time: smaller float64 copies
         column = points[:, axis][order].astype(np.float64)
         centroids[:, axis] = np.add.reduceat(column, starts) / counts
     return centroids
 
 
 def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
-    """Return the order of the points by voxel key, and where in that order each voxel begins."""
+    """Return the points' order by voxel key, and the start of each voxel in that order."""
     low = np.floor(points.min(axis=0).astype(np.float64) / voxel)
     extent = np.floor(points.max(axis=0).astype(np.float64) / voxel) - low + 1
     if float(np.prod(extent)) > _MAX_CELLS:
@@ -163,14 +156,13 @@ def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
 def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> tuple[Points, Floats32]:
     """Estimate unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0), and planarity (N,).
 
-    Planarity is 1 where the points around lie on a plane and 0 where they scatter alike in all directions, as in a
-    crown: 1 - 3 s, with s the share of the covariance's smallest eigenvalue (the "surface variation" of Pauly et al.,
-    2002). Fewer than three neighbours give (0, 0, 1) and 0.
+    Planarity is 1 - 3 s, with s the share of the covariance's smallest eigenvalue ("surface variation", Pauly et al.,
+    2002): 1 on a plane, 0 for isotropic scatter as in a crown. Fewer than three neighbours give (0, 0, 1) and 0.
 
     Args:
         points: (N, 3) float32 metres, finite.
-        k: at most this many neighbours.
-        radius: only neighbours within this distance in metres (hybrid search); None for the k nearest.
+        k: maximum number of neighbours.
+        radius: maximum distance of neighbours, metres (hybrid search); None for the k nearest.
 
     Raises:
         ConfigError: ``k`` < 3 or ``radius`` <= 0.

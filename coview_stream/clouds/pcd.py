@@ -1,4 +1,4 @@
-"""PCD files: ascii, binary and binary_compressed, any order and types of fields."""
+"""PCD files: ascii, binary and binary_compressed, with fields of any order and type."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _AXES = ("x", "y", "z")
 _MAX_HEADER = 64 * 1024  # bytes
-_MAX_ROW = 1 << 20  # bytes of a point, set by hand: a hundred times the longest descriptors
-_LZF_RATIO = 88  # LZF's most: a back reference of 3 bytes stands for up to 264
+_MAX_ROW = 1 << 20  # bytes of a point; a hundred times the longest descriptors
+_LZF_RATIO = 88  # LZF's maximum: a back reference of 3 bytes yields up to 264
 
 
 @dataclass(frozen=True)
 class _Header:
-    """Header of a PCD file: fields with their types and counts, points, encoding and where the data start."""
+    """Header of a PCD file."""
 
     fields: tuple[str, ...]
     types: tuple[np.dtype[np.generic], ...]
@@ -36,7 +36,7 @@ class _Header:
 
     @property
     def row(self) -> np.dtype[np.void]:
-        """One record; padding fields share the name ``_``, so fields are named by position."""
+        """Type of a point; fields are named by position because padding fields share the name ``_``."""
         pairs = zip(self.types, self.counts, strict=True)
         return np.dtype([(f"f{i}", kind, (count,)) for i, (kind, count) in enumerate(pairs)])
 
@@ -74,8 +74,8 @@ def _parse_header(content: bytes, path: Path) -> _Header:
     try:
         return _header_from(entries, start)
     except (KeyError, ValueError, IndexError) as error:
-        what = f"no {error.args[0]} line" if isinstance(error, KeyError) else str(error)
-        raise CloudError(f"{path}: damaged PCD header ({what}); export the file again") from error
+        reason = f"no {error.args[0]} line" if isinstance(error, KeyError) else str(error)
+        raise CloudError(f"{path}: damaged PCD header ({reason}); export the file again") from error
 
 
 def _header_from(entries: dict[str, list[str]], data_start: int) -> _Header:
@@ -108,15 +108,15 @@ def _width_times_height(entries: dict[str, list[str]]) -> int:
     return int(entries["WIDTH"][0]) * int(entries.get("HEIGHT", ["1"])[0])
 
 
-def _truncated(path: Path, header: _Header, found: int) -> CloudError:
+def _truncated(path: Path, header: _Header, stored: int) -> CloudError:
     return CloudError(
-        f"{path}: truncated PCD, the header promises {header.points} points and the file holds {found}; "
+        f"{path}: truncated PCD, the header promises {header.points} points and the file holds {stored}; "
         "copy or export it again"
     )
 
 
 def _stack(columns: list[npt.NDArray[np.generic]]) -> Reals:
-    """Stack to (N, 3), in float32 if that is what the file holds, in float64 otherwise."""
+    """Stack to (N, 3), in float32 if all columns are, otherwise in float64."""
     dtype = np.float32 if all(column.dtype == np.float32 for column in columns) else np.float64
     return np.stack([column.astype(dtype, copy=False) for column in columns], axis=1)
 
@@ -127,7 +127,7 @@ def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
     body = content[header.data_start :]
     if header.points == 0:
         return np.zeros((0, 3))
-    # three digits, two blanks and a line end are the shortest row; also guards loadtxt's allocation
+    # the shortest row has three digits, two blanks and a line end; this also bounds loadtxt's allocation
     if header.points > len(body) // 6 + 1 or not body.strip():
         raise _truncated(path, header, body.count(b"\n"))
     try:
@@ -152,7 +152,7 @@ def _binary(content: bytes, header: _Header, path: Path) -> Reals:
 
 
 def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
-    """Unpack a body that is one LZF block with each field stored for all points before the next field."""
+    """Unpack a body: one LZF block, field after field, each for all points."""
     start = header.data_start + 8
     if len(content) < start:
         raise _truncated(path, header, 0)
@@ -180,7 +180,7 @@ def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
 def lzf_decompress(packed: bytes, size: int) -> bytearray:
     """Decompress one LZF block of ``size`` bytes.
 
-    Control bytes below 32 start a literal run; others are back references with a 3-bit length (7: one more
+    A control byte below 32 starts a literal run; others are back references with a 3-bit length (7: one more
     length byte follows) and a 13-bit distance.
 
     Raises:
@@ -207,7 +207,7 @@ def lzf_decompress(packed: bytes, size: int) -> bytearray:
             if begin < 0:
                 raise ValueError("back reference before the start")
             piece = out[begin : begin + length]
-            # a reference may reach into what it is about to write: the pattern then repeats
+            # a reference may overlap its own output: the pattern then repeats
             out += piece if distance >= length else (piece * (length // distance + 1))[:length]
     except IndexError as error:
         raise ValueError("compressed block ends early") from error

@@ -1,4 +1,4 @@
-"""PLY files: ascii and binary of either byte order, with the vertices anywhere among the elements."""
+"""PLY files: ascii and binary in either byte order, with the vertices anywhere among the elements."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _AXES = ("x", "y", "z")
 _MAX_HEADER = 64 * 1024  # bytes
-_MAX_LISTS = 8  # set by hand: lists in one element; files have one or two, and each costs a pass over its bytes
-_WINDOW = 1 << 18  # bytes looked at together, set by hand: 20 MB of temporaries
+_MAX_LISTS = 8  # in one element; files have one or two, and each costs a pass over its bytes
+_WINDOW = 1 << 18  # bytes examined together: 20 MB of temporaries
 
 
 @dataclass
 class _Element:
-    """An element that the header declares: its name, how many rows follow, and their properties."""
+    """An element of the header: name, number of rows and their properties."""
 
     name: str
     count: int
@@ -41,7 +41,7 @@ class _Element:
 
     @property
     def least_bytes(self) -> int:
-        """Bytes of a row whose lists are all empty, in a binary file."""
+        """Bytes of a binary row with empty lists."""
         return sum(np.dtype(prop[1]).itemsize for prop in self.properties)
 
     def row(self, order: str) -> np.dtype[np.void]:
@@ -62,8 +62,8 @@ def read_ply(path: Path) -> Cloud:
     names = [prop[0] for prop in vertex.properties]
     missing = [axis for axis in _AXES if axis not in names]
     if missing or vertex.has_list or len(set(names)) < len(names):
-        what = f"have no {', '.join(missing)}" if missing else "hold lists or a property twice"
-        raise CloudError(f"{path}: PLY vertices {what}; export the file as a plain point cloud")
+        fault = f"have no {', '.join(missing)}" if missing else "hold lists or a property twice"
+        raise CloudError(f"{path}: PLY vertices {fault}; export the file as a plain point cloud")
     before = elements[: elements.index(vertex)]
     builder = CloudBuilder()
     if vertex.count:
@@ -121,9 +121,9 @@ def _natural(text: str) -> int:
     return value
 
 
-def _truncated(path: Path, vertex: _Element, found: int) -> CloudError:
+def _truncated(path: Path, vertex: _Element, stored: int) -> CloudError:
     return CloudError(
-        f"{path}: truncated PLY, the header promises {vertex.count} vertices, the file has {max(0, found)}; "
+        f"{path}: truncated PLY, the header promises {vertex.count} vertices, the file has {max(0, stored)}; "
         "copy or export it again"
     )
 
@@ -167,7 +167,7 @@ def _binary(content: bytes, start: int, order: str, before: list[_Element], vert
 
 
 def _skip(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
-    """Return the offset behind an element's rows, in time linear in their bytes whatever the header claims.
+    """Return the offset behind an element's rows, in time linear in the file's size whatever the header claims.
 
     Raises:
         CloudError: a list of negative length, or fewer bytes than the rows need.
@@ -202,7 +202,7 @@ def _after_row(content: bytes, start: int, order: str, element: _Element, path: 
 
 
 def _all_like_the_first(content: bytes, start: int, stride: int, order: str, element: _Element) -> bool:
-    """Tell whether the lists of all rows are as long as those of the first."""
+    """Return whether all rows have lists of the same lengths as the first."""
     if start + element.count * stride > len(content):
         return False
     for prop in element.properties:
@@ -217,7 +217,7 @@ def _all_like_the_first(content: bytes, start: int, stride: int, order: str, ele
 
 
 def _walk(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
-    """Follow rows of different lengths: where a row would end is computed for every byte of a window at once."""
+    """Follow rows of different lengths; row ends are computed for every byte of a window at once."""
     left, size = element.count, len(content)
     octets = np.frombuffer(content, np.uint8)
     while left:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 
 def python_command(module: str, *args: str) -> list[str]:
-    """Return the command that runs one of our modules; nothing is imported from the current directory."""
+    """Return the command that runs one of our modules, without imports from the current directory."""
     return [sys.executable, "-P", "-m", module, *args]
 
 
 def python_environment() -> dict[str, str]:
-    """Return our environment for such a command: this package in reach, the current directory not searched."""
-    # an empty or relative entry would be looked up in the current directory
+    """Return the environment of such a command: this package importable, the current directory not searched."""
+    # empty and relative entries refer to the current directory
     paths = os.pathsep.join(path for path in sys.path if Path(path).is_absolute())
     return os.environ | {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1"}

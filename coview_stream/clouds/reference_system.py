@@ -1,7 +1,7 @@
-"""Coordinate reference systems that cloud files state: which one, and whether a map can be made in it.
+"""Coordinate reference systems of cloud files and maps.
 
-A map has to be in metres, east, north and up, with lengths as on the ground. A silent error of scale looks like a robot
-that is never found.
+A map must be in metres, east, north and up, with lengths as on the ground: an undetected error of scale looks like a
+robot that is never found.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from coview_stream.geometry.arrays import Floats
 
 _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
 _LINEAR_UNIT, _VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
-_CODES = range(1024, 32767)  # of EPSG; 32767 is a system that other keys describe
+_CODES = range(1024, 32767)  # of EPSG; 32767 is a system described by other keys
 _METRE = 9001
+_NORTH_STEP = 10.0  # metres along the map's north axis, to measure true north
 _UNITS = {9002: "feet", 9003: "US survey feet", 9005: "Clarke's feet", 9014: "fathoms", 9093: "miles"}
 
 MAX_SCALE_ERROR = 0.01
-"""Share by which lengths of a projection may differ from those on the ground, set by hand: half a metre in 50 m."""
+"""Relative error of a projection's lengths: half a metre in 50 m."""
 
 
 def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
-    """Return what a file states: its WKT, ``EPSG:code`` or ``EPSG:code+vertical code``; None if it does not say."""
+    """Return the stated system: WKT, ``EPSG:code`` or ``EPSG:code+vertical code``; None if it states none."""
     if wkt:
         return wkt
     horizontal = next((keys[key] for key in (_PROJECTED, _GEOGRAPHIC) if keys.get(key, 0) in _CODES), None)
@@ -40,30 +41,30 @@ def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
 
 
 def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high: Floats) -> str | None:
-    """Return why no map can be made of coordinates in this system, and what to do; None if one can.
+    """Return why no map can be made of coordinates in this system, and the remedy; None if one can.
 
     Args:
-        text: the system, as :func:`stated_system` gives it.
-        keys: GeoTIFF keys that state units apart from the system.
+        text: the system, from :func:`stated_system`.
+        keys: GeoTIFF keys; some state units separately.
         low: (3,) lower corner of the coordinates.
         high: (3,) upper corner.
     """
-    what = _stated_unit(keys) or _unit_in_text(text or "", low, high)
+    flaw = _stated_unit(keys) or _unit_in_text(text or "", low, high)
     system = _parse(text)
-    if what is None and system is not None:
-        what = _flaw(system, 0.5 * (low + high))
-    if what is None:
+    if flaw is None and system is not None:
+        flaw = _flaw(system, 0.5 * (low + high))
+    if flaw is None:
         return None
-    return f"{what} according to its reference system; reproject it to {_metric_system(system, low, high)}"
+    return f"{flaw} according to its reference system; reproject it to {_metric_system(system, low, high)}"
 
 
 def unchecked_system(text: str | None) -> bool:
-    """Tell whether a file's system is known by a code alone that cannot be looked up, for want of pyproj."""
+    """Return whether a system is only a code that cannot be looked up without pyproj."""
     return text is not None and text.startswith("EPSG:") and importlib.util.find_spec("pyproj") is None
 
 
 def flaw_of_name(text: str) -> str | None:
-    """Return why a system that a person names is none for coordinates in metres; None if it is, or without pyproj."""
+    """Return why a system named by a person does not fit metric coordinates; None if it does, or without pyproj."""
     if importlib.util.find_spec("pyproj") is None:
         return None
     system = _parse(text)
@@ -75,7 +76,7 @@ def flaw_of_name(text: str) -> str | None:
 
 
 def same_system(one: str | None, other: str | None) -> bool:
-    """Tell whether two systems are the same, or may be: one is not stated, or states no heights."""
+    """Return whether two systems may be the same: one may be unknown, or state no heights."""
     if one is None or other is None or one == other:
         return True
     first, second = _parse(one), _parse(other)
@@ -86,7 +87,7 @@ def same_system(one: str | None, other: str | None) -> bool:
 
 
 def short_name(text: str | None) -> str:
-    """Return a system's name, in a few words."""
+    """Return a system's name in a few words."""
     if text is None:
         return "unknown"
     system = _parse(text)
@@ -98,10 +99,10 @@ def short_name(text: str | None) -> str:
 
 
 def _stated_unit(keys: Mapping[int, int]) -> str | None:
-    for key, what in ((_LINEAR_UNIT, "coordinates are"), (_VERTICAL_UNIT, "heights are")):
+    for key, subject in ((_LINEAR_UNIT, "coordinates are"), (_VERTICAL_UNIT, "heights are")):
         unit = keys.get(key, _METRE)
         if unit in _UNITS:
-            return f"{what} in {_UNITS[unit]}"
+            return f"{subject} in {_UNITS[unit]}"
     return None
 
 
@@ -118,7 +119,7 @@ def _like_degrees(low: Floats, high: Floats) -> bool:
 
 @lru_cache(maxsize=64)
 def _parse(text: str | None) -> Any:
-    """Return a pyproj.CRS; None without pyproj, or where the text is none: no reason to refuse the points."""
+    """Return a pyproj.CRS; None without pyproj, or for an unknown text, since its points may be good."""
     if not text or importlib.util.find_spec("pyproj") is None:
         return None
     import pyproj
@@ -152,10 +153,10 @@ def _flaw(system: Any, centre: Floats) -> str | None:
         return "coordinates are in degrees" if _like_degrees(centre, centre) else None
     axes = [("coordinates", axis) for axis in parts[0].axis_info[:2]]
     axes += [("heights", axis) for part in (parts[0].axis_info[2:], *(p.axis_info for p in parts[1:])) for axis in part]
-    for what, axis in axes:
+    for subject, axis in axes:
         if abs(axis.unit_conversion_factor - 1.0) > 1e-9:
             unit = {"foot": "feet", "US survey foot": "US survey feet"}.get(axis.unit_name, axis.unit_name)
-            return f"{what} are in {unit} ({system.name})"
+            return f"{subject} are in {unit} ({system.name})"
     scale = _scale(parts[0], centre)
     if scale is not None and abs(scale - 1.0) > MAX_SCALE_ERROR:
         return f"lengths are {scale:.2f} times those on the ground ({system.name} is a map of the world, not of a site)"
@@ -163,7 +164,7 @@ def _flaw(system: Any, centre: Floats) -> str | None:
 
 
 def _scale(projected: Any, centre: Floats) -> float | None:
-    """Return lengths on the map by lengths on the ground; None where the place is not in the system's area."""
+    """Return lengths on the map divided by lengths on the ground; None outside the system's area."""
     place = _longitude_latitude(projected, centre)
     if place is None:
         return None
@@ -187,7 +188,7 @@ def _longitude_latitude(projected: Any, centre: Floats) -> tuple[float, float] |
 
 
 def _metric_system(system: Any, low: Floats, high: Floats) -> str:
-    """Name a metric system of the place, if that can be told."""
+    """Name a metric system for the place, if possible."""
     how = "a metric system, for example with `pdal translate -f filters.reprojection`"
     centre = 0.5 * (low + high)
     if system is None or _parts(system)[0].is_geocentric:
@@ -200,20 +201,17 @@ def _metric_system(system: Any, low: Floats, high: Floats) -> str:
     return f"EPSG:{(32600 if place[1] >= 0 else 32700) + zone} or another {how[2:]}"
 
 
-_STEP = 10.0  # metres to the north by which true north is measured
-
-
 class GeoReference:
-    """Map coordinates as WGS 84.
+    """Conversion of map coordinates to WGS 84.
 
-    Heights are above the ellipsoid where the reference system says what its own refer to and pyproj has the grid for
-    it; else those of the map, as they are.
+    Heights are above the ellipsoid if the system states its vertical datum and pyproj has the grid for it; otherwise
+    they are the map's.
 
     Args:
         crs: of the map, WKT or ``EPSG:code``.
 
     Raises:
-        InputError: the map states no reference system, or one that has no place on Earth. DependencyError: no pyproj.
+        InputError: the map has no reference system, or one without a place on Earth. DependencyError: no pyproj.
     """
 
     def __init__(self, crs: str | None) -> None:
@@ -234,9 +232,9 @@ class GeoReference:
             raise InputError(f"the map's reference system {short_name(crs)} has no place on Earth ({error})") from error
 
     def geodetic(self, positions: Floats) -> Floats:
-        """Return latitude, longitude (degrees) and height (metres), (N, 3), of positions (N, 3) in the map's frame.
+        """Return latitude, longitude (degrees) and height (metres), (N, 3), of positions (N, 3) in the map frame.
 
-        NaN where a position has no place on Earth.
+        NaN for a position without a place on Earth.
         """
         x, y, z = np.asarray(positions, dtype=np.float64).reshape(-1, 3).T
         if self._high is None:
@@ -249,8 +247,8 @@ class GeoReference:
         return out
 
     def convergence(self, position: Floats) -> float:
-        """Return the bearing of the map's north at a position (3,), radians, clockwise from true north."""
-        north = np.add(position, (0.0, _STEP, 0.0))
+        """Return the bearing of the map's north axis at a position (3,), radians clockwise from true north."""
+        north = np.add(position, (0.0, _NORTH_STEP, 0.0))
         (lat, lon, _), (lat_n, lon_n, _) = np.radians(self.geodetic(np.stack([position, north])))
         east = math.sin(lon_n - lon) * math.cos(lat_n)
         along = math.cos(lat) * math.sin(lat_n) - math.sin(lat) * math.cos(lat_n) * math.cos(lon_n - lon)
@@ -262,7 +260,7 @@ class GeoReference:
 
     def enu_covariance(self, position: Floats, covariance: Floats) -> Floats:
         """Return a covariance (3, 3) of x, y, z in map axes as one of east, north, up, m2."""
-        angle = self.convergence(position)  # the map's axes are turned clockwise by it
+        angle = self.convergence(position)  # by which the map's axes are turned clockwise
         turn = np.array(
             [[math.cos(angle), math.sin(angle), 0.0], [-math.sin(angle), math.cos(angle), 0.0], [0, 0, 1.0]]
         )

@@ -1,4 +1,4 @@
-"""Trajectories as text: TUM (``t x y z qx qy qz qw``) and KITTI (3x4 rows with separate times)."""
+"""Trajectories as text: TUM (``t x y z qx qy qz qw``) and KITTI (3x4 rows, with separate times)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
     """Read stamps (N,) in seconds and poses (N, 4, 4) in metres from a TUM file.
 
     Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
-    without poses gives N = 0 (a trajectory of a run that was never localised).
+    without poses gives N = 0 (a run that was never localised).
 
     Raises:
         RunError: missing or unreadable file, text or a wrong number of columns, NaN, a zero quaternion, or
@@ -43,7 +43,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
     """Read poses (N, 4, 4) from a KITTI file: 12 numbers a line, the first three rows of each matrix.
 
     Raises:
-        RunError: as ``read_tum``; also where the 3x3 part is no rotation.
+        RunError: as ``read_tum``; also if the 3x3 part is no rotation.
     """
     path = Path(path)
     rows, lines = _read_rows(path, 12, "the 3x4 pose, row by row")
@@ -94,13 +94,13 @@ def write_tum(path: str | os.PathLike[str], stamps: Sequence[float] | Floats, po
 
 
 def check_stamps(stamps: Floats, lines: Sequence[int], path: Path) -> None:
-    """Raise RunError at the first stamp that does not come after the one before."""
+    """Raise RunError at the first stamp that does not increase."""
     late = np.diff(stamps) <= 0
     if late.any():
         at = int(np.argmax(late)) + 1
-        what = "repeats" if stamps[at] == stamps[at - 1] else "comes before"
+        verb = "repeats" if stamps[at] == stamps[at - 1] else "comes before"
         raise RunError(
-            f"{path}:{lines[at]}: stamp {stamps[at]:.6f} {what} the one of the line before; "
+            f"{path}:{lines[at]}: stamp {stamps[at]:.6f} {verb} the one of the line before; "
             "sort the lines and remove repetitions"
         )
 
@@ -111,7 +111,7 @@ def columns_of(path: Path) -> int:
 
 
 def _words(path: Path) -> list[tuple[int, list[str]]]:
-    """Return (line number, words) of each line that is neither blank nor a comment."""
+    """Return (line number, words) of all lines but blank ones and comments."""
     try:
         text = path.read_bytes().decode("ascii")
     except FileNotFoundError as error:
