@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 # set by hand; of onnxruntime, the network and what else is imported, in two processes
 _NETWORK_MEMORY = 0.2 * GB
-_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, and what a search says of each; set by hand
-_FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level; set by hand
-_FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores; set by hand
+_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, and what a search says of each
+_FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level
+_FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores
 
 
 def open_map(path: Path) -> tuple[BaseMap | None, Finding]:

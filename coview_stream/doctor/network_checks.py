@@ -36,8 +36,8 @@ _KEYS = (
     "**/@v0/*/pubsub/point_cloud/**",
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
-_LISTEN = 2.0  # seconds, set by hand: clouds come at 5 Hz or more
-_MAX_LISTED = 3  # candidates in one line, set by hand
+_LISTEN = 2.0  # seconds: clouds come at 5 Hz or more
+_MAX_LISTED = 3  # candidates in one line
 _MAX_CANDIDATES = 200  # set by hand; a large site has more than anyone reads
 
 

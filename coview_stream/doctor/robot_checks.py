@@ -202,15 +202,15 @@ def gravity_finding(messages: Sequence[CapturedMessage], robot: str) -> Finding:
     return Finding("ok", "gravity", found, robot=robot)
 
 
-_MAX_LAG = 1.0  # seconds of a cloud after the odometry of its stamp, set by hand; drivers take 0.05 to 0.3
+_MAX_LAG = 1.0  # seconds of a cloud after the odometry of its stamp; drivers take 0.05 to 0.3
 _YEAR = 3.2e7  # seconds
-_MIN_PAIRED = 0.9  # share of the clouds that find odometry, set by hand
-_MAX_STATUS_AGE = 5.0  # seconds, set by hand; a node publishes one every second
+_MIN_PAIRED = 0.9  # share of the clouds that find odometry
+_MAX_STATUS_AGE = 5.0  # seconds; a node publishes one every second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
-_LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds, set by hand
-_MAX_FRAMES = 60  # compared with odometry, set by hand
-_NEAREST_NS = 100_000_000  # a cloud's stamp from the odometry that is taken for it, set by hand
-_LONG_SEARCH = 60.0  # seconds, set by hand: most robots are found within ten
+_LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds
+_MAX_FRAMES = 60  # compared with odometry
+_NEAREST_NS = 100_000_000  # a cloud's stamp from the odometry that is taken for it
+_LONG_SEARCH = 60.0  # seconds: most robots are found within ten
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
 

@@ -1,1 +1,1 @@
-"""Fusion of localized runs with the base map: one cloud, tagged by source, and what has changed."""
+"""Fusion of localized runs with the base map: one cloud, tagged by source and by change."""

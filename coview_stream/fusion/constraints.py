@@ -25,7 +25,7 @@ from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import MIN_PAIRS, Prior
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
-# set by hand
+# chosen by hand
 STEP = 4.0  # metres driven from keyframe to keyframe
 _REACH = 2.0  # metres driven before and after it of which the frames are taken
 _EVERY = 0.5  # metres from one of these frames to the next
@@ -36,15 +36,15 @@ _NEIGHBOURS, _RADIUS = 20, 1.0  # of normals
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """One keyframe and what was seen around it.
+    """One keyframe and the points around it.
 
-    Its frame has its origin in the body, and the map's axes as ``locate`` had them.
+    Its frame has its origin in the body and the map's axes, by the poses of ``locate``.
 
     Attributes:
         run: number of the run, from 0.
         index: of the keyframe among the run's frames that have a pose.
         driven: metres along the run.
-        turned: radians, likewise, all turns counted positive.
+        turned: radians along the run, all turns counted positive.
         T_map_body: (4, 4) as ``locate`` had it, relative to the map's origin.
         T_odom_body: (4, 4).
         points: (N, 3) float32, its frame, metres.
@@ -65,12 +65,12 @@ class Submap:
 
     @cached_property
     def source(self) -> RegistrationCloud:
-        """The points as they are registered to others."""
+        """The points, prepared to be registered."""
         return prepare_scan(self.points, np.zeros(3), RegistrationConfig())
 
     @cached_property
     def target(self) -> LocalMap | None:
-        """The points as others are registered to them; None where they are too few."""
+        """The points as a registration's target; None where they are too few."""
         if len(self.points) < MIN_PAIRS:
             return None
         normals, planarity = estimate_normals(self.points, _NEIGHBOURS, _RADIUS)
@@ -78,11 +78,11 @@ class Submap:
 
 
 def submaps_of(run: LocalizedRun, number: int, origin: Floats) -> list[Submap]:
-    """Return the submaps of a run, in order; every frame is read once at most.
+    """Return the submaps of a run, in order; a frame is read once at most.
 
     Args:
-        run: where it was localized.
-        number: its own, from 0.
+        run: the localized run.
+        number: of the run, from 0.
         origin: (3,) of the map.
     """
     odometry = run.odometry
@@ -118,9 +118,9 @@ def path_of(poses: Floats) -> tuple[Floats, Floats]:
 
 
 def spaced(driven: Floats, step: float) -> Ints:
-    """Return indices of the first of (K,) metres driven, of those ``step`` and more after the one before, and the last.
+    """Return indices into metres driven (K,): the first, others ``step`` or more apart, and the last.
 
-    The last is left out where it is within half a step of the one before.
+    The last is left out within half a step of the one before.
     """
     chosen = [0]
     for k in range(1, len(driven)):
@@ -132,21 +132,21 @@ def spaced(driven: Floats, step: float) -> Ints:
 
 
 AGREE = 3.0
-"""Sigmas per degree of freedom up to which two poses say the same; set by hand, as is what follows."""
+"""Sigmas per degree of freedom up to which two poses agree; chosen by hand, like the next."""
 
-_BELIEF = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # how far off the poses may be that registration starts from
+_BELIEF = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # sigmas of the poses that a registration starts from
 _SCALES = (1.6, 0.8, 0.4)  # metres
 _APART = 10.0  # metres between two keyframes that are registered to each other, at most
-_LOOP = 30.0  # metres that a run has driven between two of its own, at least
-_OTHERS = 2  # of each other run that one is registered to, at most
+_LOOP = 30.0  # least metres driven between two keyframes of one run
+_OTHERS = 2  # keyframes of another run that one is registered to, at most
 _ON_MAP, _ON_SUBMAP = 0.1, 0.3  # shares of the points that have to find a partner
-_MATCH = 0.5  # metres: farther apart it is not the same surface
-_FLAT = 0.5  # planarity of the surfaces of which distances are taken
+_MATCH = 0.5  # metres between points of one surface, at most
+_FLAT = 0.5  # least planarity of a surface to measure distances from
 
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """What one registration says.
+    """Result of one registration.
 
     Attributes:
         source: index of the submap that was registered.
@@ -162,28 +162,28 @@ class Constraint:
 
 
 class Registrar:
-    """Registers submaps, and tells how far their surfaces are apart."""
+    """Registers submaps, and measures the distances between their surfaces."""
 
     def __init__(self, submaps: Sequence[Submap], maps: LocalMaps) -> None:
-        """Take submaps, and the crops of the base map."""
+        """Register these submaps, and to these crops of the base map."""
         self.submaps = submaps
         self._maps = maps
         self._config = RegistrationConfig()
 
     def to_map(self, k: int) -> Constraint | None:
-        """Register submap ``k`` to the base map from where ``locate`` had it; None where too little is alike.
+        """Register submap ``k`` to the base map from the pose of ``locate``; None where too little is alike.
 
         Where both agree the pose is the one of ``locate``, which knows the registrations of all frames before.
         """
         T_located = self.submaps[k].T_map_body
         target = self._maps.around(T_located[:3, 3])
-        found = None if target is None else self._registered(k, -1, target, T_located, np.eye(4))
-        if found is None or off_by(found, T_located) > AGREE:
-            return found
-        return replace(found, T=T_located)
+        constraint = None if target is None else self._registered(k, -1, target, T_located, np.eye(4))
+        if constraint is None or off_by(constraint, T_located) > AGREE:
+            return constraint
+        return replace(constraint, T=T_located)
 
     def to_submap(self, k: int, other: int) -> Constraint | None:
-        """Register submap ``k`` to another from where ``locate`` had both; None where too little is alike."""
+        """Register submap ``k`` to another from the poses of ``locate``; None where too little is alike."""
         target = self.submaps[other].target
         T_start = inverse(self.submaps[other].T_map_body) @ self.submaps[k].T_map_body
         back = self.submaps[other].T_submap_body
@@ -195,17 +195,17 @@ class Registrar:
             return None
         information, pivot, config = np.diag(_BELIEF**-2), np.zeros(3), self._config
         prior = Prior(T_start @ inverse(turn), information)
-        found = register(scan, prior.T_map_source, target, config, _SCALES, prior, pivot)
-        if found is None or found.pairs < (_ON_MAP if other < 0 else _ON_SUBMAP) * config.keep * len(scan.points):
+        match = register(scan, prior.T_map_source, target, config, _SCALES, prior, pivot)
+        if match is None or match.pairs < (_ON_MAP if other < 0 else _ON_SUBMAP) * config.keep * len(scan.points):
             return None
         shared = SharedErrorModel(config)
-        shared.learn(scan, found.T_map_source, target, pivot)
+        shared.learn(scan, match.T_map_source, target, pivot)
         try:
-            own = remove_prior(found.T_map_source @ turn, found.information, T_start, information, config)
-            covariance = registration_covariance(own.information, config) + shared.covariance
+            measured = remove_prior(match.T_map_source @ turn, match.information, T_start, information, config)
+            covariance = registration_covariance(measured.information, config) + shared.covariance
         except InputError:
             return None
-        return Constraint(k, other, T_answer @ own.T_map_body, along_body(covariance, own.T_map_body))
+        return Constraint(k, other, T_answer @ measured.T_map_body, along_body(covariance, measured.T_map_body))
 
     def apart_from_map(self, k: int, T_map_body: Pose) -> Floats:
         """Return distances (M,) of a submap's points to the base map's surfaces, within half a metre."""
@@ -213,7 +213,7 @@ class Registrar:
         return np.zeros(0) if target is None else self._apart(k, target, T_map_body)
 
     def apart(self, k: int, other: int, poses: Floats) -> Floats:
-        """Return distances (M,) of a submap's points to another's surfaces, if bodies are at poses (S, 4, 4)."""
+        """Return distances (M,) of a submap's points to another's surfaces, with the bodies at poses (S, 4, 4)."""
         target = self.submaps[other].target
         T = self.submaps[other].T_submap_body @ inverse(poses[other]) @ poses[k]
         return np.zeros(0) if target is None else self._apart(k, target, T)
@@ -230,14 +230,14 @@ class Registrar:
 
 
 def off_by(constraint: Constraint, T: Pose) -> float:
-    """Return by how many sigmas, per degree of freedom, a pose (4, 4) is off what a constraint says."""
+    """Return the sigmas, per degree of freedom, between a pose (4, 4) and a constraint."""
     gap, R = boxminus(constraint.T, T), constraint.T[:3, :3]
     gap = np.concatenate([gap[:3] @ R, gap[3:] @ R])
     return float(np.sqrt(gap @ np.linalg.solve(constraint.covariance, gap) / 6.0))
 
 
 def overlapping(submaps: Sequence[Submap]) -> list[tuple[int, int]]:
-    """Return pairs of submaps that see the same place: nearest ones of other runs, and loops of the same run."""
+    """Return pairs of submaps of the same place: nearest ones of other runs, and loops of the same run."""
     places = np.array([submap.T_map_body[:3, 3] for submap in submaps])
     runs = np.array([submap.run for submap in submaps])
     driven = np.array([submap.driven for submap in submaps])

@@ -1,4 +1,4 @@
-"""Fusing: runs on a base map to one cloud, each point with its source, and what has changed if that is asked for."""
+"""Fusing of runs on a base map: one cloud with the source of each point and, on request, the changes."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def records(points: Floats, source: npt.ArrayLike, change: npt.ArrayLike, stamp:
 
 
 _CELL = 0.5  # metres
-_AROUND = 5  # cells: eaves and crowns hide what stands a metre beside them
+_AROUND = 5  # cells: eaves and crowns hide things within a metre
 _MAX_CELLS = 400_000_000
 
 
 class SurveyCover:
     """Heights of the highest points of the base map around each place.
 
-    Seen from above, all that stands higher than these was covered, and would be in the map if it had been there; what
-    is lower may be hidden below a roof or a crown, or be a facade.
+    A thing that stood higher would have been seen from above and would be in the map; a lower one may have been hidden
+    below a roof or a crown, or be a facade.
     """
 
     def __init__(self, base_map: BaseMap, low: Points, high: Points) -> None:
@@ -68,31 +68,31 @@ class SurveyCover:
         return out
 
     def saw(self, points: Points, above: float) -> Bools:
-        """Tell of points (N, 3) whether the survey would have seen them: ``above`` metres over all around them."""
+        """Tell (N,) whether the survey would have seen points (N, 3): ``above`` metres over all around them."""
         top = self.top_around(points)
         return np.asarray(np.isfinite(top) & (points[:, 2] > top + above))
 
 
 Progress = Callable[[str, int, int], None]
-"""Called with (what is done, frames done, frames)."""
+"""Called with (name of the step, frames done, frames)."""
 
 _CHUNK = 500_000
-_LOOKS = 3  # that see through a point before it counts as not there; set by hand, as are the following
-_THROUGH_MOVING, _THROUGH_GONE = 2, 4  # times as many as see something there
-_NEAR = 0.5  # metres: a point of the map this near is the same thing, and a blind spot is farther from all of them
+_LOOKS = 3  # through a point, before it counts as absent
+_THROUGH_MOVING, _THROUGH_GONE = 2, 4  # looks through a point per look that ends there
+_NEAR = 0.5  # metres to the map: nearer is the same thing, farther may be a blind spot
 _ABOVE = 0.4  # metres over all that the survey saw around
 
 
 @dataclass(frozen=True)
 class FuseConfig:
-    """What of the runs is taken.
+    """Selection of the runs' points.
 
     Attributes:
-        voxel: metres; one point of all runs is kept in each cube of this size, and none this near to the map's.
-        range_min: metres from the lidar; what is nearer may be the robot itself.
-        range_max: metres from the lidar; what is farther lies where the pose's angles put it.
-        keep_moving: keep what rays of the runs went through later or before: people, cars that drove.
-        changes: tell what is new and what is gone.
+        voxel: metres; one point of all runs in each cube of this size, and none this near to the map's points.
+        range_min: metres from the lidar; nearer points may be the robot itself.
+        range_max: metres from the lidar; farther points suffer from errors of the pose's angles.
+        keep_moving: keep people and cars, which other rays went through.
+        changes: mark new and vanished points.
 
     Raises:
         ConfigError: a value out of its range.
@@ -112,10 +112,10 @@ class FuseConfig:
 
 @dataclass(frozen=True)
 class Added:
-    """What one run added.
+    """Contribution of one run.
 
     Attributes:
-        frames: that were taken.
+        frames: used.
         without_pose: frames that have no pose.
         damaged: frames that could not be read.
         points: of the run in the fused cloud; a voxel that several runs saw counts for the first of them.
@@ -129,7 +129,7 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The fused cloud, whose base map stays in its file until it is asked for.
+    """The fused cloud; its base map stays in its file until :meth:`chunks` reads it.
 
     Attributes:
         base_map: the map.
@@ -140,7 +140,7 @@ class Fused:
         stamp: (N,) float64 of the newest frame that saw it, seconds.
         added: by run.
         filled: square metres of surface, about, that lie in blind spots of the survey.
-        moving: voxels apart from the map that rays went through; left out unless they were to be kept.
+        moving: voxels apart from the map that rays went through; left out without ``keep_moving``.
     """
 
     base_map: BaseMap
@@ -175,11 +175,11 @@ def fuse(
 ) -> Fused:
     """Merge localized runs with the map they were localized on.
 
-    The frames are read twice: once for their surfaces, once, a few of them, for what their rays went through.
-    What is held in memory is one row for each voxel that the runs hit, not their points.
+    Frames are read for their surfaces, and a few of them again for the points that their rays went through.
+    Memory holds one row per voxel that the runs hit, not their points.
 
     Raises:
-        InputError: a frame lies beyond what a map can hold.
+        InputError: a frame lies too far from the map.
         CloudError: not one point of the runs is in range.
     """
     config = config or FuseConfig(voxel=base_map.config.voxel)
@@ -250,7 +250,7 @@ def _seen_through(through: Counts, seen: Counts, times: int) -> Bools:
 
 
 def _gone(points: Points, through: Counts, seen: Counts, now: Points) -> Bools:
-    """Tell of the map's points (B, 3) which are gone: seen through, with nothing that stays around them now."""
+    """Tell which of the map's points (B, 3) are gone: seen through, with no lasting point near them now."""
     gone = _seen_through(through, seen, _THROUGH_GONE)
     far: Floats32 = distances(points[gone], within(now), _NEAR)
     gone[gone] = ~np.isfinite(far)
@@ -258,22 +258,22 @@ def _gone(points: Points, through: Counts, seen: Counts, now: Points) -> Bools:
 
 
 def _base_near(base_map: BaseMap, points: Points) -> Ints:
-    """Return the indices of the map's points near enough to the runs' that a ray may tell something of them."""
+    """Return the indices of the map's points within reach of the runs' rays."""
     tile = 2.0 * REACH
     low = np.floor(points[:, :2].min(axis=0).astype(np.float64) / tile) - 1
     shape = (np.floor(points[:, :2].max(axis=0) / tile) + 2 - low).astype(int)
     grid = np.zeros(tuple(shape), dtype=bool)
     grid[tuple((np.floor(points[:, :2].astype(np.float64) / tile) - low).astype(int).T)] = True
-    found = []
+    near = []
     for begin in range(0, len(base_map.points), _CHUNK):
         cells = (np.floor(base_map.points[begin : begin + _CHUNK, :2] / tile) - low).astype(int)
         inside = np.flatnonzero(((cells >= 0) & (cells < shape)).all(axis=1))
-        found.append(begin + inside[grid[tuple(cells[inside].T)]])
-    return np.concatenate(found)
+        near.append(begin + inside[grid[tuple(cells[inside].T)]])
+    return np.concatenate(near)
 
 
 def check_count(runs: int) -> None:
-    """Refuse more runs than a point's source can name.
+    """Refuse more runs than a point's source number can count.
 
     Raises:
         ConfigError: there are more than 65,535.

@@ -1,4 +1,4 @@
-"""Files of fused clouds: las and laz, ply, pcd and npy, written in chunks, and a JSON file that names the sources."""
+"""Output of fused clouds: files (las, laz, ply, pcd, npy, with a JSON file of the sources), a summary, a picture."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _PCD_TYPES = {"f8": "8 F", "u2": "2 U", "u1": "1 U"}
 
 
 def check_name(path: Path, inputs: Iterable[Path]) -> None:
-    """Refuse a name that no cloud can have, or that of a file that is read; and LAS where laspy is missing.
+    """Refuse a name that no cloud can have, the name of an input, and LAS where laspy is missing.
 
     Raises:
-        CloudError: it is one. DependencyError: laspy is missing.
+        CloudError: the name is refused. DependencyError: laspy is missing.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise CloudError(f"{path}: name a cloud, one of {', '.join(SUFFIXES)}")
@@ -42,10 +42,10 @@ def check_name(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
-    """Write the cloud, and ``PATH.json`` beside it with the name of each source.
+    """Write the cloud, and next to it ``PATH.json`` with the name of each source.
 
-    LAS and LAZ hold millimetres, the source as ``point_source_id``, the stamp as ``gps_time`` and ``change`` as a
-    dimension of its own; PLY and PCD have properties ``source``, ``change`` and ``stamp``, and NPY columns x, y, z,
+    LAS and LAZ hold millimetres, the source as ``point_source_id``, the stamp as ``gps_time`` and ``change`` as an
+    extra dimension; PLY and PCD have properties ``source``, ``change`` and ``stamp``, and NPY columns x, y, z,
     stamp, source, change, all float64.
 
     Raises:
@@ -63,7 +63,7 @@ def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
 
 
 def write_trajectories(path: Path, runs: Sequence[LocalizedRun]) -> list[str]:
-    """Write the poses of each run beside the cloud, TUM, map <- body: ``PATH.run1.tum`` and so on; return the names.
+    """Write the poses of each run next to the cloud, TUM, map <- body: ``PATH.run1.tum`` ...; return the names.
 
     Raises:
         InputError: a file cannot be written.
@@ -110,7 +110,7 @@ def _las(stream: BinaryIO, fused: Fused, path: Path) -> None:
 
 
 def _wkt(crs: str | None) -> str | None:
-    """Return a reference system as WKT; None, with a warning, where it is only a code that cannot be looked up."""
+    """Return a reference system as WKT; None, with a warning, for a code that cannot be looked up."""
     if crs is None or not crs.startswith("EPSG:"):
         return crs
     try:
@@ -149,7 +149,7 @@ def _columns(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
 
 
 def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
-    """Say what each source brought, what of blind spots was filled and, if asked for, how much has changed."""
+    """Summarize the sources, the blind spots filled and, on request, the changes, a line each."""
     lines = [f"{'0 base map':<18} {len(fused.base_map.points):,} points"]
     for k, (name, added) in enumerate(zip(names, fused.added, strict=True), start=1):
         left = [
@@ -157,8 +157,8 @@ def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
             for count, why in ((added.without_pose, "without a pose left out"), (added.damaged, "damaged"))
             if count
         ]
-        told = ", ".join([f"{added.points:,} points of {added.frames} frames", *left])
-        lines.append(f"{f'{k} {name}':<18} {told}")
+        text = ", ".join([f"{added.points:,} points of {added.frames} frames", *left])
+        lines.append(f"{f'{k} {name}':<18} {text}")
     lines.append(f"{'blind spots':<18} about {fused.filled:,.0f} m2 of surface filled")
     lines.append(f"{'moving':<18} {fused.moving:,} voxels that rays went through")
     if changes:
@@ -168,11 +168,11 @@ def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
 
 
 _ADDED, _NEW, _GONE = "#56B4E9", "#009E73", "#D55E00"
-_MOST = 200_000  # points drawn of a kind; set by hand
+_MOST = 200_000  # points drawn per kind
 
 
 def draw_fused(fused: Fused, path: Path, title: str) -> None:
-    """Draw it.
+    """Draw the base map, the points of the runs, and the changes.
 
     Raises:
         InputError: the picture cannot be written. DependencyError: matplotlib is missing.
@@ -189,7 +189,8 @@ def draw_fused(fused: Fused, path: Path, title: str) -> None:
         shift = draw_base_map(axes, base)
         for label, points, colour in kinds:
             if len(points):
-                some = points[:: -(-len(points) // _MOST)] + base_map.origin - shift
-                axes.scatter(some[:, 0], some[:, 1], s=0.5, color=colour, linewidths=0, label=label, rasterized=True)
+                thinned = points[:: -(-len(points) // _MOST)] + base_map.origin - shift
+                xy = thinned[:, 0], thinned[:, 1]
+                axes.scatter(*xy, s=0.5, color=colour, linewidths=0, label=label, rasterized=True)
         axes.set_title(title)
         legend_below(drawing, axes)

@@ -6,7 +6,7 @@ Unknown are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), gtsam
 * odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q measured from the registrations, as while tracking
 * registrations of overlapping submaps, of two runs or of two times of one: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
 
-under Cauchy's kernel all of them. Whether it is better is asked of pairs of submaps that took no part.
+all under Cauchy's kernel. Pairs of submaps that took no part judge whether the result is better.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
 
 Progress = Callable[[str, int, int], None]
-"""Called with (what is done, how many, of how many)."""
+"""Called with (name of the step, how many, of how many)."""
 
-# set by hand
+# chosen by hand
 _KERNEL = 3.0  # sigmas, of Cauchy's weights
 _ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # belief in a pose that nothing else holds
-_HELD_OUT = 4  # one of so many pairs takes no part, to be judged by
+_HELD_OUT = 4  # one of so many pairs is held out to judge the result
 _MIN_HELD_OUT = 3
 _MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distance to the map may grow
 
@@ -68,19 +68,19 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What came of a joint adjustment.
+    """Result of a joint adjustment.
 
     Attributes:
-        located: of each run, (K, 4, 4) map <- body in the coordinates of the map's sources, as ``locate`` had them.
-        adjusted: likewise, adjusted.
+        located: poses of each run by ``locate``, (K, 4, 4) map <- body in the coordinates of the map's sources.
+        adjusted: the adjusted poses, in the same form.
         keyframes: how many.
         on_map: registrations to the map.
         odometry: steps from keyframe to keyframe.
         between: pairs of submaps of two runs.
         loops: pairs of submaps of one run.
-        held_out: pairs that took no part and were judged by.
+        held_out: pairs that took no part, to judge the result.
         residuals: median of |e| in sigmas of all constraints between submaps that took part: before, after.
-        judgement: distances; None where too few pairs were there to judge by.
+        judgement: distances; None with too few pairs to judge by.
     """
 
     located: tuple[Poses, ...]
@@ -96,16 +96,16 @@ class Joint:
 
     @property
     def accepted(self) -> bool:
-        """Whether the adjusted poses are better, as far as the overlaps that took no part tell."""
+        """Whether the adjusted poses are better, judged by the held-out overlaps."""
         return self.judgement is not None and self.judgement.better
 
     @property
     def poses(self) -> tuple[Poses, ...]:
-        """The adjusted poses if they are accepted; else those of ``locate``."""
+        """The adjusted poses if they are accepted, else the poses of ``locate``."""
         return self.adjusted if self.accepted else self.located
 
     def said(self) -> str:
-        """Say it in lines."""
+        """Describe the result in lines."""
         first = (
             f"{'joint':<18} {self.keyframes} keyframes, {self.on_map} on the map, {self.odometry} by odometry, "
             f"{self.between} between runs, {self.loops} loops"
@@ -116,7 +116,7 @@ class Joint:
         runs, to_map = self.judgement.runs, self.judgement.to_map
         both = zip(self.adjusted, self.located, strict=True)
         moved = [float(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1).max()) for a, b in both]
-        shift = f"runs moved by up to {', '.join(f'{each:.2f}' for each in moved)} m"
+        shift = f"runs moved by up to {', '.join(f'{metres:.2f}' for metres in moved)} m"
         return "\n".join([
             first,
             f"{'':<18} constraints between submaps off by {self.residuals[0]:.1f} sigma, then {self.residuals[1]:.1f}",
@@ -132,14 +132,14 @@ def adjust(
     """Adjust the poses of runs jointly; the runs themselves stay as they are.
 
     Args:
-        base_map: they were localized on it.
+        base_map: the map that they were localized on.
         runs: one or more.
-        progress: is told what is done.
-        relative: use registrations of submaps to each other; without, the map's and odometry alone, for comparison.
+        progress: called after each step.
+        relative: use registrations between submaps; False for a comparison with the map and odometry alone.
 
     Raises:
         DependencyError: gtsam is missing.
-        CloudError: a frame cannot be read, as :meth:`LocalizedRun.frames` has it.
+        CloudError: a frame cannot be read.
     """
     require_library("gtsam", "gtsam>=4.3", "fuse --joint")
     submaps: list[Submap] = []
@@ -148,13 +148,13 @@ def adjust(
         if progress:
             progress("submaps", number + 1, len(runs))
     registrar = Registrar(submaps, LocalMaps(base_map, 40.0))
-    on_map = [found for k in range(len(submaps)) if (found := registrar.to_map(k))]
+    on_map = [constraint for k in range(len(submaps)) if (constraint := registrar.to_map(k))]
     pairs = []
     candidates = overlapping(submaps)
     for done, (k, other) in enumerate(candidates, start=1):
-        found = registrar.to_submap(k, other)
-        if found is not None:
-            pairs.append(found)
+        constraint = registrar.to_submap(k, other)
+        if constraint is not None:
+            pairs.append(constraint)
         if progress:
             progress("overlaps", done, len(candidates))
     held_out, used = pairs[::_HELD_OUT], [pair for k, pair in enumerate(pairs) if k % _HELD_OUT]
@@ -164,14 +164,14 @@ def adjust(
     judgement = None
     if len(held_out) >= _MIN_HELD_OUT:
         judgement = Judgement(
-            _medians(lambda at: [registrar.apart(each.source, each.target, at) for each in held_out], before, after),
+            _medians(lambda at: [registrar.apart(pair.source, pair.target, at) for pair in held_out], before, after),
             _medians(lambda at: [registrar.apart_from_map(k, at[k]) for k in range(len(submaps))], before, after),
         )
     adjusted = tuple(
         _spread(run, [(s, T) for s, T in zip(submaps, after, strict=True) if s.run == number], base_map.origin)
         for number, run in enumerate(runs)
     )
-    loops = sum(submaps[each.source].run == submaps[each.target].run for each in used)
+    loops = sum(submaps[pair.source].run == submaps[pair.target].run for pair in used)
     residuals = (_residual(used, before), _residual(used, after))
     return Joint(
         tuple(run.poses for run in runs), adjusted, len(submaps), len(on_map), len(steps), len(used) - loops, loops,
@@ -180,12 +180,12 @@ def adjust(
 
 
 def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:
-    """Return the steps of odometry, as uncertain as the registrations of their run to the map show it to be.
+    """Return the steps of odometry, with the uncertainty that the run's registrations to the map show.
 
-    Where an end has no registration, the step is the one of ``locate`` unless it jumps: nothing else has what it knew.
+    Where an end has no registration, the step is taken from ``locate`` unless it jumps there.
     """
     config = LocalizerConfig().tracking
-    registered = {each.source: each for each in on_map}
+    registered = {constraint.source: constraint for constraint in on_map}
     drifts = {submap.run: DriftEstimator(config) for submap in submaps}
     steps = [k for k in range(1, len(submaps)) if submaps[k].run == submaps[k - 1].run]
     out = []
@@ -195,7 +195,7 @@ def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[C
         if k in registered and k - 1 in registered and worth_learning(driven, turned):
             first, second = registered[k - 1], registered[k]
             step = inverse(a.T_odom_body) @ b.T_odom_body
-            noise = np.array([np.diag(_in_map(each)) for each in (first, second)]).sum(axis=0)
+            noise = np.array([np.diag(along_map(end.covariance, end.T)) for end in (first, second)]).sum(axis=0)
             drifts[a.run].add(boxminus(second.T, first.T @ step), noise, driven, turned)
     for k in steps:
         a, b = submaps[k - 1], submaps[k]
@@ -207,10 +207,6 @@ def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[C
         smooth = alone and off_by(by_odometry, T_located) < AGREE
         out.append(replace(by_odometry, T=T_located) if smooth else by_odometry)
     return out
-
-
-def _in_map(constraint: Constraint) -> Floats:
-    return along_map(constraint.covariance, constraint.T)
 
 
 def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: Sequence[Constraint]) -> Floats:
@@ -226,11 +222,11 @@ def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: S
     for k, submap in enumerate(submaps):
         values.insert(k, gtsam.Pose3(submap.T_map_body))
         graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(submap.T_map_body), anywhere))
-    for each in on_map:
-        graph.add(gtsam.PriorFactorPose3(each.source, gtsam.Pose3(each.T), robust(each.covariance)))
-    for each in relative:
-        T = gtsam.Pose3(each.T)
-        graph.add(gtsam.BetweenFactorPose3(each.target, each.source, T, robust(each.covariance)))
+    for c in on_map:
+        graph.add(gtsam.PriorFactorPose3(c.source, gtsam.Pose3(c.T), robust(c.covariance)))
+    for c in relative:
+        T = gtsam.Pose3(c.T)
+        graph.add(gtsam.BetweenFactorPose3(c.target, c.source, T, robust(c.covariance)))
     answer = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.asarray([answer.atPose3(k).matrix() for k in range(len(submaps))], dtype=np.float64)
 
@@ -239,19 +235,19 @@ def _residual(constraints: Sequence[Constraint], poses: Floats) -> float:
     """Median of the whitened differences between submaps, in sigmas per degree of freedom."""
     if not constraints:
         return float("nan")
-    return float(np.median([off_by(each, inverse(poses[each.target]) @ poses[each.source]) for each in constraints]))
+    return float(np.median([off_by(c, inverse(poses[c.target]) @ poses[c.source]) for c in constraints]))
 
 
 def _medians(apart: Callable[[Floats], list[Floats]], before: Floats, after: Floats) -> tuple[float, float]:
     def median(poses: Floats) -> float:
-        every = [each for each in apart(poses) if len(each)]
-        return float(np.mean([np.median(each) for each in every])) if every else float("nan")
+        medians = [np.median(distances) for distances in apart(poses) if len(distances)]
+        return float(np.mean(medians)) if medians else float("nan")
 
     return median(before), median(after)
 
 
 def _spread(run: LocalizedRun, keyframes: Sequence[tuple[Submap, Pose]], origin: Floats) -> Poses:
-    """Return poses (K, 4, 4) of all frames: moved as the keyframes before and after, blended by the way driven."""
+    """Return poses (K, 4, 4) of all frames: the moves of the keyframes around, blended by the way driven."""
     driven, _ = path_of(run.odometry)
     at = np.array([submap.driven for submap, _ in keyframes])
     moves = [T @ inverse(submap.T_map_body) for submap, T in keyframes]

@@ -1,4 +1,4 @@
-"""Localized runs: a recorded run, and what ``locate`` wrote for it."""
+"""Localized runs: a recorded run with the results of ``locate``."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ class RunPair:
 
     @property
     def result(self) -> Path:
-        """The ``result.json`` beside the trajectory, which need not be there."""
+        """The ``result.json`` next to the trajectory, which may be absent."""
         return self.trajectory.with_name("result.json")
 
 
 def parse_pair(text: str) -> RunPair:
-    """Read ``RUN:OUT``; paths may have colons as long as both are there for one way to part them only.
+    """Read ``RUN:OUT``; paths may have colons if only one way to split the text names existing paths.
 
     Raises:
-        InputError: no part before a colon is there together with the part after it, or there are several ways.
+        InputError: no way to split the text names existing paths, or several do.
     """
     ways = [k for k, letter in enumerate(text) if letter == ":" and 0 < k < len(text) - 1]
     if not ways:
-        raise InputError(f"{text}: write RUN:OUT, the run and what `coview-stream locate RUN -o OUT` wrote for it")
+        raise InputError(f"{text}: write RUN:OUT, the run and the results of `coview-stream locate RUN -o OUT`")
     pairs = [RunPair(Path(text[:k]), Path(text[k + 1 :])) for k in ways]
     there = [pair for pair in pairs if pair.run.exists() and pair.out.exists()]
     if len(there) > 1:
@@ -64,7 +64,7 @@ def parse_pair(text: str) -> RunPair:
     if not there:
         pair = next((pair for pair in pairs if pair.run.exists()), pairs[0])
         absent = pair.out if pair.run.exists() else pair.run
-        raise InputError(f"{text}: there is no {absent}; write RUN:OUT, the run and what `locate` wrote for it")
+        raise InputError(f"{text}: there is no {absent}; write RUN:OUT, the run and the results of `locate`")
     return there[0]
 
 
@@ -86,35 +86,35 @@ class PosedFrame:
 
 
 class LocalizedRun:
-    """Run with poses on the map; frames are read when they are asked for.
+    """Run with poses on the map; frames are read on demand.
 
     Attributes:
-        pair: where it is.
+        pair: its paths.
         stamps: (K,) of the frames that have a pose, seconds.
         poses: (K, 4, 4) theirs, map <- body, in the coordinates of the map's sources.
         without_pose: frames of the run that have none.
-        damaged: frames that could not be read so far, by index.
+        damaged: indices of frames that could not be read so far.
     """
 
     def __init__(self, pair: RunPair, base_map: BaseMap, open_it: Callable[[Path, Mount | None], Run]) -> None:
-        """Read the results, then open the run with ``open_it`` (its path, the mount that ``locate`` had been given).
+        """Read the results, then open the run with ``open_it`` (its path, the mount given to ``locate``).
 
         Raises:
             InputError: the results are of another map, no frame has a pose, or files cannot be read.
         """
         self.pair = pair
         if not pair.trajectory.is_file():
-            raise InputError(f"{pair.out}: holds no trajectory.tum; name what `coview-stream locate` wrote")
+            raise InputError(f"{pair.out}: holds no trajectory.tum; name the results of `coview-stream locate`")
         stamps, poses = read_tum(pair.trajectory)
-        told = _read_result(pair.result)
-        _check_map(pair, told, base_map)
-        calibration = _part(told, "calibration")
+        result = _read_result(pair.result)
+        _check_map(pair, result, base_map)
+        calibration = _part(result, "calibration")
         self._R_level = exp_so3(np.radians([_number(calibration, "roll_deg"), _number(calibration, "pitch_deg"), 0.0]))
         scale = _number(calibration, "odometry_scale", 1.0) - 1.0
         self._correction = SweepCorrection(self._R_level, scale)
         turn = np.radians(_number(calibration, "odometry_turn_deg_per_m"))
         self._calibration = Calibration(scale=scale, turn=float(turn))
-        self._run = open_it(pair.run, _mount(told))
+        self._run = open_it(pair.run, _mount(result))
         self._origin = base_map.origin
         self.damaged: set[int] = set()
         self._index, at = _matched(self._run.stamps, stamps)
@@ -130,21 +130,21 @@ class LocalizedRun:
 
     @property
     def odometry(self) -> Poses:
-        """Odometry (K, 4, 4) of these frames' bodies, metres, scale and heading as ``locate`` last corrected them."""
+        """Odometry (K, 4, 4) of these frames, metres, with the last correction by ``locate`` of scale and heading."""
         correction = OdometryCorrection()
-        every = np.array([correction.correct(T, self._calibration) for T in self._run.poses])
-        return np.asarray(every[self._index])
+        corrected = np.array([correction.correct(T, self._calibration) for T in self._run.poses])
+        return np.asarray(corrected[self._index])
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks of the run's reader, a line each."""
         return self._run.notes
 
-    def frames(self, every: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
-        """Yield the frames with a pose, in order; None for those left out by ``every`` (by index) or damaged."""
+    def frames(self, wanted: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
+        """Yield the frames with a pose, in order; None for a damaged one, or one that ``wanted`` refuses."""
         lever = np.zeros(3) if self._run.mount is None else self._run.mount.T_body_sensor[:3, 3]
         for k, index in enumerate(self._index):
-            if every is not None and not every(k):
+            if wanted is not None and not wanted(k):
                 yield None
                 continue
             try:
@@ -155,7 +155,7 @@ class LocalizedRun:
                 continue
             finite = frame.points[np.isfinite(frame.points).all(axis=1)]
             points = transform(pose_from(self._R_level, np.zeros(3)), finite)
-            # a single scan may be stored far from its zero: the pose is that of the file's own coordinates
+            # a single scan may be stored far from its zero: the pose is in the file's coordinates
             T = self.poses[k] @ pose_from(np.eye(3), frame.origin)
             T[:3, 3] -= self._origin
             yield PosedFrame(float(self.stamps[k]), points, T, self._R_level @ lever)
@@ -179,16 +179,16 @@ def _read_result(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_RESULT:
             raise ValueError("too large")
-        told = json.loads(path.read_bytes())
+        result = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as what `locate` writes ({error}); run it again") from error
-    if not isinstance(told, dict):
+        raise InputError(f"{path}: cannot be read as a result of `locate` ({error}); run it again") from error
+    if not isinstance(result, dict):
         raise InputError(f"{path}: is no result of `locate`; run it again")
-    return told
+    return result
 
 
-def _check_map(pair: RunPair, told: dict[str, Any], base_map: BaseMap) -> None:
-    sha = told.get("map_sha256")
+def _check_map(pair: RunPair, result: dict[str, Any], base_map: BaseMap) -> None:
+    sha = result.get("map_sha256")
     if not isinstance(sha, str) or not sha:
         warn(f"{pair.out}: does not say which map it was localised on; taken for the one given")
     elif base_map.sha256 and sha != base_map.sha256:
@@ -198,16 +198,16 @@ def _check_map(pair: RunPair, told: dict[str, Any], base_map: BaseMap) -> None:
         )
 
 
-def _part(told: dict[str, Any], name: str) -> dict[str, Any]:
-    value = told.get(name)
+def _part(result: dict[str, Any], name: str) -> dict[str, Any]:
+    value = result.get(name)
     return value if isinstance(value, dict) else {}
 
 
-def _number(told: dict[str, Any], name: str, otherwise: float = 0.0) -> float:
-    value = told.get(name, otherwise)
+def _number(values: dict[str, Any], name: str, otherwise: float = 0.0) -> float:
+    value = values.get(name, otherwise)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else otherwise
 
 
-def _mount(told: dict[str, Any]) -> Mount | None:
-    value = _part(told, "mount")
+def _mount(result: dict[str, Any]) -> Mount | None:
+    value = _part(result, "mount")
     return Mount(**{name: _number(value, name) for name in ("roll", "pitch", "yaw", "x", "y", "z")}) if value else None

@@ -1,4 +1,4 @@
-"""Sightings: how often rays of the runs ended at points, and how often they went through where these are."""
+"""Sightings of points: how often rays ended at them or went through them, and the tables of points to look up."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points
 
 REACH = 25.0
-"""Metres within which rays are looked at, set by hand: farther off neighbouring rays miss what is between them."""
+"""Metres within which rays count: farther off, neighbouring rays miss things between them."""
 
-_PIXEL = np.radians(0.5)  # of the picture of ranges; 0.2 m at the reach. Set by hand
+_PIXEL = np.radians(0.5)  # of the picture of ranges; 0.2 m at the reach
 _COLUMNS, _ROWS = 720, 361
 _NEAREST, _STEEPEST = 1.5, np.radians(70.0)
-_TILE = 8.0  # metres, of the look-up of points; set by hand
+_TILE = 8.0  # metres, of the look-up of points
 
 
 Counts = npt.NDArray[np.uint32]
@@ -28,18 +28,18 @@ Counts = npt.NDArray[np.uint32]
 class Sightings:
     """Counts of the sightings of points that do not change.
 
-    A ray goes through a point if it and all rays in the pixels around end well behind it: a ray that grazes the ground
-    or an edge says nothing. Where no ray was measured nothing is known.
+    A ray goes through a point if it and all rays in the pixels around end well behind it; one that grazes the ground
+    or an edge does not count. Without a ray nothing is known.
 
     Attributes:
         points: (N, 3) relative to the map's origin, sorted by tile.
-        order: (N,) which of the points given each is.
-        through: (N,) looks that saw through it.
-        seen: (N,) looks that saw something there.
+        order: (N,) indices of the points in the given order.
+        through: (N,) looks through the point.
+        seen: (N,) looks that ended there.
     """
 
     def __init__(self, points: Points, margin: float) -> None:
-        """Take points (N, 3) relative to the map's origin; a ray has to end ``margin`` metres behind, or farther."""
+        """Count for points (N, 3) relative to the map's origin; a ray through one ends ``margin`` metres behind it."""
         tiles = np.floor(points[:, :2].astype(np.float64) / _TILE).astype(np.int64)
         self.order: Ints = np.lexsort((tiles[:, 1], tiles[:, 0]))
         tiles = tiles[self.order]
@@ -52,7 +52,7 @@ class Sightings:
         self.seen = np.zeros(len(points), dtype=np.uint32)
 
     def look(self, frame: PosedFrame) -> None:
-        """Count what one frame says of the points around it."""
+        """Count the rays of one frame at the points around it."""
         ranges = _picture(frame.points - frame.eye.astype(np.float32))
         nearest = _nearest_around(ranges)
         R, t = frame.T_map_body[:3, :3], frame.T_map_body[:3, 3]
@@ -109,7 +109,7 @@ def looks_at(stamps: Floats, positions: Floats, metres: float = 0.5, seconds: fl
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
-_BUFFER = 2_000_000  # rows that wait to be merged; set by hand: 100 MB
+_BUFFER = 2_000_000  # rows that wait to be merged: 100 MB
 
 ROW = np.dtype([("key", "<i8"), ("hits", "<u4"), ("sum", "<f4", 3), ("stamp", "<f8"), ("source", "<u2")])
 """A voxel: its key, frames that hit it, sum of their points from its corner, newest stamp, the first run's number."""
@@ -166,16 +166,16 @@ class VoxelTable:
     def _merge(self) -> None:
         if not self._waiting:
             return
-        every = np.concatenate([self._rows, *self._waiting])
+        rows = np.concatenate([self._rows, *self._waiting])
         self._waiting, self._count = [], 0
-        every = every[np.argsort(every["key"], kind="stable")]
-        first = np.flatnonzero(np.append(True, np.diff(every["key"]) != 0)) if len(every) else np.zeros(0, np.int64)
-        merged = every[first]
+        rows = rows[np.argsort(rows["key"], kind="stable")]
+        first = np.flatnonzero(np.append(True, np.diff(rows["key"]) != 0)) if len(rows) else np.zeros(0, np.int64)
+        merged = rows[first]
         if len(first):
-            merged["hits"] = np.add.reduceat(every["hits"], first)
-            merged["sum"] = np.add.reduceat(every["sum"], first, axis=0)
-            merged["stamp"] = np.maximum.reduceat(every["stamp"], first)
-            merged["source"] = np.minimum.reduceat(every["source"], first)
+            merged["hits"] = np.add.reduceat(rows["hits"], first)
+            merged["sum"] = np.add.reduceat(rows["sum"], first, axis=0)
+            merged["stamp"] = np.maximum.reduceat(rows["stamp"], first)
+            merged["source"] = np.minimum.reduceat(rows["source"], first)
         self._rows = merged
 
 
@@ -192,7 +192,7 @@ def cells_of(keys: Ints) -> Floats:
     return np.stack(parts, axis=1).astype(np.float64) - _HALF
 
 
-_TREE_TILE = 50.0  # metres; set by hand: a tree of points at a time of at most some 100,000
+_TREE_TILE = 50.0  # metres: a tree of points at a time of at most some 100,000
 
 
 def distances(points: Points, around: Callable[[Floats, float], Points], reach: float) -> Floats32:

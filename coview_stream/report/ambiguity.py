@@ -24,75 +24,75 @@ from coview_stream.report.plots import (
 _LIMITS = {0.0: "#0072B2", 5.0: "#56B4E9", 10.0: "#009E73", 20.0: "#F0E442", 40.0: "#E69F00", math.inf: "#D55E00"}
 """Metres of driving, and the colour of the stations that are told apart by then: of Okabe and Ito."""
 
-_AREA = 50.0  # metres: stations this near each other are one part of the site; set by hand
+_AREA = 50.0  # metres: stations this near each other are one part of the site
 
 
-def summary(found: Ambiguity, base_map: BaseMap) -> str:
-    """Say in one line from how many stations a robot is found at once, later, and not."""
-    if not len(found):
+def summary(result: Ambiguity, base_map: BaseMap) -> str:
+    """Summarize in one line the shares of stations from which a robot is found at once, later, and not."""
+    if not len(result):
         return "no stations"
-    never = float(np.isinf(found.drive).mean())
-    parts = [f"{_percent(found.share(0.0))} of {len(found):,} places are told apart at once"]
-    later = float(np.isfinite(found.drive).mean()) - found.share(0.0)
+    never = float(np.isinf(result.drive).mean())
+    parts = [f"{_percent(result.share(0.0))} of {len(result):,} places are told apart at once"]
+    later = float(np.isfinite(result.drive).mean()) - result.share(0.0)
     if later > 0.0:
-        metres = float(np.max(found.drive[np.isfinite(found.drive)]))
+        metres = float(np.max(result.drive[np.isfinite(result.drive)]))
         parts.append(f"{_percent(later)} after driving up to {metres:.0f} m")
     if never > 0.0:
         parts.append(f"{_percent(never)} stay ambiguous for {FARTHEST:.0f} m or to the end of the way")
     text = ", ".join(parts)
-    if found.wrong.any():
-        text += f"; at {int(found.wrong.sum())} another place would be taken"
-    slow = found.drive > 0.0
+    if result.wrong.any():
+        text += f"; at {int(result.wrong.sum())} another place would be taken"
+    slow = result.drive > 0.0
     if slow.any():
-        x, y = _worst(found, slow) + base_map.origin[:2]
+        x, y = _worst(result, slow) + base_map.origin[:2]
         text += f"; worst around {x:.0f}, {y:.0f}"
-    return f"{text} (risk {found.risk:g}, {_percent(found.changed)} of the site presumed changed)"
+    return f"{text} (risk {result.risk:g}, {_percent(result.changed)} of the site presumed changed)"
 
 
-def facts(found: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
+def facts(result: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
     """Return the numbers for JSON; metres in the source's frame, nats; null for a drive that does not end."""
-    position = found.position + base_map.origin
+    position = result.position + base_map.origin
     stations = [
         {
-            "station": int(found.station[k]),
+            "station": int(result.station[k]),
             "position": [round(float(v), 2) for v in position[k]],
-            "drive": float(found.drive[k]) if np.isfinite(found.drive[k]) else None,
-            "tried": bool(found.driven[k]),
-            "evidence": round(float(found.evidence[k]), 2),
-            "lead": round(float(found.lead[k]), 2),
-            "error": float(found.error[k]),
-            "wrong": bool(found.wrong[k]),
+            "drive": float(result.drive[k]) if np.isfinite(result.drive[k]) else None,
+            "tried": bool(result.driven[k]),
+            "evidence": round(float(result.evidence[k]), 2),
+            "lead": round(float(result.lead[k]), 2),
+            "error": float(result.error[k]),
+            "wrong": bool(result.wrong[k]),
         }
-        for k in range(len(found))
+        for k in range(len(result))
     ]
-    within = {f"{limit:g}": found.share(limit) for limit in _LIMITS if math.isfinite(limit)}
+    within = {f"{limit:g}": result.share(limit) for limit in _LIMITS if math.isfinite(limit)}
     return {
-        "summary": summary(found, base_map), "risk": found.risk, "changed": found.changed, "within": within,
-        "never": float(np.isinf(found.drive).mean()) if len(found) else 0.0, "stations": stations,
+        "summary": summary(result, base_map), "risk": result.risk, "changed": result.changed, "within": within,
+        "never": float(np.isinf(result.drive).mean()) if len(result) else 0.0, "stations": stations,
     }  # fmt: skip
 
 
-def plot_ambiguity(found: Ambiguity, base_map: BaseMap, path: str | os.PathLike[str], title: str) -> None:
+def plot_ambiguity(result: Ambiguity, base_map: BaseMap, path: str | os.PathLike[str], title: str) -> None:
     """Draw the map in grey, and its stations by how far a robot has to drive from them.
 
     Raises:
         InputError: the picture cannot be written.
     """
-    release_arrays(base_map.arrays)  # of what searching took
+    release_arrays(base_map.arrays)  # memory of the search
     base = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
     release_arrays(base_map.arrays)
     with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
         shift = draw_base_map(axes, base)
-        at = found.position + base_map.origin - shift
+        at = result.position + base_map.origin - shift
         size = float(np.clip(16_000.0 / max(len(at), 1), 6.0, 30.0))
         before = -math.inf
         for limit, colour in _LIMITS.items():
-            here = (found.drive > before) & (found.drive <= limit)
-            label = f"{_name(before, limit)}: {_percent(float(here.mean()) if len(found) else 0.0)}"
+            here = (result.drive > before) & (result.drive <= limit)
+            label = f"{_name(before, limit)}: {_percent(float(here.mean()) if len(result) else 0.0)}"
             before = limit
             if here.any():
                 axes.scatter(at[here, 0], at[here, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
-        if not len(found):
+        if not len(result):
             draw_notice(axes, "no stations")
         axes.set_title(f"{title}: metres to drive until found")
         legend_below(drawing, axes, "a robot that sets out here is found (share of all places looked at)")
@@ -104,16 +104,16 @@ def _name(before: float, limit: float) -> str:
     return f"after {before:.0f} to {limit:.0f} m" if math.isfinite(limit) else f"not within {before:.0f} m"
 
 
-def _worst(found: Ambiguity, slow: Bools) -> Floats:
-    """Return the middle (2,) of the part of the site with most stations that take long."""
-    xy, metres = found.position[slow, :2], np.minimum(found.drive[slow], 2.0 * FARTHEST)
+def _worst(result: Ambiguity, slow: Bools) -> Floats:
+    """Return the middle (2,) of the part of the site with the longest drives."""
+    xy, metres = result.position[slow, :2], np.minimum(result.drive[slow], 2.0 * FARTHEST)
     cell = np.unique(np.floor(xy / _AREA), axis=0, return_inverse=True)[1].ravel()
     worst = cell == np.bincount(cell, weights=metres).argmax()
     return np.asarray(np.median(xy[worst], axis=0))
 
 
 def _percent(share: float) -> str:
-    """Say a share so that neither all nor none is said of less."""
+    """Format a share; "0 %" and "100 %" mean none and all."""
     percent = 100.0 * share
     if 0.0 < percent < 0.5:
         return "under 1 %"

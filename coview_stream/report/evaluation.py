@@ -22,10 +22,10 @@ MAX_TRANSLATION = 3.0
 """... and below this translation error (eq. 16), metres (the success criterion of eq. 17)."""
 
 MAX_STAMP_GAP = 0.051
-"""Poses farther than this from every true stamp (seconds) are not compared; half a frame at 10 Hz, set by hand."""
+"""Poses farther than this from every true stamp (seconds) are not compared; half a frame at 10 Hz."""
 
 MIN_RIGHT_SHARE = 0.95
-"""A run succeeds if its first pose is right and more than this share of all poses; set by hand."""
+"""A run succeeds if its first pose is right and more than this share of all poses."""
 
 Trajectory = tuple[Floats, Floats]
 """Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
@@ -86,8 +86,8 @@ class Evaluation:
         rotation: errors of the right poses, degrees; None if there are none.
         worst_t_m: largest translation error of all poses, the false ones included, metres.
         worst_r_deg: largest rotation error of all poses, degrees.
-        origin_t_m: translation error at the origin of the odometry, as the paper reports it: the yaw error
-            times the lever arm from there to the robot is part of it. None if it was not asked for.
+        origin_t_m: translation error at the origin of the odometry, which the paper reports: the yaw error
+            times the lever arm from there to the robot is part of it. None without ``T_map_odom``.
     """
 
     frames: int

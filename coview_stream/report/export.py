@@ -17,7 +17,7 @@ from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, pose_to_tum
 
-_LATEST = 4e9  # seconds since 1970 up to which a stamp is taken for a time of day; below a year it is none
+_LATEST = 4e9  # seconds since 1970: stamps outside, or within the first year, are no times of day
 _EARLIEST = 3.2e7
 
 

@@ -28,9 +28,9 @@ TRUTH = "#000000"
 ACCENT = "#009E73"
 
 MAX_BASE_POINTS = 1_000_000
-"""A base map is thinned to this many points, set by hand: more do not show in a picture of 800 cells across."""
+"""A base map is thinned to this many points: more do not show in a picture of 800 cells across."""
 
-_GROUND_WINDOW = 25.0  # metres, set by hand; terrain changes little over it, and few buildings are wider
+_GROUND_WINDOW = 25.0  # metres; terrain changes little over it, and few buildings are wider
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -88,7 +88,7 @@ def draw_base_map(axes: Any, points: Reals) -> Floats:
     if len(points):
         sample = np.asarray(points[:: max(1, -(-len(points) // MAX_BASE_POINTS))], dtype=np.float64) - shift
         grey, extent = _shaded(sample)
-        # one colour where nothing was measured, so that holes look like holes
+        # holes have one colour
         axes.imshow(grey.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(_axis_label("east", shift[0]))
@@ -110,13 +110,13 @@ def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
     heights = np.full(shape, -np.inf)
     heights[i[order], j[order]] = points[order, 2]
     heights = np.where(np.isinf(heights), grey_closing(heights, size=(3, 3)), heights)
-    known = np.isfinite(heights)
+    measured = np.isfinite(heights)
     window = max(3, int(_GROUND_WINDOW / cell))
-    above = np.where(known, heights, 0.0) - minimum_filter(np.where(known, heights, np.inf), size=window)
-    tall = max(float(np.percentile(above[known], 98)), 0.5)
+    above = np.where(measured, heights, 0.0) - minimum_filter(np.where(measured, heights, np.inf), size=window)
+    tall = max(float(np.percentile(above[measured], 98)), 0.5)
     grey = 0.93 - 0.55 * np.clip(above / tall, 0.0, 1.0) ** 0.7
     top = low + shape * cell
-    return np.where(known, grey, np.nan), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
+    return np.where(measured, grey, np.nan), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
 
 
 def map_figure_size(points: Reals) -> tuple[float, float]:
@@ -147,7 +147,7 @@ def _axis_label(name: str, shift: float) -> str:
 
 
 def draw_notice(axes: Any, text: str) -> None:
-    """Write a text across the middle of a picture that would else be empty."""
+    """Write a text across the middle of an empty picture."""
     axes.text(
         0.5,
         0.5,
@@ -171,7 +171,7 @@ def legend_below(drawing: Any, axes: Any, title: str | None = None) -> None:
 
 
 def legend_above(axes: Any) -> None:
-    """Put the legend on the right above the axes, beside the title."""
+    """Put the legend on the right above the axes, next to the title."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
@@ -281,7 +281,7 @@ def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike
 
 
 def _draw_false(axes: Any, distance: Reals, values: Reals, limit: float) -> None:
-    """Mark false poses and the limit they crossed; metres beside millimetres need a log axis."""
+    """Mark false poses and the limit they crossed; metres next to millimetres need a log axis."""
     if not len(values):
         axes.set_ylim(bottom=0.0)
         return
@@ -312,8 +312,8 @@ def plot_descriptor_pair(
         shapes = f"{query.shape} and {winner.shape}"
         raise InputError(f"descriptors: shapes {shapes} differ; give two (rings, sectors)")
     pair = [np.asarray(query, dtype=np.float64), np.roll(np.asarray(winner, dtype=np.float64), shift, axis=1)]
-    known = np.concatenate([values[np.isfinite(values)] for values in pair])
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    finite = np.concatenate([values[np.isfinite(values)] for values in pair])
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     rings, sectors = query.shape
     edges = np.linspace(0, 2 * np.pi, sectors + 1), np.arange(rings + 1)
     options = {"figsize": (10, 5.2), "ncols": 2, "axes": {"subplot_kw": {"projection": "polar"}}}
@@ -340,14 +340,14 @@ def plot_descriptor_pair(
 def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | None = None) -> None:
     """Draw ``trajectory.png`` and, after a fix, ``descriptors.png`` into an existing folder.
 
-    ``truth`` are true positions (T, 3) in the map, metres, drawn beside the estimate.
+    ``truth`` are true positions (T, 3) in the map, metres.
 
     Raises:
         InputError: a picture cannot be written.
     """
     no_position = np.full(3, np.nan)
     positions = np.array([no_position if f.T_map_body is None else f.T_map_body[:3, 3] for f in result.fixes])
-    release_arrays(base_map.arrays)  # of what searching took, before pictures take as much
+    release_arrays(base_map.arrays)  # memory of the search, before pictures take as much
     points = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
     release_arrays(base_map.arrays)
     states = [fix.state.reported for fix in result.fixes]

@@ -1,6 +1,6 @@
 """Airborne scan for the base map: an aircraft that sweeps the scene in strips, in two directions.
 
-All figures are set by hand, after data sheets of airborne scanners.
+The figures follow data sheets of airborne scanners.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Flight:
         swath: half of the opening angle across the flight direction, radians.
         noise: of the range, metres, one sigma.
         porosity: probability that a pulse passes one surface of foliage.
-        margin: metres beyond the map in which pulses aimed at the scene's zero may still meet what is on it.
+        margin: metres beyond the map within which pulses aimed at the scene's zero are cast.
     """
 
     altitude: float = ALTITUDE
@@ -60,8 +60,8 @@ def airborne_scan(
     """Scan the square of ``size`` metres with ``density`` pulses per square metre, strip by strip.
 
     Yields the share of the flight that is done (0 to 1) and the strip's points (N, 3) in the scene frame,
-    float64 metres. Two flight directions cross at 75 to 105 degrees; each brings half of the pulses, so that
-    facades of every heading are grazed.
+    float64 metres. Two flight directions cross at 75 to 105 degrees with half of the pulses each:
+    facades of all headings are grazed.
     """
     first = rng.uniform(0, np.pi)
     headings = (first, first + np.radians(rng.uniform(75, 105)))
@@ -88,7 +88,7 @@ def _strip(
 ) -> Floats:
     half, reach = size / 2, size / np.sqrt(2)
     width = 2 * flight.altitude * np.tan(flight.swath)
-    # the overlap brings some squares twice; thin each strip so that the mean density is what was asked for
+    # strips overlap: thin each one to keep the mean density
     spacing = 1.0 / np.sqrt(density * (1 - _OVERLAP) if len(_lines(size, flight)) > 1 else density)
     sweeps, beams = int(2 * reach / spacing), int(width / spacing)
     turn = np.array([[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
@@ -128,11 +128,11 @@ _CROSSING = np.radians((75.0, 105.0))  # between the two flight directions
 _RETURNS, _DEAD = 4, 1.0  # of a pulse, and metres between two of them
 _RETURN_DEPTH = 0.3  # metres in depth that are one return
 _GRID, _NEIGHBOURS = 0.3, 16  # metres; places of that grid that say how the surface at a point lies
-_SCATTERED = 0.06  # least share of the spread across the surface where it is foliage, set by hand
+_SCATTERED = 0.06  # least share of the spread across the surface where it is foliage
 _UPRIGHT = 0.35  # greatest |z| of the normal of a wall: from 70 degrees on
 _TOP = 0.5  # metres: a wall's top edge
-_COLUMN = 1.0  # metres: within this, what is above a wall point is its own wall
-_OPAQUE = 3.0  # typical distances between neighbours: a surface hides what is behind so wide a cell
+_COLUMN = 1.0  # metres: points above a wall point within this belong to its wall
+_OPAQUE = 3.0  # width of a cell that a surface fills, in typical distances between neighbours
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,9 @@ class Surface:
 
 
 def airborne_survey(points: Reals, survey: Survey = _DEFAULT) -> Floats:
-    """Return what an aircraft's lidar would have met of a ground survey (N, 3): (M, 3) float64 metres, same frame.
+    """Return the points (M, 3) of a ground survey (N, 3) that an aircraft's lidar would meet, float64 metres.
 
-    Coordinates near zero, z up. Raises InputError for fewer points than say how a surface lies.
+    Coordinates near zero, z up. Raises InputError for too few points to fit surfaces.
     """
     places: Floats = points.astype(np.float64)
     rng, surface = np.random.default_rng(survey.seed), surface_of(places)
@@ -222,8 +222,8 @@ def surface_of(points: Floats) -> Surface:
         foliage[part] = spread[:, 0] > _SCATTERED * np.maximum(spread.sum(axis=1), 1e-12)
         upright[part] = np.abs(axes[:, 2, 0]) < _UPRIGHT
     at = tree.query(points)[1]
-    some = points[:: max(1, len(points) // 20_000)]
-    spacing = float(np.median(cKDTree(points).query(some, k=2)[0][:, 1]))
+    sample = points[:: max(1, len(points) // 20_000)]
+    spacing = float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
     return Surface(foliage[at], _below_edge(points, (upright & ~foliage)[at]), spacing)
 
 
@@ -260,17 +260,17 @@ def _met(flown: Floats, surface: Surface, density: float, survey: Survey, rng: n
     solid, first = ~surface.foliage[within], np.full(count, np.inf)
     np.minimum.at(first, cell[solid], depth[solid])
     # a slope of 45 degrees is not hidden by its own upper end
-    seen = np.flatnonzero(~surface.wall[within] & (depth <= first[cell] + opaque + _RETURN_DEPTH))
-    pulse, _ = _cells(place[seen], side)
-    answering = _answers(pulse, depth[seen], surface.foliage[within[seen]], survey.porosity, rng)
-    return np.asarray(within[seen[answering]])
+    visible = np.flatnonzero(~surface.wall[within] & (depth <= first[cell] + opaque + _RETURN_DEPTH))
+    pulse, _ = _cells(place[visible], side)
+    answering = _answers(pulse, depth[visible], surface.foliage[within[visible]], survey.porosity, rng)
+    return np.asarray(within[visible[answering]])
 
 
 def _answers(pulse: Indices, depth: Floats, foliage: Bools, porosity: float, rng: np.random.Generator) -> Indices:
     """Return which of a strip's visible points (N,) answer their pulse (N,): one of each layer that it reaches."""
     reach = np.full(int(pulse.max(initial=0)) + 1, -np.inf)
     alive = np.ones(len(reach), bool)
-    found: list[Indices] = []
+    returns: list[Indices] = []
     for _ in range(_RETURNS):
         left = alive[pulse] & (depth > reach[pulse] + _DEAD)
         nearest = np.full(len(reach), np.inf)
@@ -278,11 +278,11 @@ def _answers(pulse: Indices, depth: Floats, foliage: Bools, porosity: float, rng
         layer = rng.permutation(np.flatnonzero(left & (depth <= nearest[pulse] + _RETURN_DEPTH)))
         answering, which = np.unique(pulse[layer], return_index=True)
         answers = layer[which]
-        found.append(answers)
+        returns.append(answers)
         alive[:] = False
         alive[answering] = foliage[answers] & (rng.random(len(answers)) < porosity)
         reach[answering] = depth[answers]
-    return np.concatenate(found)
+    return np.concatenate(returns)
 
 
 def _cells(places: Floats, side: float) -> tuple[Indices, int]:

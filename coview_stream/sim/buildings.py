@@ -1,6 +1,6 @@
 """Buildings: each function draws one at the origin, frontage along x and the street towards -y.
 
-Walls reach ``_FOOTING`` below z = 0: a building may stand on a slope. Lengths in metres, all set by hand.
+Walls reach ``_FOOTING`` below z = 0: a building may stand on a slope. Lengths in metres.
 """
 
 from __future__ import annotations

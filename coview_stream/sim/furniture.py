@@ -1,4 +1,4 @@
-"""Street furniture: parked vehicles, lamp posts, signs and masts. Sizes in metres, all set by hand."""
+"""Street furniture: parked vehicles, lamp posts, signs and masts. Sizes in metres."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ _MIN_CLEARANCE = 2.2  # metres from the robot's route to the middle of a vehicle
 
 
 def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: float) -> Floats:
-    """Return (N, 4) x, y, yaw and kind of places ``offset`` metres beside the streets' centre lines, in random order.
+    """Return places (N, 4) x, y, yaw, kind at ``offset`` metres from the streets' centre lines, in random order.
 
     Places on a crossing are left out. ``kind`` is a random number in [0, 1).
     """
-    every = np.concatenate(layout.streets)
-    tree = cKDTree(every)
+    tree = cKDTree(np.concatenate(layout.streets))
     rows = []
     for line in layout.streets:
         heading = directions(line)
@@ -31,13 +30,13 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
             xy = line[k] + side * offset * normal
             yaw = heading[k] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.03, len(k))
             rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
-    found = np.concatenate(rows)
-    clear = tree.query(found[:, :2])[0] > 0.8 * offset
-    return np.asarray(rng.permutation(found[clear & _leaves_lane_free(found, layout.route)]))
+    places = np.concatenate(rows)
+    clear = tree.query(places[:, :2])[0] > 0.8 * offset
+    return np.asarray(rng.permutation(places[clear & _leaves_lane_free(places, layout.route)]))
 
 
 def _leaves_lane_free(rows: Floats, route: Floats) -> Bools:
-    """Return (N,) whether a vehicle parked there leaves the robot's lane free, both its ends included."""
+    """Tell (N,) where a parked vehicle, both its ends included, leaves the robot's lane free."""
     tree = cKDTree(route)
     reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
     along = reach * np.column_stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])])

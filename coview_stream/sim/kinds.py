@@ -1,6 +1,6 @@
 """Kinds of scene: the streets, buildings and vegetation of towns, campuses, villages, industry and forests.
 
-All numbers are set by hand.
+All numbers are plausible values, not measured ones.
 """
 
 from __future__ import annotations

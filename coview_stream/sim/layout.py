@@ -1,4 +1,4 @@
-"""Layout of a scene: streets, the closed loop that the robot drives, the ground, and which of it is taken."""
+"""Layout of a scene: streets, the closed loop that the robot drives, the ground, and its occupied cells."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coview_stream.sim.mesh import Mesh, height_field
 
 _LOOP_STEP = 0.25  # metres between points of the route
 _STREET_STEP = 1.0  # metres between points of a street
-_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb; set by hand
+_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ def _street_lines(rng: np.random.Generator, half: float, spacing: tuple[float, f
 def _loop_lines(lines: Floats, size: float) -> tuple[Floats, float, float]:
     """Pick the two street lines that bound the loop; return all lines and those two.
 
-    They are the ones next to a quarter of the map's size on either side of its middle, moved where that would
-    lead out of the map; streets that then run too close beside them are left out.
+    The two lie nearest to a quarter of the map's size on either side of its middle, moved where they would leave the
+    map; streets that then run too close to them are dropped.
     """
     near, far = 0.14 * size, 0.28 * size
     low = np.clip(lines[np.argmin(np.abs(lines + 0.24 * size))], -far, -near)
@@ -142,9 +142,9 @@ def _inside(points: Floats, half: float) -> Floats:
 
 
 class Site:
-    """Ground of a scene, a square of +-``half`` metres about the origin, and which of it is taken.
+    """Ground of a scene, a square of +-``half`` metres about the origin, with its occupied cells.
 
-    ``relief`` is the amplitude of the hills, ``roughness`` that of the ground off the road, ``ditch`` the
+    ``relief`` is the amplitude of the hills, ``roughness`` of the ground off the road, ``ditch`` the
     depth of the ditches along it; metres.
     """
 
@@ -165,10 +165,10 @@ class Site:
             heading, phase = rng.uniform(0, 2 * np.pi, 2)
             along = X * np.cos(heading) + Y * np.sin(heading)
             z += share * relief * np.sin(2 * np.pi * along / wavelength + phase)
-        beside = self.road_distance(X.ravel(), Y.ravel()).reshape(X.shape) - self.layout.half_width
+        off_road = self.road_distance(X.ravel(), Y.ravel()).reshape(X.shape) - self.layout.half_width
         bumps = gaussian_filter(rng.normal(size=X.shape), 2.0)
-        z += roughness * bumps / bumps.std() * np.clip(beside / 3.0, 0.0, 1.0)
-        return np.asarray(z - ditch * np.exp(-(((beside - 1.5) / 0.9) ** 2)))
+        z += roughness * bumps / bumps.std() * np.clip(off_road / 3.0, 0.0, 1.0)
+        return np.asarray(z - ditch * np.exp(-(((off_road - 1.5) / 0.9) ** 2)))
 
     def z(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
         """Return the height of the ground at (N,) coordinates, metres."""
@@ -181,7 +181,7 @@ class Site:
         return float(self.z(x, y)[0])
 
     def mesh(self, cover: Callable[[Floats, Floats], Floats] | None = None) -> Mesh:
-        """Return the ground's mesh, raised by what lies on it: ``cover`` (x, y) -> depth, (N,) metres."""
+        """Return the ground's mesh, raised by a ``cover``: (x, y) -> depth (N,), metres."""
         if cover is None:
             return height_field(self._axis, self._heights)
         X, Y = np.meshgrid(self._axis, self._axis, indexing="ij")
@@ -193,7 +193,7 @@ class Site:
         return self._road[i, j].astype(np.float64)
 
     def claim(self, x: float, y: float, w: float, d: float, yaw: float = 0.0, margin: float = 0.0) -> bool:
-        """Take a w x d rectangle if it and ``margin`` metres about it are free of roads and other claims."""
+        """Occupy a w x d rectangle if it and ``margin`` metres about it are free of roads and other claims."""
         wide = self._footprint(x, y, w + 2 * margin, d + 2 * margin, yaw)
         if np.abs(wide).max() >= self.half or self._taken[self._cells(*wide.T)].any():
             return False
@@ -213,7 +213,7 @@ class Site:
 
 
 def _rasters(layout: Layout, half: float) -> tuple[Bools, Floats32]:
-    """Return taken cells (the streets, to begin with) and each cell's distance to a street's centre, metres."""
+    """Return the occupied cells (at first the streets) and each cell's distance to a street's centre, metres."""
     n = int(2 * half / _CELL) + 1
     centre = np.ones((n, n), dtype=bool)
     for line in (layout.route, *layout.streets):

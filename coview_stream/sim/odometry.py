@@ -1,7 +1,7 @@
 """Motion of a simulated robot: true poses along the route, and odometry that drifts from them.
 
 The robot keeps a steady speed and sways on uneven ground. Its odometry has an origin and heading of its own and is
-gravity aligned. All figures are set by hand.
+gravity aligned.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from coview_stream.sim.sensors import FRAME_PERIOD
 
 _SWAY = float(np.radians(0.6))  # radians; roll and pitch jitter, one sigma
 _SWAY_MEMORY = 0.8  # share of the frame before; a body on wheels swings at about 1 Hz
-_WANDER = 0.25  # metres; the robot does not keep to the middle of its lane
+_WANDER = 0.25  # metres, about the middle of the lane
 _WHEELBASE = 1.0  # metres over which the ground tilts the robot
 
 
@@ -55,7 +55,7 @@ class OdometryConfig:
 def drive(scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator) -> Floats:
     """Return poses (N, 4, 4) of the sensor in the scene, one every 0.1 s over ``length`` metres.
 
-    The start is anywhere on the route, the direction either; a long drive goes round again. The sensor is ``height``
+    Start and direction on the route are drawn; a long drive goes round again. The sensor is ``height``
     metres above the ground, and pitches and rolls with it.
     """
     route = scene.route if rng.random() < 0.5 else scene.route[::-1]
@@ -92,9 +92,9 @@ def _sway(rng: np.random.Generator, count: int) -> Floats:
 
 
 def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random.Generator) -> Floats:
-    """Return odometry (N, 4, 4) ``T_odom_body`` of a robot with true poses (N, 4, 4) ``T_map_body``.
+    """Return odometry ``T_odom_body`` (N, 4, 4) of a robot with true poses ``T_map_body`` (N, 4, 4).
 
-    The frames differ by a turn about z and an offset: roll and pitch stay those of gravity.
+    The frames differ by a turn about z and an offset; both are aligned to gravity.
     """
     count = len(T_map_body)
     steps = np.diff(T_map_body[:, :3, 3], axis=0)

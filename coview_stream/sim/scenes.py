@@ -1,6 +1,6 @@
 """Seeded scenes in two states: when the map was made, and now.
 
-Frame: the scene's own, z up, metres, origin in the middle. Trees, cars and poles may change between the two;
+Scene frame: z up, metres, origin in the middle. Trees, cars and poles may change between the two;
 ground, buildings and hedges stay.
 """
 
@@ -18,8 +18,8 @@ from coview_stream.sim.kinds import KINDS, Kind, Plot
 from coview_stream.sim.layout import Site, directions, resample
 from coview_stream.sim.mesh import Mesh, join, placed
 
-# metres, set by hand
-_MARGIN = 50.0  # of the scene beyond the map: a robot near its edge sees what stands there
+# metres
+_MARGIN = 50.0  # of the scene beyond the map: a robot near the edge sees it
 _FOOTWAY = 1.8  # width
 _PARKING = 6.4  # length of a parking place
 
@@ -65,7 +65,7 @@ class SceneState:
 
 @dataclass(frozen=True)
 class Parts:
-    """What a scene consists of at one time.
+    """Parts of a scene at one time.
 
     Attributes:
         ground: the bare ground.
@@ -86,7 +86,7 @@ class Parts:
     poles: Floats
 
     def state(self, site: Site) -> SceneState:
-        """Join all that is solid, and all that is leafy."""
+        """Join the solid parts, and the leafy ones."""
         below = site.z(self.trees[:, 0], self.trees[:, 1])
         street = [furniture.cars(self.cars, site), furniture.poles(self.poles, site)]
         solid = join([self.ground, *self.built, *self.fixed, *street, vegetation.trunks(self.trees, below)])
@@ -105,7 +105,7 @@ class Scene:
         site: ground and roads.
         route: (N, 2) closed loop that robots drive on, metres.
         footprints: of the buildings.
-        parts: what it was drawn from, when the map was made and now; None where it was not drawn here.
+        parts: its parts when the map was made and now; None for a scene not drawn by :func:`build_scene`.
         houses: for each footprint the index of its building among ``Parts.built``.
     """
 

@@ -20,11 +20,11 @@ from coview_stream.sim.mesh import Mesh
 from coview_stream.sim.scenes import SceneState
 
 BLOCK = 200_000
-"""Rays cast at a time, set by hand: bounds the memory to about 30 MB."""
+"""Rays cast at a time: bounds the memory to about 30 MB."""
 
 _THREADS = 2
-_MAX_LAYERS = 6  # surfaces of foliage that a ray may pass; set by hand
-_LEAF_DEPTH = 0.12  # metres, set by hand; mean depth below the hull of a crown at which a leaf is hit
+_MAX_LAYERS = 6  # surfaces of foliage that a ray may pass
+_LEAF_DEPTH = 0.12  # metres; mean depth below the hull of a crown at which a leaf is hit
 _STEP = 2e-3  # metres beyond a leaf at which the ray goes on
 
 
@@ -41,7 +41,7 @@ class Hits(NamedTuple):
 
 
 class Struck(NamedTuple):
-    """First hits of (N,) rays, and what was hit.
+    """First hits of (N,) rays, with the mesh and its normal.
 
     Attributes:
         distance: (N,) metres; inf without a hit.
@@ -59,9 +59,9 @@ class Struck(NamedTuple):
 class MeshCaster:
     """Ray caster for meshes, on ``threads`` cores.
 
-    ``foliage`` names those that let some rays pass, by their index, each with the probability that a ray passes one
-    of its surfaces; None for the probability that :meth:`trace` is given. Leaves are hit ``leaf_depth`` metres on
-    average below the surface of their foliage.
+    ``foliage`` maps the index of a mesh that lets rays pass to the probability that a ray passes one of its surfaces;
+    None for the ``porosity`` of :meth:`trace`. Leaves are hit ``leaf_depth`` metres on average below the surface of
+    their foliage.
 
     Raises:
         DependencyError: Open3D cannot be loaded.
@@ -102,8 +102,8 @@ class MeshCaster:
         distance, incidence = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
         struck, normals = np.full(count, -1, np.intp), np.zeros((count, 3), np.float32)
         passing = np.full(max(self._foliage, default=-1) + 2, np.nan)  # by mesh; the last place is the sky's
-        for index, own in self._foliage.items():
-            passing[index] = porosity if own is None else own
+        for index, share in self._foliage.items():
+            passing[index] = porosity if share is None else share
         alive: Indices = np.arange(count, dtype=np.intp)
         start = np.zeros(count, np.float32)
         for layer in range(_MAX_LAYERS):
@@ -193,20 +193,20 @@ class Sensor:
         porosity: float = POROSITY,
         noise: float = RANGE_NOISE,
     ) -> Points:
-        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is that of the range."""
+        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is the range's."""
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)
         hits = caster.cast(origins, turned, rng, porosity)
         t = hits.distance.astype(np.float64)
         noisy = t + rng.normal(0, noise, len(t))
-        seen = self.detects(t, hits.incidence, rng.random(len(t)))
-        return (rays[seen] * noisy[seen, None]).astype(np.float32)
+        detected = self.detects(t, hits.incidence, rng.random(len(t)))
+        return (rays[detected] * noisy[detected, None]).astype(np.float32)
 
     def detects(self, distance: Floats, strength: Reals, luck: Floats) -> Bools:
         """Tell which of (N,) pulses return, from (N,) distances in metres.
 
-        ``strength`` is the cosine of the incidence, less what was lost on the way; ``luck`` is uniform in [0, 1).
+        ``strength`` is the cosine of the incidence, less losses on the way; ``luck`` is uniform in [0, 1).
         """
         with np.errstate(invalid="ignore"):
             # a Lambertian surface returns cos / r^2; below the threshold a pulse is lost more and more often

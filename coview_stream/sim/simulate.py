@@ -65,8 +65,8 @@ class SimulationConfig:
         speed: of the robot, metres per second.
         height: of the sensor above the ground, metres.
         odometry: errors of the odometry.
-        dirt: what is imperfect beyond that; nothing by default.
-        drive_seed: of the drive, its scans and its odometry; others give other runs through the same world.
+        dirt: further imperfections; none by default.
+        drive_seed: of the drive, its scans and its odometry: another run through the same world.
 
     Raises:
         ConfigError: unknown scene or sensor, or a value out of its range.
@@ -87,10 +87,10 @@ class SimulationConfig:
     drive_seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in (("scene", KINDS), ("sensor", SENSORS)):
+        for name, choices in (("scene", KINDS), ("sensor", SENSORS)):
             value = getattr(self, name)
-            if value not in known:
-                raise ConfigError(f"{name}: {value!r} is unknown; use one of {', '.join(known)}")
+            if value not in choices:
+                raise ConfigError(f"{name}: {value!r} is unknown; use one of {', '.join(choices)}")
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
@@ -99,7 +99,7 @@ class SimulationConfig:
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, for JSON; ``dirt`` and ``drive_seed`` only if there is some."""
+        """Return all fields as plain values, for JSON; ``dirt`` and ``drive_seed`` only where they are set."""
         values = asdict(self) | {"dirt": self.dirt.to_dict()}
         if not self.dirt.kinds:
             del values["dirt"]
@@ -109,7 +109,7 @@ class SimulationConfig:
 
 
 _FIRST_STAMP = 1000.0  # seconds
-_AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams, apart from those of the scene
+_AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams; the scene uses lower numbers
 
 
 @dataclass(frozen=True)
@@ -136,10 +136,10 @@ def simulate(
     progress: bool = False,
     overwrite: bool = False,
 ) -> Simulated:
-    """Write a simulated world to the directory ``out``; it is complete or not there.
+    """Write a simulated world to the directory ``out``, completely or not at all.
 
-    ``progress`` draws a bar on stderr. ``overwrite`` replaces a world that was simulated there before; other files
-    are refused all the same.
+    ``progress`` draws a bar on stderr. ``overwrite`` replaces an earlier simulated world; a directory with other files
+    is refused.
 
     Raises:
         InputError: ``out`` exists and is not empty, or cannot be written.
@@ -169,7 +169,7 @@ def simulate(
 
 
 def scene_of(config: SimulationConfig) -> Scene:
-    """Draw the scene, with what changed in it since the survey."""
+    """Draw the scene, with the changes since the survey."""
     scene = build_scene(config.scene, config.seed, config.size, config.changed)
     years = config.dirt.years
     return scene if years is None else aged(scene, years, _dirt_stream(config, Stream.YEARS))[0]
@@ -220,8 +220,8 @@ def frames(
 ) -> Iterator[Points]:
     """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame.
 
-    ``odometry`` (N, 4, 4) deskews raw sweeps, where there are some, in the place of the truth; ``recording`` takes
-    them as they are.
+    ``odometry`` (N, 4, 4) deskews raw sweeps; without it the truth does. ``recording`` takes the raw sweeps of a world
+    with motion.
     """
     sensor = SENSORS[config.sensor]()
     if config.dirt.on_sensor:
@@ -246,7 +246,7 @@ def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
 
 @contextmanager
 def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Give a directory beside ``out`` that becomes ``out`` without an error, and is removed with one."""
+    """Yield a directory next to ``out``: renamed to ``out`` on success, removed on an error."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a new directory")
     ours = (out / "world.json").is_file()

@@ -1,4 +1,4 @@
-"""Vegetation, boulders and fallen trunks: trunks are solid, foliage lets some rays pass. Sizes are set by hand."""
+"""Vegetation, boulders and fallen trunks: trunks are solid, foliage lets some rays pass."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _broadleaf(trees: Floats, ground: Floats) -> Mesh:
     if not len(trees):
         return EMPTY
     parts = []
-    for lump, share in enumerate((1.0, 0.62, 0.55)):  # a main crown and two boughs beside it
+    for lump, share in enumerate((1.0, 0.62, 0.55)):  # a main crown and two boughs
         seed = trees[:, 7] + 17 * lump
         reach = 0.0 if lump == 0 else 0.65
         angle = 2 * np.pi * _noise(seed, 1)
@@ -152,6 +152,6 @@ def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Me
 
 
 def _noise(seed: Floats, k: int | Ints) -> Floats:
-    """Return repeatable numbers in [0, 1) from each tree's own seed: a tree keeps its shape."""
+    """Return repeatable numbers in [0, 1) from the trees' seeds, so a tree keeps its shape."""
     value = np.sin(seed * 12.9898 + np.asarray(k) * 78.233) * 43758.5453
     return np.asarray(value - np.floor(value))

@@ -13,7 +13,7 @@ from coview_stream.training.worlds import QUERY_CELLS, WorldViews
 
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
-# set by hand, as the ranges drawn from below
+# chosen by hand, like the ranges below
 _CHANCE = 0.5  # of each change
 _MAX_FALLEN = 0.004  # disks per square metre: 40 a hectare
 _RADII = (1.0, 2.5)  # metres
@@ -106,7 +106,7 @@ class Batch:
 def draw_batch(
     worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, augment: bool = True
 ) -> Batch:
-    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one; ``augment`` changes the images."""
+    """Draw ``pieces`` maps of as many worlds, with ``each`` queries per map; ``augment`` changes the images."""
     images, queries, owners, poses = [], [], [], []
     for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
         world = worlds[int(k)]
@@ -118,10 +118,10 @@ def draw_batch(
         for index in chosen:
             x, y, yaw = world.poses[index]
             at = _rotated(np.array([x, y]) - centre, -turn)
-            seen = world.queries[index]
+            view = world.queries[index]
             if rng.random() < _FROM_MAP:
-                seen = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
-            image, quarter = _query(seen, mirrored, rng)
+                view = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
+            image, quarter = _query(view, mirrored, rng)
             heading = yaw - turn
             if mirrored:
                 at, heading = at * (1.0, -1.0), -heading
@@ -164,7 +164,7 @@ def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size:
 
 
 def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Image, float]:
-    """Mirror a query, rotate it by quarters and hide some of it; also return what its heading gains, radians."""
+    """Mirror a query, rotate it by quarters and hide parts; return it and the change of its heading, radians."""
     if mirrored:
         image = image[:, ::-1]
     quarters = int(rng.integers(4))

@@ -61,10 +61,10 @@ def _clear(points: Floats, obstacles: Floats) -> Bools:
     flat = points.reshape(-1, 2)
     clear = np.ones(len(flat), dtype=bool)
     thin = obstacles[:, 2] <= 0.5
-    for some in (obstacles[thin], obstacles[~thin]):
-        if len(some):
-            far, nearest = cKDTree(some[:, :2]).query(flat, distance_upper_bound=8.0)
-            radius = np.append(some[:, 2], 0.0)[nearest]
+    for trunks in (obstacles[thin], obstacles[~thin]):
+        if len(trunks):
+            far, nearest = cKDTree(trunks[:, :2]).query(flat, distance_upper_bound=8.0)
+            radius = np.append(trunks[:, 2], 0.0)[nearest]
             clear &= far > radius + CLEARANCE
     return clear.reshape(points.shape[:-1])
 

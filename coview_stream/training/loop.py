@@ -1,4 +1,4 @@
-"""Training loop: batches through both encoders, with checkpoints; independent of what the worlds contain."""
+"""Training loop: batches through both encoders, with checkpoints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Report = Callable[[int, Losses], None]
 def train(
     worlds: Sequence[WorldViews], config: TrainingConfig, report: Report | None = None, checkpoint: Path | None = None
 ) -> PlaceNet:
-    """Train from scratch, or go on from the file ``checkpoint`` if it exists; it is written every 100 steps.
+    """Train from scratch, or resume from the file ``checkpoint``, which is written every 100 steps.
 
     Raises:
         InputError: the loss is not finite, or the checkpoint cannot be read or is of another configuration.
@@ -47,15 +47,15 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = config.rate * _schedule(step, config.steps)
         torch.manual_seed(config.seed + step)  # a resumed training goes on as if it had not stopped
-        found = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
-        if not torch.isfinite(found.total):
+        loss = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
+        if not torch.isfinite(loss.total):
             raise InputError(f"step {step}: the loss is not finite; train with a lower rate")
         optimiser.zero_grad()
-        found.total.backward()
+        loss.total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), _MAX_GRADIENT)
         optimiser.step()
         if report is not None:
-            report(step, found)
+            report(step, loss)
         if checkpoint is not None and (step + 1) % _CHECKPOINT_STEPS == 0:
             _keep(checkpoint, net, optimiser, step + 1, config)
     net.eval()
@@ -104,9 +104,9 @@ def _restore(path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer,
         state = torch.load(path, weights_only=True)
         same = state["config"] == asdict(config)
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: not the state of a training ({error}); delete it to start anew") from error
+        raise InputError(f"{path}: not the state of a training ({error}); delete it to start again") from error
     if not same:
-        raise InputError(f"{path}: a training of other numbers; delete it to start anew, or choose another folder")
+        raise InputError(f"{path}: a training of other numbers; delete it to start again, or choose another folder")
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])

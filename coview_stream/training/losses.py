@@ -18,10 +18,10 @@ _LOCAL_TEMPERATURE = 0.07  # of the softmax over local descriptors
 _PLACE_TEMPERATURE = 0.08  # of the softmax over global ones
 _SAMPLES = 128  # corresponding points of a query and its map
 _IGNORED_RADIUS = 2.5  # metres: other points within are neither right nor wrong
-_SAME_PLACE = 12.0  # metres: likewise for global descriptors
+_SAME_PLACE = 12.0  # metres: the same for global descriptors
 _MIN_SIGMA = 0.05  # uncertainties below are taken for it
-_LOCAL_WEIGHT, _PLACE_WEIGHT = 0.5, 0.5  # beside the dense loss
-_EXCLUDED = -1e4  # logit of what does not compete
+_LOCAL_WEIGHT, _PLACE_WEIGHT = 0.5, 0.5  # relative to the dense loss
+_EXCLUDED = -1e4  # logit of a point that does not compete
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ def dense_loss(
     cell = LOCAL_CELL * _COARSE
     at = poses[:, :2] / cell + (size / 2 - half)
     target = _soft_target(at, piece_of, tried, len(maps), last).to(logits)
-    found = logits.detach().argmax(1)
-    right = target.reshape(count, -1).gather(1, found[:, None])[:, 0] > 0.05
+    best = logits.detach().argmax(1)
+    right = target.reshape(count, -1).gather(1, best[:, None])[:, 0] > 0.05
     loss = -(target.reshape(count, -1) * functional.log_softmax(logits, 1)).sum(1).mean()
     return loss, float(right.float().mean())
 
@@ -106,8 +106,8 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
 def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
     """Make corresponding cells similar and others not, and sigma the error of that.
 
-    A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant, so that a
-    high uncertainty is never cheaper than a good descriptor. Only points that both have seen count.
+    A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant: a high
+    uncertainty is never cheaper than a good descriptor. Only points seen in both images count.
     """
     count = len(poses)
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
@@ -132,11 +132,11 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
     """Make a query's global descriptor most similar to that of the map around its place."""
-    own = _middle(query[2])
+    ours = _middle(query[2])
     maps = piece[2]
     size = maps.shape[-1]
     flat = maps.flatten(2).transpose(1, 2).reshape(-1, maps.shape[1])
-    logits = own @ flat.T / _PLACE_TEMPERATURE
+    logits = ours @ flat.T / _PLACE_TEMPERATURE
     axis = (torch.arange(size) + 0.5 - size / 2) * PLACE_CELL
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     cells = torch.stack([x.flatten(), y.flatten()], -1)
@@ -145,7 +145,7 @@ def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) 
     distance = apart.repeat(1, len(maps)).masked_fill(~same, torch.inf)
     wanted = distance.argmin(1)
     near = distance < _SAME_PLACE
-    near[torch.arange(len(own)), wanted] = False
+    near[torch.arange(len(ours)), wanted] = False
     return functional.cross_entropy(logits.masked_fill(near, _EXCLUDED), wanted)
 
 

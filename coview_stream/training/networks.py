@@ -128,7 +128,7 @@ class PlaceNet(nn.Module):
 
 
 class OneView(nn.Module):
-    """The network for one view, as it is exported."""
+    """The network for one view, in the form that is exported."""
 
     def __init__(self, net: PlaceNet, view: int) -> None:
         super().__init__()
@@ -190,15 +190,15 @@ _LAYERS = ("Conv", "Add", "Relu")  # the rest takes no time
 
 
 def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
-    """Quantise the ground network in a directory of weights; the file is written beside it, and named by the card.
+    """Quantise the ground network in a directory of weights; write the result there and name it in the card.
 
     Activations have eight bits in the range that the images cause, weights seven, one scale for each channel: sums
     of eight would overflow on CPUs without VNNI. The aerial network is not quantised: maps are built once.
 
     Args:
         directory: with the weights and their card.
-        images: (LAYERS, H, W) of scans as they will be seen, a hundred or so.
-        note: what they are, for the card.
+        images: (LAYERS, H, W) of typical scans, a hundred or so.
+        note: their description, for the card.
 
     Raises:
         InputError: there are no weights. DependencyError: ONNX is not installed.
@@ -236,7 +236,7 @@ def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
 
 
 def _delicate(graph: Any) -> list[str]:
-    """Name the nodes behind a power or a softplus, and what a softplus is of: numbers of too many magnitudes."""
+    """Name the nodes behind a power or softplus and the inputs of a softplus: numbers of too many magnitudes."""
     names: list[str] = []
     tensors: set[str] = set()
     steep = {name for node in graph.node if node.op_type == "Softplus" for name in node.input}

@@ -56,9 +56,9 @@ _BOUNDS: dict[str, Range] = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """Ranges (minimum, maximum) of what each world, tree or submap draws; single numbers are shares or counts.
+    """Ranges (minimum, maximum) that worlds, trees and submaps are drawn from; single numbers are shares or counts.
 
-    Set by hand.
+    The defaults span forests and towns as they are known, without a calibration.
 
     Attributes:
         built: share of worlds with buildings; the others are forests.
@@ -148,10 +148,10 @@ class Recipe:
     def __post_init__(self) -> None:
         for name, bounds in _BOUNDS.items():
             _require_within(name, getattr(self, name), bounds)
-        for name, known in (("kinds", tuple(KINDS)), ("sensors", TRAINED_SENSORS)):
+        for name, choices in (("kinds", tuple(KINDS)), ("sensors", TRAINED_SENSORS)):
             values = getattr(self, name)
-            if not values or not set(values) <= set(known):
-                raise ConfigError(f"{name}: {values!r}; use one or more of {', '.join(known)}")
+            if not values or not set(values) <= set(choices):
+                raise ConfigError(f"{name}: {values!r}; use one or more of {', '.join(choices)}")
         if not set(self.dirt) <= set(TRAINED_DIRT):
             raise ConfigError(f"dirt: {self.dirt!r}; use none or some of {', '.join(TRAINED_DIRT)}")
 
@@ -176,12 +176,12 @@ def _require_within(name: str, value: Any, bounds: Range) -> None:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of the training loop; set by hand.
+    """Settings of the training loop.
 
     Attributes:
         steps: number of batches.
         pieces: maps (136 m) in a batch.
-        each: queries in every one.
+        each: queries per map.
         rate: of AdamW at first; it falls along a cosine.
         decay: AdamW's weight decay.
         width: the encoder's channels at 1 m.

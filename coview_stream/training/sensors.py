@@ -1,4 +1,10 @@
-"""Sensors of training drives: the simulator's, and FGLoc6D's VLP-16, inclined by 45 degrees and rotating as a whole."""
+"""Sensors of training drives, and their dirt.
+
+The sensors are the simulator's, and FGLoc6D's VLP-16, inclined by 45 degrees and rotating as a whole. The dirt is the
+part of :mod:`coview_stream.sim.dirt` that matters in a forest: a leaning sensor, beams of finite width, noise that
+grows with the range, tall grass, each up to twice its default strength. Seasons are the recipe's ``leaf_off``. Dirt has
+random numbers of its own: a drive without it stays the same.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +22,10 @@ from coview_stream.sim.dirt.scene import Grass
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, Sensor
 
 INCLINATION = float(np.radians(45.0))
-"""Of the sensor's own axis, radians; set by hand."""
+"""Of the sensor's axis, radians."""
 
 TURNS = 0.5
-"""Turns of the whole sensor about the vertical, per second; set by hand."""
+"""Turns of the whole sensor about the vertical, per second."""
 
 _COLUMNS = 1800
 _ROTATING = "vlp16-inclined"
@@ -33,15 +39,15 @@ _GROUP = {"vlp16": 16, "os64": 64, "os64-2048": 64, _ROTATING: 16}  # beams fire
 def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
     """Make a sensor by its name; ``stride`` maps its number of beams to n: only every n-th column is cast."""
     sensor = _inclined() if name == _ROTATING else SENSORS[name]()
-    every = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
-    if every == 1:
+    nth = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
+    if nth == 1:
         return sensor
     group, beams = _GROUP.get(name, 1), sensor.beams
 
     def thinned(frame: int) -> Floats:
         rays = beams(frame)
-        # another column in each frame, so that together they cover all
-        return np.asarray(rays[(np.arange(len(rays)) // group + frame) % every == 0])
+        # other columns in each frame: together they cover all
+        return np.asarray(rays[(np.arange(len(rays)) // group + frame) % nth == 0])
 
     return Sensor(name, thinned, sensor.min_range, sensor.max_range)
 
@@ -65,16 +71,16 @@ def _inclined() -> Sensor:
 TRAINED_DIRT = ("mounting", "beams", "grass")
 """Kinds of dirt that training drives can have."""
 
-_STRONGEST = 2.0  # times the default of the simulator; set by hand
-_ON_GROUND = 0.15  # metres: what lies no higher above the ground is hidden by grass; set by hand
-_STEEPEST = 0.05  # cosine of the incidence: flatter beams pass no longer way through grass; set by hand
+_STRONGEST = 2.0  # times the default of the simulator
+_ON_GROUND = 0.15  # metres above the ground up to which grass hides points
+_STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat beams through grass
 
 
 class DriveDirt(NamedTuple):
     """Dirt of one drive; None for kinds that are off.
 
     Attributes:
-        T_body_sensor: (4, 4) where the sensor is; its points are taken for the body's.
+        T_body_sensor: (4, 4) of the sensor, whose points are sent as the body's.
         beams: width and noise of its beams.
         grass: off the roads, here everywhere.
         rng: random numbers of all of it.
@@ -99,7 +105,7 @@ class DriveDirt(NamedTuple):
         self, lidar: Sensor, caster: Caster, ground: Callable[[Floats, Floats], Floats], T_scene_body: Pose,
         frame: int, porosity: float, noise: float,
     ) -> Points:  # fmt: skip
-        """Return one frame (N, 3) in what the robot takes for its body frame, metres; see :meth:`Sensor.scan`."""
+        """Return one frame (N, 3) in the robot's assumed body frame, metres; see :meth:`Sensor.scan`."""
         T, rays = T_scene_body @ self.T_body_sensor, lidar.beams(frame)
         distance, strength = self._hits(caster, ground, T, rays, porosity)
         sigma = np.full(len(rays), noise)
@@ -109,9 +115,9 @@ class DriveDirt(NamedTuple):
             distance, share = self.beams.mixed(distance, second, self.rng)
             strength = (1.0 - share) * strength + share * fainter
             sigma = np.hypot(sigma, self.beams.noise * np.where(np.isfinite(distance), distance, 0.0))
-        seen = lidar.detects(distance, strength, self.rng.random(len(rays)))
+        detected = lidar.detects(distance, strength, self.rng.random(len(rays)))
         noisy = distance + sigma * self.rng.normal(size=len(rays))
-        return (rays[seen] * noisy[seen, None]).astype(np.float32)
+        return (rays[detected] * noisy[detected, None]).astype(np.float32)
 
     def _hits(
         self, caster: Caster, ground: Callable[[Floats, Floats], Floats], T: Pose, rays: Floats, porosity: float

@@ -14,7 +14,7 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.tree_meshes import MeshCopies, join_standing
 from coview_stream.training.trees import PATTERNS, Terrain, Trees, draw_species, draw_stems, draw_trees, opened
 
-_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range; set by hand
+_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range
 
 
 class Stand(NamedTuple):
@@ -25,7 +25,7 @@ class Stand(NamedTuple):
         now: geometry when the robot drives.
         terrain: the ground.
         trees: all trees of either time.
-        obstacles: (N, 3) x, y and radius of what blocks the robot, metres.
+        obstacles: (N, 3) x, y and radius of obstacles for the robot, metres.
         drawn: values that were drawn for the stand, for JSON.
     """
 
@@ -66,9 +66,9 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
         "pattern": pattern,
         "stems": round(1e4 * len(xy) / (2 * half) ** 2),
         "height": round(float(trees.height.mean()), 1) if len(xy) else 0.0,
-        "species": [each._asdict() for each in species],
+        "species": [kind._asdict() for kind in species],
         "slope": round(slope, 1),
-        "winter": [bool(each) for each in winters],
+        "winter": [bool(winter) for winter in winters],
         "mortality": mortality,
         "understory": understory,
         "wind": wind,
@@ -78,7 +78,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
 
 def tags(drawn: dict[str, Any]) -> str:
     """Describe a stand in a few words, for tables by forest type."""
-    families = sorted({each["family"] for each in drawn["species"]})
+    families = sorted({species["family"] for species in drawn["species"]})
     season = "leaf-off" if any(drawn["winter"]) else "leaf-on"
     land = "flat" if drawn["slope"] < 3 else "hilly" if drawn["slope"] < 12 else "steep"
     stems = "sparse" if drawn["stems"] < 300 else "medium" if drawn["stems"] < 700 else "dense"
@@ -87,7 +87,7 @@ def tags(drawn: dict[str, Any]) -> str:
 
 def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
     """Draw whether it is winter at the two times: the same season in half of the cases."""
-    first, second = (bool(each) for each in rng.random(2) < recipe.leaf_off)
+    first, second = (bool(winter) for winter in rng.random(2) < recipe.leaf_off)
     return (first, first) if rng.random() < 0.5 else (first, second)
 
 
@@ -101,8 +101,8 @@ def _fates(rng: np.random.Generator, count: int, mortality: float) -> tuple[tupl
 def _branch_counts(rng: np.random.Generator, trees: Trees, winter: bool) -> Ints:
     """Draw the number of branches (N,) of each tree."""
     living, bare = rng.integers(0, 7), rng.integers(8, 22)
-    seen = trees.dead | (winter & ~trees.evergreen)
-    return rng.poisson(np.where(seen, bare, living))
+    leafless = trees.dead | (winter & ~trees.evergreen)
+    return rng.poisson(np.where(leafless, bare, living))
 
 
 def _litter(rng: np.random.Generator, terrain: Terrain) -> list[Mesh]:

@@ -25,7 +25,7 @@ from coview_stream.version import __version__
 
 # set by hand
 _REPORT_STEPS = 20  # from one line of progress to the next
-_CALIBRATED = 120  # queries from which the ranges of the quantised network are taken; set by hand
+_CALIBRATED = 120  # queries from which the ranges of the quantised network are taken
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
 
 Say = Callable[[str], None]
@@ -135,8 +135,8 @@ def train_session(
             raise InputError(f"{path}: a world of another recipe; choose another folder, or delete it")
     history: list[list[float]] = []
 
-    def report(step: int, found: Any) -> None:
-        history.append([float(x.detach()) for x in (found.dense, found.local, found.place)] + [found.recall])
+    def report(step: int, loss: Any) -> None:
+        history.append([float(x.detach()) for x in (loss.dense, loss.local, loss.place)] + [loss.recall])
         if (step + 1) % _REPORT_STEPS == 0:
             dense, local, place, found_share = np.mean(history[-_REPORT_STEPS:], axis=0)
             say(f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {found_share:.2f}")
@@ -170,12 +170,12 @@ def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries
     result: dict[str, Any] = {
         "worlds": len(worlds),
         "queries": len(results),
-        "AR@1": float(np.mean([each.found_among(1) for each in results])),
-        "AR@5": float(np.mean([each.found_among(5) for each in results])),
+        "AR@1": float(np.mean([query.found_among(1) for query in results])),
+        "AR@5": float(np.mean([query.found_among(5) for query in results])),
         "chance": float(np.pi * 10.0**2 / area),
     }
-    for sensor in sorted({each.sensor for each in results}):
-        result[sensor] = float(np.mean([each.found_among(1) for each in results if each.sensor == sensor]))
+    for sensor in sorted({query.sensor for query in results}):
+        result[sensor] = float(np.mean([query.found_among(1) for query in results if query.sensor == sensor]))
     return result
 
 
@@ -211,7 +211,7 @@ class SearchedQuery:
         world: index of its world.
         sensor: of the robot.
         travelled: metres driven for it.
-        found: (5, 3) x, y (metres) and heading (radians) of the best places, best first.
+        places: (5, 3) x, y (metres) and heading (radians) of the best places, best first.
         pose: (3,) the true x, y and heading.
         scores: (5,) of the places.
     """
@@ -219,13 +219,13 @@ class SearchedQuery:
     world: int
     sensor: str
     travelled: float
-    found: Floats
+    places: Floats
     pose: Floats
     scores: Floats
 
     def found_among(self, best: int = 1) -> bool:
         """Tell whether one of the ``best`` places lies within 10 m of the truth."""
-        apart = np.linalg.norm(self.found[:best, :2] - self.pose[:2], axis=1)
+        apart = np.linalg.norm(self.places[:best, :2] - self.pose[:2], axis=1)
         return bool((apart < _MAX_ERROR).any())
 
 
@@ -241,9 +241,9 @@ def search_queries(
         for k in range(len(world.queries))[:max_queries]:
             query = ground(world.queries[k])
             volume = correlate(*downsample(query.local, weights(query.sigma)), index, yaws)
-            found, scores = best_places(volume, yaws, world.corner)
+            places, scores = best_places(volume, yaws, world.corner)
             results.append(
-                SearchedQuery(number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores)
+                SearchedQuery(number, str(world.sensor[k]), float(world.travelled[k]), places, world.poses[k], scores)
             )
     return results
 

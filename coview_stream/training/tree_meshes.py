@@ -57,7 +57,7 @@ _TETRAHEDRON = Mesh(
     np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
     np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
 )
-_MAX_CLUMPS = 110_000  # in a stand; set by hand
+_MAX_CLUMPS = 110_000  # in a stand
 
 
 def crowns(rng: np.random.Generator, trees: Trees) -> list[MeshCopies]:
@@ -82,7 +82,7 @@ def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]
 
 
 def _lump(rng: np.random.Generator, trees: Trees, of: Ints, semi: Floats, rough: float) -> MeshCopies:
-    """Draw one bough beside the middle of each crown."""
+    """Draw one bough off the middle of each crown."""
     share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
     centre = trees.crown_axis(trees.base[of] + semi[:, 2] * rng.uniform(0.5, 1.5, len(of)), of)
     out = 0.7 * semi[:, 0] * rng.uniform(0.6, 1.2, len(of))

@@ -15,7 +15,7 @@ from coview_stream.training.recipe import Recipe
 
 Field = Callable[[Floats, Floats], Floats]
 
-_STEP = 1.0  # metres between grid points; set by hand
+_STEP = 1.0  # metres between grid points
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
@@ -161,7 +161,7 @@ def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: F
     count = len(xy)
     kind = _species_of(rng, xy, len(species))
     height = _heights(rng, recipe, xy)
-    pick = {name: np.array([getattr(each, name) for each in species])[kind] for name in Species._fields}
+    pick = {name: np.array([getattr(sort, name) for sort in species])[kind] for name in Species._fields}
     crown = _crowns(rng, recipe, pick["width"], height, (2 * terrain.half) ** 2)
     base = np.clip(pick["base"] + rng.normal(0, 0.06, count), *recipe.crown_base) * height
     radius = np.clip(pick["thick"] * height * rng.lognormal(0, 0.25, count), *recipe.stem_radius)
@@ -185,7 +185,7 @@ def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: F
 
 def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Floats, area: float) -> Floats:
     """Draw radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
-    low, high = (each * height / 2 for each in recipe.crown_width)
+    low, high = (width * height / 2 for width in recipe.crown_width)
     wide = share * rng.lognormal(0, 0.15, len(height)) * height / 2
     if rng.random() < 0.5:
         wide = wide * np.sqrt(rng.uniform(0.7, 2.0) * area / max(float((np.pi * wide**2).sum()), 1.0))

@@ -31,7 +31,7 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.stands import draw_stand, tags
 
 _PLACE, _FLIGHT, _DRIVES = range(3)  # random streams
-_BEYOND = 8.0  # metres of forest beyond the map; set by hand
+_BEYOND = 8.0  # metres of forest beyond the map
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _built(rng: np.random.Generator, seed: int, recipe: Recipe, size: float) -> 
     kind, changed = str(rng.choice(recipe.kinds)), recipe.draw(rng, "changed")
     scene = build_scene(kind, seed, size, changed)
     axis: Floats = np.linspace(-size / 2, size / 2, 50)
-    heights = scene.site.z(*(each.ravel() for each in np.meshgrid(axis, axis)))
+    heights = scene.site.z(*(grid.ravel() for grid in np.meshgrid(axis, axis)))
     return World(
         size=size,
         kind=kind,

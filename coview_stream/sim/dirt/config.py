@@ -1,4 +1,4 @@
-"""Dirt of the real world, by kind: what is on, and how strong."""
+"""Dirt of the real world: its kinds, and the strength of each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Dirt:
         beams: noise that grows with the range, mixed echoes at edges.
         reflectors: signs that bloom.
         glass: windows that mirror or let through.
-        mounting: a leaning sensor beside its place.
+        mounting: a leaning, displaced sensor.
         gravity: a false direction of down in the odometry.
         odometry: wrong scale and a turning heading.
         slip: bursts of slipping wheels.
@@ -43,7 +43,7 @@ class Dirt:
         snow: snow on the ground.
 
     Raises:
-        ConfigError: a value out of its range.
+        ConfigError: a value out of its range, here or in one of the kinds.
     """
 
     seed: int = 0
@@ -75,13 +75,13 @@ class Dirt:
 
     @property
     def on_sensor(self) -> bool:
-        """Whether the robot's frames differ from those of a clean world, besides what was changed in the scene."""
+        """Whether the robot's frames differ from a clean world's by more than the changes of the scene."""
         return any(name in _ON_SENSOR for name in self.kinds)
 
     def describe(self) -> list[str]:
-        """Say of each kind that is on how strong it is: "snow 0.4: m of snow off the roads"."""
-        chosen = [(name, STRENGTHS[name]) for name in self.kinds]
-        return [f"{name} {getattr(getattr(self, name), each.field):g}: {each.unit}" for name, each in chosen]
+        """Describe the strength of each kind that is on: "snow 0.4: m of snow off the roads"."""
+        strengths = [(name, STRENGTHS[name]) for name in self.kinds]
+        return [f"{name} {getattr(getattr(self, name), s.field):g}: {s.unit}" for name, s in strengths]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the seed and the settings of the kinds that are on as plain values, for JSON."""
@@ -96,7 +96,7 @@ class Strength(NamedTuple):
     field: str
     """Its field."""
     unit: str
-    """What the number is, for people."""
+    """Meaning of the number, for people."""
 
 
 STRENGTHS: dict[str, Strength] = {
@@ -130,7 +130,7 @@ _ON_SENSOR = frozenset(
 
 def real(seed: int = 0) -> Dirt:
     """Return all kinds of dirt at once, each with its default strength: the worst of all seasons in one run."""
-    return Dirt(seed, **{name: each.settings() for name, each in STRENGTHS.items()})
+    return Dirt(seed, **{name: strength.settings() for name, strength in STRENGTHS.items()})
 
 
 def parse_dirt(text: str, seed: int = 0) -> Dirt:

@@ -1,4 +1,4 @@
-"""Retro-reflectors: traffic signs so bright that beams beside them return from them too."""
+"""Dirt of light: beams of finite width, rain, dust, windows, and signs that bloom."""
 
 from __future__ import annotations
 
@@ -19,9 +19,6 @@ class Beams:
         noise: of the range, metres per metre, one sigma, besides the sensor's constant noise.
         divergence: full angle of the beam, milliradians.
         pulse: metres within which two echoes of one beam are not told apart; their ranges mix.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     noise: float = 0.0007
@@ -32,7 +29,7 @@ class Beams:
         within(self, noise=(0.0, 0.05), divergence=(0.0, 50.0), pulse=(0.0, 10.0))
 
     def aside(self, rays: Floats, rng: np.random.Generator) -> Floats:
-        """Return (N, 3) unit rays elsewhere in the beams about (N, 3) unit rays."""
+        """Return other unit rays (N, 3) within the beams about unit rays (N, 3)."""
         shift = rng.normal(size=rays.shape)
         shift -= np.einsum("ij,ij->i", shift, rays)[:, None] * rays
         shift *= (np.sqrt(rng.random(len(rays))) / np.linalg.norm(shift, axis=1))[:, None]
@@ -40,7 +37,7 @@ class Beams:
         return np.asarray(spread / np.linalg.norm(spread, axis=1)[:, None])
 
     def mixed(self, first: Floats, second: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return (N,) ranges that beams with echoes at both of (N,) ranges give, and the second echo's share in each.
+        """Return the ranges (N,) of beams with two echoes each, and the second echo's share (N,) in them.
 
         Echoes farther apart than the pulse stay apart, and the stronger wins.
         """
@@ -49,9 +46,9 @@ class Beams:
             together = np.abs(second - first) < self.pulse
         share = np.where(together, share, np.round(share))
         share = np.where(np.isfinite(first), np.where(np.isfinite(second), share, 0.0), 1.0)
-        safe = [np.where(np.isfinite(each), each, 0.0) for each in (first, second)]
-        some = np.isfinite(first) | np.isfinite(second)
-        return np.where(some, (1 - share) * safe[0] + share * safe[1], np.inf), share
+        safe = [np.where(np.isfinite(ranges), ranges, 0.0) for ranges in (first, second)]
+        returned = np.isfinite(first) | np.isfinite(second)
+        return np.where(returned, (1 - share) * safe[0] + share * safe[1], np.inf), share
 
 
 @dataclass(frozen=True)
@@ -62,9 +59,6 @@ class Rain:
         drops: share of the beams that meet a drop; they return from it where nothing is nearer.
         reach: mean range of such a return, metres.
         extinction: of the light, per metre.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     drops: float = 0.02
@@ -89,9 +83,6 @@ class Dust:
         centre: of the cloud, metres behind the body.
         size: half of its length, width and height, metres.
         gusts: logarithm of the factor by which its thickness varies, one sigma.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     reach: float = 3.0
@@ -117,7 +108,7 @@ class Dust:
         return np.where((b * b > a * c) & (ends < leaves), ends, np.inf)
 
 
-# metres, set by hand
+# metres
 _STOREY, _SILL, _LINTEL = 3.2, 0.7, 2.7
 _BAY, _FRAME = 3.0, 0.3
 _UPRIGHT = 0.3  # vertical part of a wall's unit normal, at most
@@ -129,13 +120,10 @@ class Glass:
     """Windows in the walls of some buildings.
 
     Attributes:
-        share: of the buildings, that have them.
+        share: of the buildings with windows.
         mirrors: probability that a window mirrors a beam.
-        passes: probability that it lets it pass; what is left returns from the pane.
-        strength: share of the light that comes back from what is seen in or behind the glass.
-
-    Raises:
-        ConfigError: a value out of its range.
+        passes: probability that the beam passes; the rest returns from the pane.
+        strength: share of the light that comes back from surfaces in or behind the glass.
     """
 
     share: float = 0.4
@@ -162,7 +150,7 @@ class Panes(NamedTuple):
 
 
 def windows(points: Floats, normals: Floats, height: Floats) -> Bools:
-    """Tell which of (N, 3) points on walls are panes: every storey has a row of windows.
+    """Tell which points (N, 3) on walls are panes: each storey has a row of windows.
 
     ``normals`` (N, 3) are the walls' unit normals, ``height`` (N,) metres above the ground.
     """
@@ -174,9 +162,9 @@ def windows(points: Floats, normals: Floats, height: Floats) -> Bools:
 
 
 def panes(glass: Glass, points: Floats, rays: Floats, normals: Floats, rng: np.random.Generator) -> tuple[Bools, Panes]:
-    """Return which of (N,) beams that meet a pane are not stopped by it, and how they go on.
+    """Return which of the (N,) beams that meet a pane go on, and how.
 
-    ``points`` (N, 3), where they meet it, ``rays`` (N, 3) and ``normals`` (N, 3) are in the scene frame.
+    ``points`` (N, 3) on the pane, ``rays`` (N, 3) and ``normals`` (N, 3) are in the scene frame.
     """
     fate = rng.random(len(rays))
     mirrored, passed = fate < glass.mirrors, (fate >= glass.mirrors) & (fate < glass.mirrors + glass.passes)
@@ -188,8 +176,8 @@ def panes(glass: Glass, points: Floats, rays: Floats, normals: Floats, rng: np.r
     return goes_on, Panes(which, start[which].astype(np.float32), on[which].astype(np.float32))
 
 
-_LIMIT = 2.5  # times the width of the bloom; set by hand
-_NOISE = 0.03  # metres; a saturated receiver ranges worse than it should; set by hand
+_LIMIT = 2.5  # times the width of the bloom
+_NOISE = 0.03  # metres; a saturated receiver ranges worse than it should
 
 
 @dataclass(frozen=True)
@@ -199,9 +187,6 @@ class Reflectors:
     Attributes:
         bloom: width of the halo, degrees, one sigma.
         reach: metres within which a sign is bright enough.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     bloom: float = 0.8
@@ -211,9 +196,9 @@ class Reflectors:
         within(self, bloom=(0.01, 10.0), reach=(0.0, 500.0))
 
     def halo(self, rays: Floats, distance: Floats, signs: Bools, rng: np.random.Generator) -> Floats:
-        """Return (N,) ranges with those beams of (N, 3) unit ``rays`` put to a sign that leave close to one.
+        """Return the ranges (N,) of unit ``rays`` (N, 3), those close to a bright sign moved to its range.
 
-        ``signs`` tells which of the (N,) distances are those of signs. What is nearer than the sign stays.
+        ``signs`` (N,) marks the distances (N,) of signs. Nearer returns stay.
         """
         bright = signs & (distance < self.reach)
         if not bright.any():
@@ -222,9 +207,9 @@ class Reflectors:
 
         width = np.radians(self.bloom)
         apart, which = cKDTree(rays[bright]).query(rays, distance_upper_bound=_LIMIT * width)
-        beside = np.flatnonzero(np.isfinite(apart) & ~signs)
-        sign = distance[bright][which[beside]] + rng.normal(0, _NOISE, len(beside))
-        lit = rng.random(len(beside)) < np.exp(-0.5 * (apart[beside] / width) ** 2)
+        close = np.flatnonzero(np.isfinite(apart) & ~signs)
+        sign = distance[bright][which[close]] + rng.normal(0, _NOISE, len(close))
+        lit = rng.random(len(close)) < np.exp(-0.5 * (apart[close] / width) ** 2)
         bloomed = distance.copy()
-        bloomed[beside] = np.where(lit & (sign < distance[beside]), sign, distance[beside])
+        bloomed[close] = np.where(lit & (sign < distance[close]), sign, distance[close])
         return bloomed

@@ -1,4 +1,4 @@
-"""Motion during a sweep: beams leave one after the other while the robot drives and turns."""
+"""Dirt of the robot: faults of its odometry, of the lidar's mounting, and motion during a sweep."""
 
 from __future__ import annotations
 
@@ -22,9 +22,6 @@ class Miscalibration:
         scale: share by which distances are over- or underrated; the sign is drawn.
         yaw_rate: constant error of the heading, degrees per metre driven; the sign is drawn.
         yaw_walk: random walk of the heading, degrees per square root of a metre, one sigma.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     scale: float = 0.05
@@ -35,7 +32,7 @@ class Miscalibration:
         within(self, scale=(0.0, 0.5), yaw_rate=(0.0, 10.0), yaw_walk=(0.0, 20.0))
 
     def apply(self, odometry: Floats, rng: np.random.Generator) -> Floats:
-        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them."""
+        """Return ``T_odom_body`` (N, 4, 4) with this fault."""
         driven = _driven(odometry)
         sides = rng.choice([-1.0, 1.0], 2)
         walk = rng.normal(size=len(driven)) * np.sqrt(driven) * self.yaw_walk
@@ -45,16 +42,13 @@ class Miscalibration:
 
 @dataclass(frozen=True)
 class Slip:
-    """Bursts of slipping wheels: distance counted that was not driven, or the other way round, and a false turn.
+    """Bursts of slipping wheels: distance counted but not driven, or driven but not counted, and a false turn.
 
     Attributes:
-        share: of the distance in a burst that is counted too much (spinning) or too little (skidding), either drawn.
+        share: of a burst's distance that is counted too much (spinning) or too little (skidding), at random.
         turn: false turn in a burst, degrees, one sigma.
         length: of a burst, metres driven.
         every: mean distance from burst to burst, metres driven.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     share: float = 0.5
@@ -66,7 +60,7 @@ class Slip:
         within(self, share=(0.0, 1.0), turn=(0.0, 90.0), length=(0.1, 100.0), every=(0.1, 1e4))
 
     def apply(self, odometry: Floats, rng: np.random.Generator) -> Floats:
-        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them."""
+        """Return ``T_odom_body`` (N, 4, 4) with this fault."""
         driven = _driven(odometry)
         way = np.cumsum(driven)
         turns, factors = np.zeros(len(driven)), np.ones(len(driven))
@@ -78,21 +72,18 @@ class Slip:
         return spoilt(odometry, _about_z(np.radians(np.cumsum(turns))), factors)
 
     def bursts(self, way: float, rng: np.random.Generator) -> Floats:
-        """Draw where on a way of that length, metres, the wheels begin to slip: evenly spread, at least once."""
+        """Draw the metres driven at which slipping begins on a way of ``way`` metres: evenly spread, at least once."""
         count = max(1, round(way / self.every))
         return (np.arange(count) + rng.uniform(0.2, 0.8, count)) * way / count
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Error of the direction that the inertial unit takes for down: constant in size, slowly turning.
+    """Error of the inertial unit's direction of down: constant in size, slowly turning.
 
     Attributes:
-        error: angle between down and what is taken for it, degrees.
+        error: angle between the true and the assumed direction of down, degrees.
         period: seconds in which the false direction goes once round.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     error: float = 0.5
@@ -102,7 +93,7 @@ class Gravity:
         within(self, error=(0.0, 45.0), period=(1.0, 1e6))
 
     def apply(self, odometry: Floats, stamps: Floats, rng: np.random.Generator) -> Floats:
-        """Return the poses (N, 4, 4) ``T_odom_body`` as this odometry would give them at (N,) stamps, seconds."""
+        """Return ``T_odom_body`` (N, 4, 4) at stamps (N,), seconds, with this fault."""
         angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * (stamps - stamps[0]) / self.period
         axes = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
         tilts = exp_so3(np.radians(self.error) * axes)
@@ -110,7 +101,7 @@ class Gravity:
 
 
 def spoilt(odometry: Floats, turns: Floats, factors: Floats, first: Floats | None = None) -> Floats:
-    """Return poses (N, 4, 4) put together anew from spoilt motions.
+    """Return poses (N, 4, 4) chained from spoilt motions.
 
     Args:
         odometry: (N, 4, 4) ``T_odom_body``.
@@ -118,11 +109,11 @@ def spoilt(odometry: Floats, turns: Floats, factors: Floats, first: Floats | Non
         factors: (N - 1,) on the length of each motion.
         first: (3, 3) rotation of the axes at the first pose, the identity if None.
     """
-    every = np.concatenate([(np.eye(3) if first is None else first)[None], turns])
+    axes = np.concatenate([(np.eye(3) if first is None else first)[None], turns])
     moved = np.diff(odometry[:, :3, 3], axis=0) * factors[:, None]
-    moved = np.einsum("nij,nj->ni", every[:-1], moved)
+    moved = np.einsum("nij,nj->ni", axes[:-1], moved)
     poses = odometry.copy()
-    poses[:, :3, :3] = every @ odometry[:, :3, :3]
+    poses[:, :3, :3] = axes @ odometry[:, :3, :3]
     poses[1:, :3, 3] = odometry[0, :3, 3] + np.cumsum(moved, axis=0)
     return poses
 
@@ -137,15 +128,12 @@ def _driven(odometry: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Mounting error that nobody calibrated: points are taken for the body's while they are the sensor's.
+    """Uncalibrated mounting: the sensor's points are sent as the body's.
 
     Attributes:
         lean: angle between the vertical axes of sensor and body, degrees; the side it leans to is drawn.
         yaw: turn about the vertical, degrees, one sigma; no map shows it on a straight road.
         lever: distance between sensor and body, metres; its direction is drawn.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     lean: float = 2.0
@@ -163,7 +151,7 @@ class Mounting:
         return pose_from(R, self.lever * offset / np.linalg.norm(offset))
 
 
-_STEPS = 200  # true poses along a sweep: every 0.5 ms; set by hand
+_STEPS = 200  # true poses along a sweep: every 0.5 ms
 _NS = 1e9
 
 
@@ -174,9 +162,6 @@ class Motion:
     Attributes:
         rate: samples of odometry a second, by which the sweeps are deskewed.
         deskewed: whether the frames are deskewed, by the product's own code; if not they stay bent.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     rate: float = 50.0
@@ -187,10 +172,9 @@ class Motion:
 
 
 class Track:
-    """Smooth motion through the poses of a run's frames, true and as odometry has it.
+    """Smooth motion through the poses of a run's frames, true and by odometry.
 
-    The robot is where the frames' poses say at their stamps, and moves smoothly between them; what odometry gets
-    wrong grows evenly from frame to frame.
+    The robot passes the frames' poses at their stamps; the error of odometry grows evenly from frame to frame.
     """
 
     def __init__(self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses) -> None:
@@ -224,7 +208,7 @@ class Track:
         return np.asarray(interpolate(self._wrong[k], self._wrong[k + 1], share) @ self.true(stamps))
 
     def along(self, frame: int, times: Floats) -> tuple[Poses, Indices]:
-        """Return true poses (K, 4, 4) along a sweep, and which of them each of (N,) times after its stamp has."""
+        """Return true poses (K, 4, 4) along a sweep, and the index (N,) of the pose at each of the times (N,)."""
         grid = np.linspace(-FRAME_PERIOD, 0.0, _STEPS)
         nearest = np.rint((times + FRAME_PERIOD) * ((_STEPS - 1) / FRAME_PERIOD)).astype(np.intp)
         return self.true(self.stamps[frame] + grid), np.clip(nearest, 0, _STEPS - 1)
@@ -242,5 +226,5 @@ class Track:
 
 
 def beam_times(count: int) -> Floats:
-    """Return (N,) seconds from a frame's stamp, the sweep's end, to each of its beams: beams come in that order."""
+    """Return the times (N,) of a sweep's beams in seconds after its stamp, the sweep's end."""
     return np.asarray((np.arange(1, count + 1) / count - 1.0) * FRAME_PERIOD)

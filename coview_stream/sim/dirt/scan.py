@@ -1,4 +1,4 @@
-"""Scans of a robot with dirt: from the beams that leave to the frame that its odometry straightens."""
+"""Scans of a robot with dirt: from beams to deskewed frames, and the recording of raw sweeps."""
 
 from __future__ import annotations
 
@@ -92,18 +92,18 @@ def stream(world_seed: int, seed: int, purpose: Stream) -> np.random.Generator:
 
 
 GROUND, SOLID, GLAZED, SIGN, LEAVES = range(5)
-"""What a beam meets: indices of the meshes of :class:`Surfaces`."""
+"""Indices of the meshes of :class:`Surfaces`."""
 
 _CONIFER = vegetation.TREE_COLUMNS.index("conifer")
 
 
 class Echoes(NamedTuple):
-    """What (N,) beams come back from.
+    """Echoes of (N,) beams.
 
     Attributes:
         distance: (N,) metres that the beam counts; inf without a return.
-        strength: (N,) cosine of the incidence, less what was lost at glass.
-        signs: (N,) whether it is a retro-reflecting sign.
+        strength: (N,) cosine of the incidence, less the loss at glass.
+        signs: (N,) whether a retro-reflecting sign returned it.
     """
 
     distance: Floats
@@ -112,10 +112,10 @@ class Echoes(NamedTuple):
 
 
 class Surfaces:
-    """Scene as the robot's beams meet it, with what lies on its ground and with windows in some of its walls."""
+    """Scene for the robot's beams, with the cover of its ground and with windows in some walls."""
 
     def __init__(self, scene: Scene, cover: Cover | None, glass: Glass | None, rng: np.random.Generator) -> None:
-        """Take the scene as it is now; the buildings with windows are drawn from ``rng``.
+        """Use the present state of the scene; ``rng`` draws the buildings with windows.
 
         Raises:
             DependencyError: Open3D cannot be loaded.
@@ -138,16 +138,16 @@ class Surfaces:
 
     def echoes(self, origins: Floats32, rays: Floats32, rng: np.random.Generator) -> Echoes:
         """Cast (N, 3) unit rays from (N, 3) origins, scene frame, metres."""
-        found = self._caster.trace(origins, rays, rng, POROSITY)
-        distance, strength = found.distance.astype(np.float64), found.incidence.astype(np.float64)
+        hits = self._caster.trace(origins, rays, rng, POROSITY)
+        distance, strength = hits.distance.astype(np.float64), hits.incidence.astype(np.float64)
         if self._cover is not None:
-            ground = np.flatnonzero(found.mesh == GROUND)
-            at = origins[ground] + rays[ground] * found.distance[ground, None]
+            ground = np.flatnonzero(hits.mesh == GROUND)
+            at = origins[ground] + rays[ground] * hits.distance[ground, None]
             x, y = at[:, 0].astype(np.float64), at[:, 1].astype(np.float64)
             distance[ground] += self._cover.sink(x, y, strength[ground], rng)
         if self._glass is not None:
-            self._look_through(self._glass, origins, rays, found.normal, distance, strength, found.mesh == GLAZED, rng)
-        return Echoes(distance, strength, found.mesh == SIGN)
+            self._look_through(self._glass, origins, rays, hits.normal, distance, strength, hits.mesh == GLAZED, rng)
+        return Echoes(distance, strength, hits.mesh == SIGN)
 
     def _look_through(
         self,
@@ -160,7 +160,7 @@ class Surfaces:
         glazed: Bools,
         rng: np.random.Generator,
     ) -> None:
-        """Put what is seen in or behind windows in the place of the windows, in ``distance`` and ``strength``."""
+        """Replace panes by the surfaces in or behind them, in ``distance`` and ``strength``."""
         hit = np.flatnonzero(glazed)
         points = origins[hit].astype(np.float64) + distance[hit, None] * rays[hit]
         normal = normals[hit].astype(np.float64)
@@ -184,12 +184,12 @@ def seasonal_caster(parts: Parts, scene: Scene, seasons: Seasons) -> MeshCaster:
 
 
 class Scanner:
-    """Lidar in a dirty world; frames are asked for in order, as each goes on with the random numbers."""
+    """Lidar in a dirty world; read frames in order, they share random numbers."""
 
     def __init__(
         self, scene: Scene, sensor: Sensor, dirt: Dirt, height: float, rng: Callable[[Stream], np.random.Generator]
     ) -> None:
-        """Take the scene as it is now; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's.
+        """Use the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's.
 
         Raises:
             DependencyError: Open3D cannot be loaded.
@@ -205,7 +205,7 @@ class Scanner:
     def frames(
         self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses, recording: Recording | None = None
     ) -> Iterator[Points]:
-        """Yield frames (N, 3) float32 metres, in what the robot takes for its body frame.
+        """Yield frames (N, 3) float32 metres, in the robot's assumed body frame.
 
         Args:
             stamps: (N,) seconds.
@@ -225,7 +225,7 @@ class Scanner:
             yield points
 
     def sweep(self, frame: int, T_scene_body: Pose, track: Track | None) -> tuple[Points, Floats]:
-        """Return points (N, 3), sensor frame at their times, and these times (N,), seconds after the frame's stamp.
+        """Return points (N, 3) in the sensor frame at their times, and the times (N,), seconds after the stamp.
 
         Without a track all beams leave at once, at the stamp.
         """
@@ -248,12 +248,12 @@ class Scanner:
         strength = echoes.strength
         if self._dirt.rain is not None:
             strength = strength * np.exp(-2.0 * self._dirt.rain.extinction * np.where(distance < 1e4, distance, 0.0))
-        seen = self._sensor.detects(distance, strength, self._rng.random(len(rays)))
+        detected = self._sensor.detects(distance, strength, self._rng.random(len(rays)))
         noisy = distance + noise * self._rng.normal(size=len(rays))
-        return (rays[seen] * noisy[seen, None]).astype(np.float32), times[seen]
+        return (rays[detected] * noisy[detected, None]).astype(np.float32), times[detected]
 
     def _echoes(self, origins: Floats32, rays: Floats, towards: Floats, moving: MeshCaster | None) -> Echoes:
-        """Return what beams of finite width, (N, 3) unit ``rays`` in the sensor frame, come back from."""
+        """Return the echoes of beams of finite width, unit ``rays`` (N, 3) in the sensor frame."""
         first = self._met(origins, _turned(towards, rays), moving)
         if (beams := self._dirt.beams) is not None:
             second = self._met(origins, _turned(towards, beams.aside(rays, self._rng)), moving)
@@ -267,16 +267,16 @@ class Scanner:
         return first
 
     def _met(self, origins: Floats32, rays: Floats32, moving: MeshCaster | None) -> Echoes:
-        found = self._surfaces.echoes(origins, rays, self._rng)
+        surfaces = self._surfaces.echoes(origins, rays, self._rng)
         if moving is None:
-            return found
+            return surfaces
         met = moving.trace(origins, rays, self._rng, 0.0)
-        nearer = met.distance < found.distance
-        distance = np.where(nearer, met.distance, found.distance)
-        return Echoes(distance, np.where(nearer, met.incidence, found.strength), found.signs & ~nearer)
+        nearer = met.distance < surfaces.distance
+        distance = np.where(nearer, met.distance, surfaces.distance)
+        return Echoes(distance, np.where(nearer, met.incidence, surfaces.strength), surfaces.signs & ~nearer)
 
     def _weather(self, echoes: Echoes, rays: Floats) -> Floats:
-        """Return the ranges (N,) of surfaces, drops and dust, whichever is nearer; drops and dust are seen anyway."""
+        """Return the ranges (N,) of the nearest of surfaces, drops and dust; drops and dust always return."""
         distance = echoes.distance
         in_air = np.full(len(rays), np.inf)
         if self._dirt.rain is not None:

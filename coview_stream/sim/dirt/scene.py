@@ -1,4 +1,4 @@
-"""Traffic: people and vehicles that move through the scene, and people who walk along with the robot."""
+"""Dirt of the scene: snow and grass, years and seasons since the survey, and traffic."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from coview_stream.sim.mesh import EMPTY, Mesh, cylinder, ellipsoid, join, place
 from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Footprint, Parts, Scene
 
-_VERGE = 1.0  # metres beside the carriageway without grass; set by hand
-_STEEPEST = 0.05  # cosine of the incidence: flatter rays pass no longer way through the cover; set by hand
-_WAVES = ((23.0, 0.6), (9.0, 0.4))  # metres and share: drifts and tussocks; set by hand
+_VERGE = 1.0  # metres beside the carriageway without grass
+_STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat rays through the cover
+_WAVES = ((23.0, 0.6), (9.0, 0.4))  # metres and share: drifts and tussocks
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,6 @@ class Snow:
         depth: metres, off the roads.
         on_roads: share of the depth that lies on the carriageway.
         drifts: share by which the depth varies.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     depth: float = 0.25
@@ -49,9 +46,6 @@ class Grass:
         height: metres, of the tallest.
         reach: mean way of a beam through it, metres.
         tussocks: share by which the height varies.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     height: float = 0.35
@@ -70,7 +64,7 @@ class Cover:
         self._phases = rng.uniform(0, 2 * np.pi, (2, len(_WAVES), 2))
 
     def depth(self, x: Floats, y: Floats) -> Floats:
-        """Return how deep the cover is at (N,) coordinates, metres."""
+        """Return the depth (N,) of the cover at coordinates (N,), metres."""
         return np.asarray(np.maximum(self._snow_depth(x, y), self._grass_height(x, y)))
 
     def _snow_depth(self, x: Floats, y: Floats) -> Floats:
@@ -95,9 +89,9 @@ class Cover:
         return total
 
     def sink(self, x: Floats, y: Floats, incidence: Floats, rng: np.random.Generator) -> Floats:
-        """Return how far (N,) beams go on behind the cover's surface at (N,) coordinates before they end, metres.
+        """Return the metres (N,) that beams go on below the cover's surface at coordinates (N,).
 
-        Snow stops a beam at once; through grass it comes ``reach`` metres on average, and to the ground at most.
+        Snow stops a beam at once; in grass it goes ``reach`` metres on average, and to the ground at most.
         ``incidence`` is the cosine of the angle of incidence.
         """
         if self._grass is None:
@@ -108,10 +102,10 @@ class Cover:
         return np.where(ends, np.clip(rng.exponential(self._grass.reach, len(x)), 0.0, np.maximum(through, 0.0)), 0.0)
 
 
-_GONE, _NEW, _REBUILT = 0.01, 0.01, 0.005  # share of the buildings a year; set by hand
-_FELLED = 0.015  # share of the trees a year, and as many new ones; set by hand
-_GROWTH = 0.12  # metres a year that a tree grows; set by hand
-_SMALLEST = 0.6  # share of its height now that a tree had at least
+_GONE, _NEW, _REBUILT = 0.01, 0.01, 0.005  # share of the buildings a year
+_FELLED = 0.015  # share of the trees a year, and as many new ones
+_GROWTH = 0.12  # metres a year that a tree grows
+_SMALLEST = 0.6  # least share of its present height that a tree had
 
 
 @dataclass(frozen=True)
@@ -123,9 +117,6 @@ class Years:
 
     Attributes:
         years: between survey and run.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     years: float = 10.0
@@ -140,9 +131,6 @@ class Seasons:
 
     Attributes:
         bare: probability that a pulse passes one surface of a bare crown.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     bare: float = 0.88
@@ -153,12 +141,12 @@ class Seasons:
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of the buildings, as indices of ``Scene.footprints``.
+    """Fate of the buildings, as indices of ``Scene.footprints``.
 
     Attributes:
-        gone: those that the survey saw and the robot does not.
-        new: those that the robot sees and the survey did not.
-        rebuilt: those that were replaced by another building.
+        gone: in the survey only.
+        new: at the drive only.
+        rebuilt: replaced by another building.
     """
 
     gone: Indices
@@ -167,7 +155,7 @@ class Fate:
 
 
 def aged(scene: Scene, change: Years, rng: np.random.Generator) -> tuple[Scene, Fate]:
-    """Return a scene that was mapped ``change.years`` ago, and what became of its buildings; needs ``Scene.parts``."""
+    """Return a scene that was mapped ``change.years`` ago, and the fate of its buildings; needs ``Scene.parts``."""
     before, after = drawn_parts(scene)
     order, counts = rng.permutation(len(scene.footprints)), []
     for rate in (_GONE, _NEW, _REBUILT):
@@ -187,7 +175,7 @@ def aged(scene: Scene, change: Years, rng: np.random.Generator) -> tuple[Scene, 
 
 
 def drawn_parts(scene: Scene) -> tuple[Parts, Parts]:
-    """Return what a scene was drawn from, when the map was made and now."""
+    """Return the parts of a scene when the map was made and now."""
     assert scene.parts is not None, "the scene was not drawn by build_scene"
     return scene.parts
 
@@ -205,7 +193,7 @@ def _another(scene: Scene, plot: Footprint, rng: np.random.Generator) -> Mesh:
 
 
 def _younger(trees: Floats, change: Years, rng: np.random.Generator) -> Floats:
-    """Return the trees (N, 8) of today as they were, less those that were planted since."""
+    """Return today's trees (N, 8) at their earlier size, without those planted since."""
     rows = _kept(trees, change, rng).copy()
     then = np.maximum(1.0 - _GROWTH * change.years / rows[:, 2], _SMALLEST)
     rows[:, 2:4] *= then[:, None]
@@ -235,10 +223,7 @@ class Traffic:
     Attributes:
         vehicles: on 100 metres of street.
         people: on 100 metres of street.
-        companions: people who walk with the robot, a few metres behind it or beside.
-
-    Raises:
-        ConfigError: a value out of its range.
+        companions: people who walk with the robot, within a few metres.
     """
 
     vehicles: float = 2.0
@@ -259,13 +244,13 @@ def person() -> Mesh:
 
 @dataclass(frozen=True)
 class _Mover:
-    """Somebody who goes along a street, over and over."""
+    """A person or vehicle that goes along a street, over and over."""
 
     mesh: Mesh
     line: Floats  # (K, 2) metres, points a metre apart
     start: float  # metres along it
     speed: float  # metres per second; negative against its direction
-    beside: float  # metres to the left of the line
+    left: float  # metres to the left of the line
     clear: float  # metres from the robot that it keeps
 
     def at(self, seconds: float) -> Floats:
@@ -274,12 +259,12 @@ class _Mover:
         s = (self.start + self.speed * seconds) % arc[-1]
         heading = float(np.interp(s, arc, np.unwrap(directions(self.line))))
         x, y = (float(np.interp(s, arc, self.line[:, k])) for k in range(2))
-        x, y = x - self.beside * np.sin(heading), y + self.beside * np.cos(heading)
+        x, y = x - self.left * np.sin(heading), y + self.left * np.cos(heading)
         return np.array([x, y, heading + (0.0 if self.speed > 0 else np.pi)])
 
 
 class Movers:
-    """Everybody who moves in a scene."""
+    """People and vehicles that move in a scene."""
 
     def __init__(self, site: Site, traffic: Traffic, rng: np.random.Generator) -> None:
         self._site = site
@@ -302,7 +287,7 @@ class Movers:
         self._pace = rng.uniform(0, 2 * np.pi, traffic.companions)
 
     def around(self, T_scene_body: Pose, seconds: float) -> Mesh:
-        """Return those near the robot at a time, scene frame."""
+        """Return the people and vehicles near the robot at a time, scene frame."""
         here, parts = T_scene_body[:2, 3], []
         for mover in self._movers:
             x, y, yaw = mover.at(seconds).tolist()

@@ -1,4 +1,4 @@
-"""Faults of an airborne survey: strips that do not lie on each other, and a density that is not even."""
+"""Faults of an airborne survey: misaligned strips and an uneven density."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from coview_stream.config.checks import require
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim.ranges import within
 
-_PATCH = 70.0  # metres: wavelength of the density; set by hand
-_WAVES = 6  # that make it up; set by hand
-_UPRIGHT = 0.5  # share of a strip's error that may be vertical; set by hand
+_PATCH = 70.0  # metres: wavelength of the density
+_WAVES = 6  # summed
+_UPRIGHT = 0.5  # share of a strip's error that may be vertical
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,6 @@ class Strips:
     Attributes:
         least: root mean square distance by which two strips disagree, metres; drawn evenly from here,
         most: to here.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     least: float = 0.05
@@ -52,14 +49,11 @@ def disagreement(offsets: Floats) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Density of a survey that varies from place to place; it takes the place of the configured one.
+    """Density of a survey that varies from place to place, in place of the configured one.
 
     Attributes:
         least: pulses per square metre where it is thinnest.
         most: where it is densest.
-
-    Raises:
-        ConfigError: a value out of its range.
     """
 
     least: float = 4.0
@@ -71,7 +65,7 @@ class Density:
 
 
 class Thinning:
-    """Density of a survey at each place, and what it leaves of an even scan with the largest density."""
+    """Density of a survey by place, and the thinning of an even scan to it."""
 
     def __init__(self, density: Density, rng: np.random.Generator) -> None:
         self._density = density
@@ -87,15 +81,15 @@ class Thinning:
         return np.asarray(self._density.least * (self._density.most / self._density.least) ** share)
 
     def keeps(self, points: Floats, rng: np.random.Generator) -> Bools:
-        """Tell which of the points (N, 3) of a scan with the largest density are there."""
+        """Tell which points (N, 3) of a scan with the largest density remain."""
         return np.asarray(rng.random(len(points)) * self._density.most < self.at(points[:, :2]))
 
 
 def spoilt_strips(
     strips: Iterable[tuple[float, Floats]], faults: Strips | None, thinning: Thinning | None, rng: np.random.Generator
 ) -> Iterator[tuple[float, Floats]]:
-    """Yield the strips of an airborne scan, as ``airborne_scan`` does, with their faults; after the last is flown."""
-    kept = [(done, points if thinning is None else points[thinning.keeps(points, rng)]) for done, points in strips]
-    offsets = np.zeros((len(kept), 3)) if faults is None else faults.offsets(len(kept), rng)
-    for (done, points), offset in zip(kept, offsets, strict=True):
+    """Yield the strips of ``airborne_scan`` with their faults, once all are flown."""
+    thinned = [(done, points if thinning is None else points[thinning.keeps(points, rng)]) for done, points in strips]
+    offsets = np.zeros((len(thinned), 3)) if faults is None else faults.offsets(len(thinned), rng)
+    for (done, points), offset in zip(thinned, offsets, strict=True):
         yield done, points + offset
