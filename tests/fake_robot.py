@@ -17,7 +17,7 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages import encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
-from coview_stream.stream.node.jobs import FrameResult
+from coview_stream.stream.node.engine_queue import FrameResult
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.keys import robot_keys
 
@@ -137,7 +137,7 @@ class Robot:
         self.moved(seconds - 0.01)
         self.saw(seconds)
         self.moved(seconds + 0.01)
-        job = self.session.take_frame()
+        job = self.session.take_job("track")
         assert job is not None
         self.session.handle_result(job, answer(job, **more), self.now)
         return job

@@ -94,11 +94,11 @@ def _map() -> Target:
 
 
 def _state() -> Target:
-    from coview_stream.stream.node import last_pose
+    from coview_stream.stream.node import last_place
 
     logging.getLogger("coview_stream").setLevel(logging.CRITICAL)
-    name = last_pose.file_of(Path(), "r1", "0" * 64).name
-    return _file(name, lambda path: last_pose.load(path.parent, "r1", "0" * 64))
+    name = last_place.file_of(Path(), "r1", "0" * 64).name
+    return _file(name, lambda path: last_place.load(path.parent, "r1", "0" * 64))
 
 
 def _bag(name: str) -> Target:
@@ -122,7 +122,7 @@ def _rpc() -> Target:
     from coview_stream.errors import CoViewError
     from coview_stream.messages.json_messages import read_object
     from coview_stream.stream.client.fleet_table import FleetTable
-    from coview_stream.stream.node.election import claim_in
+    from coview_stream.stream.node.status import NodeIdentity
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors
     from coview_stream.stream.transport.transport import MAX_REPLY
@@ -139,7 +139,7 @@ def _rpc() -> Target:
         answers.end()
         answers.run()
         zenoh_io._error_of(data)
-        claim_in(data)
+        NodeIdentity.read(data)
         with contextlib.suppress(CoViewError):
             table = FleetTable()
             table.add_status("r1", read_object(data), 1.0)

@@ -271,7 +271,7 @@ def state_folder(args: argparse.Namespace) -> Path | None:
     import logging
 
     from coview_stream.errors import ConfigError
-    from coview_stream.stream.node.last_pose import default_folder
+    from coview_stream.stream.node.last_place import default_folder
 
     if args.no_state:
         return None
@@ -298,7 +298,7 @@ def writable_state_folder(args: argparse.Namespace) -> Path | None:
     import logging
 
     from coview_stream.errors import InputError
-    from coview_stream.stream.node.last_pose import try_out
+    from coview_stream.stream.node.last_place import try_out
 
     log = logging.getLogger("coview_stream.node")
     folder = state_folder(args)

@@ -33,7 +33,7 @@ from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
-    from coview_stream.stream.node.engine_child import EngineChild
+    from coview_stream.stream.node.engine_process import EngineChild
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.serve import ServeOptions
     from coview_stream.viewers.scene import Sink
@@ -124,21 +124,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     operation.add_argument("--quiet", action="store_true", help="log errors only")
 
 
-def fleet_name(text: str | None) -> str | None:
-    """Return the name of a fleet; ConfigError where it is no part of a key."""
-    from coview_stream.stream.transport.keys import check_chunk
-
-    return None if text is None else check_chunk(text, "--fleet")
-
-
-def default_node(args: argparse.Namespace) -> str:
-    """Return the name of a node that is given none: nodes of a fleet have the same robots."""
-    import os
-    import socket
-
-    return str(args.robot[0]) if args.fleet is None else f"{socket.gethostname()}-{os.getpid()}"
-
-
 def _host_port(text: str) -> str:
     if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
         raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --metrics={METRICS_ADDRESS}")
@@ -147,7 +132,7 @@ def _host_port(text: str) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
-    from coview_stream.stream.node.engine_child import start_children
+    from coview_stream.stream.node.engine_process import start_children
 
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)
@@ -160,28 +145,38 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     import logging
+    import os
+    import socket
 
     from coview_stream.basemap.signature import read_verify_key
     from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.cli.view import open_sinks
+    from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.config.node import NodeConfig
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
-    from coview_stream.stream.node.serve import ServeOptions
-    from coview_stream.stream.transport.keys import node_keys, robot_keys
+    from coview_stream.stream.node.serve import CodecOptions, NetworkOptions, ServeOptions
+    from coview_stream.stream.transport.keys import check_chunk, node_keys, robot_keys
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
     start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
-    risk = acceptance_config(args.risk).risk
     verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
+    localizer = LocalizerConfig(
+        registration=RegistrationConfig(method=args.registration),
+        acceptance=acceptance_config(args.risk),
+        reloc=args.reloc,
+    )
     lidar = lidar_config(args.odometry, args.gravity, args.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
+    fleet = None if args.fleet is None else f"{args.base}/fleet/{check_chunk(args.fleet, '--fleet')}"
+    # nodes of a fleet have the same robots
+    default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
     if not 0 < args.coast < float("inf"):  # the configuration names the field otherwise
         raise ConfigError(f"--coast is {args.coast}; it must be a positive, finite number of seconds")
     by_default = not (args.connect or args.listen or args.config)
@@ -196,15 +191,23 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         deskew=not args.no_deskew,
         mount=mount_of(args),
     )
-    source = open_map_argument(args)
+    opened = open_map_argument(args)
     options = ServeOptions(
-        args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
-        args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
-        args.registration, writable_state_folder(args), args.reloc, risk,
-        node_keys(args.base, args.node or default_node(args)), args.metrics, verify_key,
-        args.geo, initial_guesses(args.initial, args.robot, args.within), source.mirrors, fleet_name(args.fleet),
-        args.base,
-    )  # fmt: skip
+        map_path=opened.path,
+        keys=keys,
+        network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config),
+        codecs=CodecOptions(args.cloud_encoding, args.odometry_encoding, args.pose_encoding, args.geo),
+        node=node,
+        localizer=localizer,
+        lidar=lidar,
+        state=writable_state_folder(args),
+        guesses=initial_guesses(args.initial, args.robot, args.within),
+        mirrors=opened.mirrors,
+        verify_key=verify_key,
+        fleet=fleet,
+        node_keys=node_keys(args.base, args.node or default_node),
+        metrics=args.metrics,
+    )
     sinks = open_sinks(args)
     hangups: list[int] = []
     try:

@@ -19,7 +19,7 @@ from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
-from coview_stream.stream.node.election import claim_in
+from coview_stream.stream.node.status import NodeIdentity
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Transport
 
@@ -134,8 +134,8 @@ def capture_robots(
         def handler(sample: Sample) -> None:
             with contextlib.suppress(MessageError):
                 capture.status = read_status(sample)
-                if (claim := claim_in(bytes(sample.payload))) is not None and not claim.ending:
-                    capture.servers.add(str(claim))
+                if (node := NodeIdentity.read(bytes(sample.payload))) is not None and not node.ending:
+                    capture.servers.add(str(node))
 
         return handler
 

@@ -21,7 +21,7 @@ from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.node.frame_sync import FrameSync
+from coview_stream.stream.node.inputs import FrameSync
 from coview_stream.version import __version__
 
 _NODE = NodeConfig()

@@ -15,13 +15,9 @@ from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount, parse_mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.transforms import inverse, transform
-from coview_stream.messages import encode_cloud
-from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.lidar_runs import open_bare_run
 from coview_stream.recordings.open_run import open_run
-from coview_stream.stream.node.session import Session
-from coview_stream.stream.transport.keys import robot_keys
 
 MOUNT = "180,10,90,0.3,-0.2,0.5"
 
@@ -58,14 +54,13 @@ def test_clouds_of_a_turned_lidar_are_read_into_the_body_frame(world_run, turned
     assert (open_run(turned_run, mount=mount).poses == open_run(world_run).poses).all()
 
 
-def test_live_clouds_are_turned_as_they_come(monkeypatch):
+def test_live_clouds_are_turned_as_they_come():
     points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
-    seen = []
-    monkeypatch.setattr(Session, "_add_cloud", lambda self, message, now: seen.append(message))
-    session = Session(robot_keys("native", "coview", "r1"), "0" * 64, NodeConfig(mount=parse_mount(MOUNT)))
-    encoded = encode_cloud(CloudMessage(1, turned(points)), "xyz")
-    session.on_cloud(Sample(session.keys.cloud, encoded.payload, encoded.encoding, encoded.attachment), 0.0)
-    assert np.allclose(seen[0].points, points, atol=1e-4)
+    robot = Robot(NodeConfig(mount=parse_mount(MOUNT)))
+    robot.moved(0.0)
+    robot.saw(0.0, points=turned(points))
+    robot.moved(0.05)
+    assert np.allclose(robot.session.take_job("track").points, points, atol=1e-4)
 
 
 def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():
@@ -78,7 +73,7 @@ def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():
         for k in range(12):
             robot.moved(0.05 * k, x=0.5 * k, yaw=0.05 * k)
         robot.saw(0.5, points=seen, times=times, codec="foxglove")
-        job = robot.session.take_frame()
+        job = robot.session.take_job("track")
         return deskew(job.points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
 
     body = deskewed(points, Mount())

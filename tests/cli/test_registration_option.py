@@ -7,8 +7,6 @@ import sys
 import pytest
 
 from coview_stream.cli import main, serve
-from coview_stream.errors import CoViewError
-from coview_stream.stream.node.engine_process import EngineProcess
 
 
 def test_locate_registration_option_names_missing_library(world_file, tmp_path, monkeypatch, capsys):
@@ -25,17 +23,4 @@ def test_serve_passes_registration_option_to_engines(world_file, monkeypatch, gi
     asked = []
     monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
-    assert [options.registration for options in asked] == [wanted]
-
-
-@pytest.mark.slow
-def test_registration_option_reaches_engine_process(world_file):
-    """Which refuses what is no method."""
-    wrong = {"registration": "guesswork"}
-    process = EngineProcess("track", str(world_file), "0" * 64, **wrong)
-    try:
-        process.start()
-        with pytest.raises(CoViewError, match="'guesswork'"):
-            process.wait_ready()
-    finally:
-        process.close()
+    assert [options.localizer.registration.method for options in asked] == [wanted]

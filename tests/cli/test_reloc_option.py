@@ -11,11 +11,10 @@ from coview_stream.basemap.file_format import load, save
 from coview_stream.cli import main, serve
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.network import network
-from coview_stream.errors import CoViewError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.stream.node.engine_process import EngineProcess
-from coview_stream.stream.node.jobs import SearchJob
+from coview_stream.stream.node.engine_queue import SearchJob
 
 
 def test_locate_reloc_learned_on_map_without_features_names_remedy(world_file, tmp_path, capsys):
@@ -38,19 +37,7 @@ def test_serve_passes_reloc_option_to_engines(world_file, monkeypatch, given, wa
     asked = []
     monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
-    assert [options.reloc for options in asked] == [wanted]
-
-
-@pytest.mark.slow
-def test_reloc_option_reaches_engine_process(world_file):
-    """Which refuses what is none."""
-    process = EngineProcess("search", str(world_file), "0" * 64, reloc="guesswork")
-    try:
-        process.start()
-        with pytest.raises(CoViewError, match="'guesswork'"):
-            process.wait_ready()
-    finally:
-        process.close()
+    assert [options.localizer.reloc for options in asked] == [wanted]
 
 
 @pytest.mark.slow
@@ -58,7 +45,7 @@ def test_search_engine_process_uses_learned_features(learned_file, world_drive):
     base_map = BaseMap.load(learned_file)
     localizer = Localizer(base_map, LocalizerConfig(reloc="learned"))
     query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
-    process = EngineProcess("search", str(learned_file), base_map.sha256, reloc="learned")
+    process = EngineProcess("search", str(learned_file), base_map.sha256, LocalizerConfig(reloc="learned"))
     try:
         process.start()
         process.wait_ready()

@@ -12,10 +12,8 @@ from coview_stream.cli import build_parser, main, serve
 from coview_stream.cli.options import acceptance_config
 from coview_stream.config import AcceptanceConfig
 from coview_stream.config.localizer import LEAST_RISK
-from coview_stream.errors import CoViewError
 from coview_stream.localization import offline
 from coview_stream.localization.evidence.words import LEAST
-from coview_stream.stream.node.engine_process import EngineProcess
 
 SERVE = ["serve", "site.coview", "--robot", "r1"]
 LOCATE = ["locate", "site.coview", "run", "-o", "out"]
@@ -47,7 +45,7 @@ def test_serve_passes_risk_option_to_engines(world_file, monkeypatch, given, wan
     asked = []
     monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", "--no-state", *given]) == 0
-    assert [options.risk for options in asked] == [wanted]
+    assert [options.localizer.acceptance.risk for options in asked] == [wanted]
 
 
 def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path, monkeypatch):
@@ -65,16 +63,3 @@ def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path
     assert asked == [1e-6]
     result = json.loads((out / "result.json").read_text())
     assert {each["state"] for each in result["keyframes"]} == {"AMBIGUOUS"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["track", "search"])
-def test_risk_option_reaches_engine_process(world_file, kind):
-    """Which refuses what is none."""
-    process = EngineProcess(kind, str(world_file), "0" * 64, risk=0.7)
-    try:
-        process.start()
-        with pytest.raises(CoViewError, match=r"risk is 0\.7"):
-            process.wait_ready()
-    finally:
-        process.close()

@@ -1,4 +1,4 @@
-"""Accounts of a robot's messages: counters, errors, percentiles of their latency, and those that never arrived."""
+"""Counters of a robot's messages, errors, latencies, rates, and an estimate of the frames that were lost on the way."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import numpy as np
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.messages.validation import OversizedError
 
-# all set by hand
-_MAX_ERRORS = 10  # different ones that are kept
+_MAX_ERRORS = 10  # different errors that a status shows
 _MAX_LOGGED = 20  # errors of one robot's input that are logged, ever: its sender may invent new ones
 _MAX_DURATIONS = 600  # a minute of frames at 10 Hz
 _RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock
-_MAX_SKIPPED = 1000  # numbers that may be missing between two frames: more, and the sender counts anew
-_MAX_GAPS = 15  # newest gaps between frames, whose median is the usual one
-_MIN_GAPS = 5  # before there is a usual one
+_MAX_SKIPPED = 1000  # sequence numbers missing between two frames: more is a sender that counts from the start again
+_MAX_GAPS = 15  # newest gaps between frames, whose median is the usual gap
+_MIN_GAPS = 5  # before there is a usual gap
 _MIN_GAP = 1.5  # usual gaps: a shorter one is jitter
 _MAX_GAP = 100.0  # usual gaps: a longer one is a pause of the sender
 _RATE_WINDOW = 30  # poses over which their rate is taken
@@ -29,31 +28,31 @@ log = logging.getLogger("coview_stream.node")
 
 @dataclass
 class Counters:
-    """Counts of all that can happen to a message; each message is counted once, where it ends.
+    """Counts of everything that can happen to a message; each message is counted once, where it ends.
 
-    ``received`` clouds end as one of the next eleven; up to ten more are under way.
+    Each ``received`` cloud ends as one of the next eleven; up to ten more are under way.
 
     Attributes:
-        received: clouds that came.
-        processed: went through the localizer.
+        received: clouds.
+        processed: clouds that went through the localizer.
         rejected: readable, but of no use to the localizer or to lidar odometry.
         dropped: made room for a newer one.
-        late: older than the odometry that is remembered.
-        out_of_order: stamp before that of the cloud before.
-        duplicate: stamp of the cloud before.
-        no_odometry: none came for the stamp.
-        malformed: not what the encoding says.
+        late: older than the oldest odometry in the buffer.
+        out_of_order: stamped before the previous cloud.
+        duplicate: with the stamp of the previous cloud.
+        no_odometry: no odometry came for the stamp.
+        malformed: does not match its encoding.
         oversized: beyond the limits on bytes or points.
         unknown_encoding: no codec reads it.
         engine_errors: an engine failed at it.
-        missing: clouds that seem never to have arrived, by the sender's numbers or gaps between stamps: an estimate.
-        odometry_received: odometry samples that came, or were made here.
+        missing: estimate of clouds that never arrived, by sequence numbers or gaps between stamps.
+        odometry_received: odometry samples, received or computed here.
         odometry_malformed: likewise.
         odometry_oversized: likewise.
         odometry_unknown_encoding: likewise.
         odometry_duplicate: likewise.
         odometry_out_of_order: likewise.
-        odometry_gaps: pauses in the odometry too long to interpolate across.
+        odometry_gaps: pauses of odometry too long to interpolate across.
         odometry_jumps: samples farther from the one before than a robot can drive.
         clock_restarts: times the sender's clock restarted.
         searches: searches of the whole map.
@@ -105,14 +104,14 @@ class Counters:
 
 
 class ErrorLog:
-    """The newest different errors of one robot's input, each once; the first few are logged as well."""
+    """The newest distinct errors of one robot's input; the first few are logged as well."""
 
     def __init__(self) -> None:
         self.texts: deque[str] = deque(maxlen=_MAX_ERRORS)
         self._logged = 0
 
     def add(self, text: str, logged: bool = True) -> None:
-        """Keep an error unless it is known; ``logged`` is whether this class logs it."""
+        """Add an error unless it is there already; ``logged``: log it as well."""
         if text not in self.texts:
             self.texts.append(text)
             if logged and self._logged < _MAX_LOGGED:
@@ -120,24 +119,24 @@ class ErrorLog:
                 log.warning("%s", text)
 
     def add_first(self, kind: str, text: str) -> None:
-        """Keep only the first error of a kind, where every one would be worded differently."""
+        """Add only the first error of a kind whose texts all differ."""
         start = f"{kind}; the first: "
-        if not any(known.startswith(start) for known in self.texts):
+        if not any(earlier.startswith(start) for earlier in self.texts):
             self.add(start + text)
 
 
 class Latency:
-    """Percentiles of the newest durations."""
+    """Percentiles of the newest 600 durations."""
 
     def __init__(self) -> None:
         self._seconds: deque[float] = deque(maxlen=_MAX_DURATIONS)
 
     def add(self, seconds: float) -> None:
-        """Take in one duration, seconds."""
+        """Add one duration, seconds."""
         self._seconds.append(seconds)
 
     def to_json(self) -> dict[str, float | None]:
-        """p50, p95 and p99 in milliseconds; null before the first."""
+        """Return p50, p95 and p99 in milliseconds; null before the first."""
         if not self._seconds:
             return {"p50": None, "p95": None, "p99": None}
         p50, p95, p99 = np.percentile(list(self._seconds), [50, 95, 99]) * 1e3
@@ -145,14 +144,14 @@ class Latency:
 
 
 class MissingFrames:
-    """Estimate of the frames that never arrived, by the sender's numbers or the usual gap between stamps."""
+    """Estimate of frames that never arrived, by sequence numbers or the usual gap between stamps."""
 
     def __init__(self) -> None:
         self._gaps: deque[int] = deque(maxlen=_MAX_GAPS)
         self._last: tuple[int, int | None] | None = None
 
     def add(self, stamp_ns: int, sequence: int | None) -> int:
-        """Take in a frame; return how many seem to be missing between the last one and this one."""
+        """Add a frame; return how many seem to be missing between the previous one and this one."""
         last = self._last
         if last is not None and last[0] - _RESTART_NS < stamp_ns <= last[0]:
             return 0
@@ -170,7 +169,7 @@ class MissingFrames:
 
 
 def counter_of(error: MessageError) -> str:
-    """Return the name of the counter of a message that cannot be decoded."""
+    """Return the name of the counter of an undecodable message."""
     if isinstance(error, EncodingError):
         return "unknown_encoding"
     return "oversized" if isinstance(error, OversizedError) else "malformed"
@@ -182,7 +181,7 @@ def last_line(text: str) -> str:
 
 
 class PoseRate:
-    """Rate at which poses go out."""
+    """Rate of published poses."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
@@ -197,3 +196,31 @@ class PoseRate:
         if span <= 0.0 or now - self._times[-1] > _MAX_POSE_AGE:
             return 0.0
         return round((len(self._times) - 1) / span, 2)
+
+
+class Rate:
+    """Absolute deadlines of a regular task: one late tick does not delay the later ones.
+
+    Args:
+        rate: ticks per second.
+        now: local time in seconds; the first tick is due at once.
+        slack: seconds by which it may be behind and still catch up.
+    """
+
+    def __init__(self, rate: float, now: float, slack: float = 0.0) -> None:
+        self.period = 1.0 / rate
+        self.slack = slack
+        self.due = now
+
+    def remaining(self, now: float) -> float:
+        """Return the seconds until the next tick, 0 if it is due."""
+        return max(0.0, self.due - now)
+
+    def take_tick(self, now: float) -> bool:
+        """Take the tick that is due, and return whether one was; after a pause of the machine none is caught up."""
+        if now < self.due:
+            return False
+        self.due += self.period
+        if now > self.due + self.slack:
+            self.due = now + self.period
+        return True

@@ -1,4 +1,4 @@
-"""Engine in a process of its own, which is started again when it dies, and ended when it hangs.
+"""Engine in a process of its own, which is started again when it dies, and killed when it hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
 thing that keeps the pose clock of this one steady.
@@ -7,30 +7,36 @@ thing that keeps the pose clock of this one steady.
 from __future__ import annotations
 
 import contextlib
+import os
+import socket
 import subprocess
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
+from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CoViewError
-from coview_stream.stream.node.engine_child import EngineChild, Opening, end
-from coview_stream.stream.node.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import Trust
+    from coview_stream.config import LocalizerConfig
+    from coview_stream.stream.node.engine_queue import Job, Result
     from coview_stream.stream.node.engines import Engine
-    from coview_stream.stream.node.jobs import Job, Result
+
+NICE = {"odometry": 2, "track": 4, "search": 10}
+"""Niceness of the engines, below the pose clock and the receiving threads in the parent. Every pose waits for
+odometry."""
 
 _POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
 
 
 class RejectedError(Exception):
-    """The engine could not use a job's frame, which changes nothing; what comes with it may have been applied."""
+    """The engine could not use a job's frame, which changes nothing; its hints may have been applied."""
 
 
 class FailedError(Exception):
@@ -43,6 +49,73 @@ class DiedError(Exception):
 
 class CancelledError(Exception):
     """The engine is no longer waited for."""
+
+
+class Opening(NamedTuple):
+    """Message that tells a child what to open.
+
+    Attributes:
+        map_path: the map's file.
+        sha256: of the map.
+        config: of the localizers and searches; None for the defaults.
+        trust: demands that the map is signed; None takes any.
+    """
+
+    map_path: str
+    sha256: str
+    config: LocalizerConfig | None = None
+    trust: Trust | None = None
+
+
+class EngineChild:
+    """A process of :mod:`coview_stream.stream.node.worker`, which may be started before map and robots are known.
+
+    It imports its libraries and loads its kernels first, which takes most of its start, and only then waits for its
+    :class:`Opening`: meanwhile the parent reads options, checks the map and opens the network. It is a new interpreter,
+    not a fork, which deadlocks once zenoh is open, nor a spawn, which would import the host's main module.
+
+    Args:
+        kind: ``track``, ``search`` or ``odometry``.
+        nice: added to its niceness; None for that of its kind.
+    """
+
+    def __init__(self, kind: str, nice: int | None = None) -> None:
+        ours, theirs = socket.socketpair()
+        nice = NICE[kind] if nice is None else nice
+        with theirs:
+            self.process = subprocess.Popen(
+                python_command("coview_stream.stream.node.worker", str(theirs.fileno()), kind, str(nice)),
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=engine_environment(kind),
+                start_new_session=True,  # an interrupt at the terminal is for the parent to pass on
+            )
+        self.pipe = Connection(ours.detach())
+
+    def close(self) -> None:
+        """Kill the process, which has nothing to save, and close the pipe."""
+        self.process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout=1.0)
+        with contextlib.suppress(OSError):
+            self.pipe.close()
+
+
+def start_children(lidar_odometry: bool) -> dict[str, EngineChild]:
+    """Start the engines of a node; that of odometry, whose library may be missing, comes first."""
+    return {kind: EngineChild(kind) for kind in NICE if lidar_odometry or kind != "odometry"}
+
+
+def engine_environment(kind: str) -> dict[str, str]:
+    """Return our environment, with this package in reach and few threads, to leave cores to the other engines.
+
+    BLAS has one. The kernels and networks of searches have all cores but one, unless ``COVIEW_THREADS`` is set: they
+    are always busy while a robot is off the map, and work with deadlines needs a free core.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = {"COVIEW_THREADS": str(max(1, cores - 1))} if kind == "search" else {}
+    ours = {name: value for name, value in python_environment().items() if name != "NOTIFY_SOCKET"}  # the node notifies
+    return threads | ours | {"OPENBLAS_NUM_THREADS": "1"}
 
 
 class EngineRunner(Protocol):
@@ -63,11 +136,11 @@ class EngineRunner(Protocol):
         ...
 
     def watch(self) -> None:
-        """Look after the engine while it has no job, never waiting; one that died is reported once, then started."""
+        """Check the engine while it has no job, never waiting; a dead one is reported once, then started."""
         ...
 
     def end_stopped(self) -> None:
-        """End an engine that somebody has stopped, which may do no more jobs; called from any thread, now and then."""
+        """Kill an engine that is stopped or hangs; called from any thread, once a second."""
         ...
 
     def close(self) -> None:
@@ -81,16 +154,13 @@ class EngineProcess:
     Args:
         kind: ``track``, ``search`` or ``odometry``.
         map_path: the map's file, which every process maps for itself.
-        sha256: of the map; a file that was replaced meanwhile is refused, or poses would be of another map than said.
-        nice: added to the child's niceness, so that the clock here is never late; None for that of its kind.
-        registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
-        reloc: recognizers that propose the places to search at.
-        risk: probability of a wrong place below which a search gives one.
-        sensor_leans: whether sensors may lean against odometry's gravity.
-        job_timeout: seconds after which a job counts as hung; set by hand.
-        open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
+        sha256: of the map; a file that was replaced meanwhile is refused, or poses would be of another map than stated.
+        config: of the localizers and searches; None for the defaults.
         trust: demands that the map is signed; None takes any.
-        child: started before, to be the first one; None starts one.
+        child: the first child, started before; None starts one.
+        nice: added to the child's niceness; None for that of its kind.
+        job_timeout: seconds after which a job counts as hung.
+        open_timeout: seconds after which opening the map, or preparing for the first job, does.
     """
 
     def __init__(
@@ -98,57 +168,49 @@ class EngineProcess:
         kind: str,
         map_path: str,
         sha256: str,
-        nice: int | None = 0,
-        job_timeout: float = 30.0,
-        open_timeout: float = 120.0,
-        registration: RegistrationMethod = "trimmed-icp",
-        reloc: Reloc = "auto",
-        risk: float = AcceptanceConfig.risk,
-        sensor_leans: bool = True,
+        config: LocalizerConfig | None = None,
+        *,
         trust: Trust | None = None,
         child: EngineChild | None = None,
+        nice: int | None = None,
+        job_timeout: float = 30.0,
+        open_timeout: float = 120.0,
     ) -> None:
         self.kind = kind
-        self.map_path = map_path
-        self.sha256 = sha256
+        self.opening = Opening(map_path, sha256, config, trust)
         self.nice = nice
         self.job_timeout = job_timeout
         self.open_timeout = open_timeout
-        self.registration = registration
-        self.reloc = reloc
-        self.risk = risk
-        self.sensor_leans = sensor_leans
-        self.trust = trust
-        self._started = child
+        self._prestarted = child
         self._closed = False
         self._lock = threading.Lock()
-        self._child: subprocess.Popen[bytes] | None = None
-        self._pipe: Connection | None = None
+        self._child: EngineChild | None = None
         self._awaited: list[str] = []  # messages that a fresh child has yet to send
-        self._stopped: int | None = None  # process that was seen stopped when last looked at
-        self._watchdog = Watchdog(f"coview-watch-{kind}", self._kill)
+        self._stopped: int | None = None  # process that was stopped at the previous check
+        self._deadline = float("inf")  # local time at which the present job counts as hung
+        self._hung = False
 
     @property
     def pid(self) -> int | None:
         """Process id of the child, None while there is none."""
-        return self._child.pid if self._child else None
+        child = self._child
+        return child.process.pid if child else None
 
     @property
     def ready(self) -> bool:
-        """Whether the child has opened the map and prepared for jobs, as far as it has been asked."""
-        return self._pipe is not None and not self._awaited
+        """Whether the child has opened the map and prepared for jobs."""
+        return self._child is not None and not self._awaited
 
     def start(self) -> None:
         """Start the child without waiting until it is ready."""
         with self._lock:
             if self._closed:
                 raise DiedError(f"the {self.kind} engine has been closed")
-            started, self._started = self._started or EngineChild(self.kind, self.nice), None
-            self._child, self._pipe = started.take()
+            child, self._prestarted = self._prestarted or EngineChild(self.kind, self.nice), None
+            self._child = child
             self._awaited = ["ready", "prepared"]
             with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
-                asked = (self.registration, self.reloc, self.risk, self.sensor_leans, self.trust)
-                self._pipe.send(Opening(self.map_path, self.sha256, *asked))
+                child.pipe.send(self.opening)
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.
@@ -163,13 +225,24 @@ class EngineProcess:
             self._await("ready", cancelled)
 
     def wait_prepared(self, cancelled: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a job would not wait any more; asks and raises what :meth:`wait_ready` does."""
+        """Wait until a job would not wait any more; arguments and errors as of :meth:`wait_ready`."""
         for message in list(self._awaited):
             self._await(message, cancelled)
 
+    def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
+        with self._exchange(self.open_timeout) as pipe:
+            while not pipe.poll(_POLL_INTERVAL):
+                if cancelled():
+                    raise CancelledError(f"the {self.kind} engine is no longer wanted")
+                self.end_hung_job()
+            kind, value = pipe.recv()
+        if kind == "error":
+            raise CoViewError(value)
+        self._awaited.remove(message)
+
     def run(self, job: Job) -> Result:
-        """Do one job; a child that died before is started again first."""
-        if self._pipe is None:
+        """Do one job; a dead child is started again first."""
+        if self._child is None:
             self.start()
         try:
             self.wait_prepared()
@@ -181,21 +254,37 @@ class EngineProcess:
             kind, value = pipe.recv()
         return unwrap(kind, value)
 
-    def watch(self) -> None:
-        """Look after the child while there is no job, without waiting: it may have become ready, or died.
+    @contextmanager
+    def _exchange(self, seconds: float) -> Iterator[Connection]:
+        """Yield the pipe; sending, waiting and receiving may all hang, and together have ``seconds``."""
+        child = self._child
+        self._deadline, self._hung = time.monotonic() + seconds, False
+        try:
+            if child is None:
+                raise EOFError
+            yield child.pipe
+        except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
+            self._end()
+            end = f"had no answer for {seconds:g} s and was ended" if self._hung else "died"
+            raise DiedError(f"the {self.kind} engine {end}") from error
+        finally:
+            self._deadline = float("inf")
 
-        A child that died is reaped and reported once; the next call starts another one, so that the next job finds it.
-        By the thread that runs the jobs.
+    def watch(self) -> None:
+        """Check the child while there is no job, without waiting: it may have become ready, or died.
+
+        A dead child is reaped and reported once; the next call starts another one, in time for the next job. By the
+        thread that runs the jobs.
 
         Raises:
             DiedError: it died, or could not open the map, and says why.
         """
-        child, pipe = self._child, self._pipe
-        if child is None or pipe is None:
+        child = self._child
+        if child is None:
             self.start()
             return
         try:
-            while self._awaited and pipe.poll():
+            while self._awaited and child.pipe.poll():
                 self._await(self._awaited[0])
         except CoViewError as error:
             self._end()
@@ -203,70 +292,44 @@ class EngineProcess:
         except OSError as error:  # closed by another thread meanwhile
             self._end()
             raise DiedError(f"the {self.kind} engine died") from error
-        if child.poll() is not None:
+        if (code := child.process.poll()) is not None:
             self._end()
-            raise DiedError(f"the {self.kind} engine died ({_cause(child.returncode)})")
+            cause = f"by signal {-code}" if code < 0 else f"exit code {code}"
+            raise DiedError(f"the {self.kind} engine died ({cause})")
 
     def end_stopped(self) -> None:
-        """Kill a child that has been stopped (SIGSTOP, a full terminal) for two calls in a row; Linux only.
+        """Kill a child whose job takes too long, or that has been stopped for two calls in a row (SIGSTOP; Linux only).
 
-        It would hold up the jobs until the time limit of one, and robots with them.
+        A stopped one would hold up the jobs until the time limit of one, and robots with them.
         """
+        self.end_hung_job()
         child = self._child
-        pid = None if child is None or child.returncode is not None else child.pid
-        stopped = pid if pid is not None and _is_stopped(pid) else None
+        running = child is not None and child.process.returncode is None
+        stopped = child.process.pid if child is not None and running and _is_stopped(child.process.pid) else None
         if child is not None and stopped is not None and stopped == self._stopped:
-            child.kill()
+            child.process.kill()
         self._stopped = stopped
 
+    def end_hung_job(self) -> None:
+        """Kill a child whose job takes too long."""
+        child = self._child
+        if child is not None and time.monotonic() >= self._deadline:
+            self._hung = True
+            child.process.kill()
+
     def close(self) -> None:
-        """Kill the child at once; it keeps nothing that would have to be saved."""
+        """Kill the child at once; it has nothing to save."""
         with self._lock:
             self._closed = True
-        if self._started is not None:
-            self._started.close()
+        if self._prestarted is not None:
+            self._prestarted.close()
         self._end()
-        self._watchdog.close()
-
-    def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
-        with self._exchange(self.open_timeout) as pipe:
-            while not pipe.poll(_POLL_INTERVAL):
-                if cancelled():
-                    raise CancelledError(f"the {self.kind} engine is no longer wanted")
-            kind, value = pipe.recv()
-        if kind == "error":
-            raise CoViewError(value)
-        self._awaited.remove(message)
-
-    @contextmanager
-    def _exchange(self, seconds: float) -> Iterator[Connection]:
-        """Yield the pipe; sending, waiting and receiving may all hang, and together have ``seconds``."""
-        pipe = self._pipe
-        try:
-            if pipe is None:
-                raise EOFError
-            with self._watchdog.limit(seconds):
-                yield pipe
-        except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
-            self._end()
-            hung = f" had no answer for {seconds:g} s and was ended"
-            raise DiedError(f"the {self.kind} engine{hung if self._watchdog.acted else ' died'}") from error
-
-    def _kill(self) -> None:
-        child = self._child
-        if child is not None:
-            child.kill()
 
     def _end(self) -> None:
         with self._lock:
             child, self._child = self._child, None
-            pipe, self._pipe = self._pipe, None
-        end(child, pipe)
-
-
-def _cause(code: int) -> str:
-    """Return how a process ended, by its exit code."""
-    return f"by signal {-code}" if code < 0 else f"exit code {code}"
+        if child is not None:
+            child.close()
 
 
 def _is_stopped(pid: int) -> bool:
@@ -290,7 +353,7 @@ def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
 
 
 def unwrap(kind: str, value: Any) -> Result:
-    """Return the result or raise what :func:`attempt` caught."""
+    """Return the result or raise the error of :func:`attempt`."""
     if kind == "done":
         result: Result = value
         return result

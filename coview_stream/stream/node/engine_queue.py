@@ -1,39 +1,168 @@
-"""Queue of one robot's frames and search requests to the engines: the two mailboxes between the processes."""
+"""One robot's frames and search requests for the engines, their jobs, and the order of robots at an engine."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.result import Fix
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.search.request import Epoch, SearchRequest
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State
+from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last_line
-from coview_stream.stream.node.frame_sync import PairedFrame
-from coview_stream.stream.node.jobs import FrameJob, FrameResult, SearchJob
-from coview_stream.stream.node.scheduling import SearchDemand
+from coview_stream.stream.node.inputs import OdometryJob, OdometryResult, PairedFrame
+from coview_stream.stream.node.last_place import PlaceHints
+
+# of searches
+_PATIENCE = 1.5  # seconds after which a waiting keyframe comes before all that have waited less
+_NEW = 8  # searches in which a robot counts as newly lost; most are found within them
+_MAX_SUPPORT = 16  # searches in a row that propose a place: with more, the map has another one like it
 
 
 @dataclass(frozen=True)
-class QueuedFrame:
+class FrameJob:
+    """One lidar frame for the tracking engine.
+
+    Attributes:
+        robot: name.
+        epoch: number of the robot's odometry frame; a new one makes the engine forget the robot's place.
+        stamp_ns: sensor time, nanoseconds.
+        points: (N, 3) float32 body frame, metres.
+        T_odom_body: (4, 4) odometry at the stamp.
+        times: (N,) seconds after the stamp at which each point was measured; None for no deskewing.
+        segment: odometry while the frame was measured; goes with ``times``.
+        require_verification: give no pose before this frame has verified the place.
+        search_result: of an earlier search, to be applied first.
+        defer: frames wait for the engine: put off all work that can wait.
+        hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
+        guess: of the place by somebody; tried, never trusted.
+        calibration: of its sensor and odometry at ``hint``, a prior.
+        first_epoch: the first one since a client reset the robot; another one makes the engine forget the calibration
+            as well.
+    """
+
+    robot: str
+    epoch: int
+    stamp_ns: int
+    points: Points
+    T_odom_body: Pose
+    times: Floats | None = None
+    segment: Segment | None = None
+    require_verification: bool = False
+    search_result: SearchResult | None = None
+    defer: bool = False
+    hint: Pose | None = None
+    guess: PlaceGuess | None = None
+    calibration: Calibration | None = None
+    first_epoch: int = 0
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The tracking engine's answer to a frame.
+
+    Attributes:
+        fix: after the frame.
+        request: keyframe to search for; None for none.
+        seconds: that the engine took.
+        events: changes of the engine's state since its last answer for this robot and epoch, in order.
+    """
+
+    fix: Fix
+    request: SearchRequest | None
+    seconds: float
+    events: tuple[Event, ...]
+
+
+@dataclass(frozen=True)
+class SearchJob:
+    """One keyframe of a robot for the search engine."""
+
+    robot: str
+    request: SearchRequest
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the frame's job."""
+        return self.request.epoch[0]
+
+
+Job: TypeAlias = FrameJob | SearchJob | OdometryJob
+Result: TypeAlias = FrameResult | SearchResult | OdometryResult
+
+
+class SearchDemand(NamedTuple):
+    """A robot's waiting keyframe, for the order of searches.
+
+    Attributes:
+        since: local time in seconds from which a keyframe has been waiting, this one or one that it replaced.
+        searches: number of searches since the robot was lost.
+        support: how many of the newest of them, in a row, proposed a place.
+    """
+
+    since: float
+    searches: int = 0
+    support: int = 0
+
+
+def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
+    """Return the robots of ``demands`` that want a search, in the order of their turns.
+
+    A keyframe that has waited for 1.5 s comes first, the oldest before the others: no robot waits much longer, unless
+    the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been proposed comes
+    before those that are newly lost, for it needs the fewest further searches, and these before those that have been
+    searched for in vain for long.
+
+    Args:
+        demands: of each robot; None for no demand.
+        now: local time in seconds.
+    """
+
+    def rank(demand: SearchDemand) -> tuple[bool, int, bool, float]:
+        overdue = now - demand.since >= _PATIENCE
+        support = demand.support if demand.support <= _MAX_SUPPORT and not overdue else 0
+        new = overdue or demand.searches < _NEW
+        return not overdue, -support, not new, demand.since
+
+    return [k for _, k in sorted((rank(demand), k) for k, demand in enumerate(demands) if demand is not None)]
+
+
+class RoundRobin:
+    """Order in which robots, numbered from 0, are served by one engine: the longest wait first."""
+
+    def __init__(self, count: int) -> None:
+        self._last_turn = [0] * count
+        self._turns = 0
+
+    def order(self) -> list[int]:
+        """Return the robots in the order in which they may be served now."""
+        return sorted(range(len(self._last_turn)), key=self._last_turn.__getitem__)
+
+    def serve(self, k: int) -> None:
+        """Count the turn that robot ``k`` has now."""
+        self._turns += 1
+        self._last_turn[k] = self._turns
+
+
+class QueuedFrame(NamedTuple):
     """A frame for the tracking engine, waiting or under way.
 
     Attributes:
         job: the frame, as the engine gets it.
-        received: local time at which it came, seconds.
+        paired: the frame with its odometry.
         waiting_since: local time from which on a frame of this robot has been waiting.
-        travelled: metres that odometry had driven when it was taken.
-        turned: radians that odometry had turned.
     """
 
     job: FrameJob
-    received: float
+    paired: PairedFrame
     waiting_since: float
-    travelled: float
-    turned: float
 
 
 class EngineQueue:
@@ -45,89 +174,86 @@ class EngineQueue:
 
     Attributes:
         epoch: number of the robot's odometry frame.
-        latency: from the coming of a cloud to its fix.
-        engine_latency: the part of it that the engine took.
-        longest_wait: seconds that a frame of this robot has been waiting, at most.
-        longest_search_wait: seconds that a keyframe of this robot has been waiting for its search and that has taken,
-            at most; one that is replaced by a newer one waits on.
+        latency: from the arrival of a cloud to its fix.
+        engine_latency: the engine's part of it.
+        longest_wait: most seconds that a frame of this robot has been waiting.
+        longest_search_wait: most seconds from a keyframe's arrival to the end of its search; a keyframe that replaces
+            another one inherits its wait.
         processed_at: local time of the newest fix; None before the first.
-        considered: places that the newest search has considered; None once there is a place, or another epoch.
+        considered: places of the newest search; None once there is a place, or another epoch.
     """
 
     def __init__(self, robot: str, epoch: int, counters: Counters, errors: ErrorLog) -> None:
         """Begin with nothing to do in odometry epoch ``epoch``, which no job of this robot has had before."""
         self.robot = robot
-        self.epoch = epoch
-        self._first_epoch = epoch
+        self._first_epoch = self.epoch = epoch
         self._counters = counters
         self._errors = errors
-        self.latency = Latency()
-        self.engine_latency = Latency()
+        self.latency, self.engine_latency = Latency(), Latency()
         self.longest_wait = self.longest_search_wait = 0.0
         self.processed_at: float | None = None
+        self._search_epoch: Epoch | None = None
+        self._searches = self._support = 0  # in that epoch, as of SearchDemand
+        self._forget_epoch()
+
+    def _forget_epoch(self) -> None:
         self.considered: Considered | None = None
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
         self._search_result: SearchResult | None = None
-        self._search_epoch: Epoch | None = None
-        self._searches = self._support = 0  # in that epoch, as SearchDemand says
-        self._forget_searches()
-
-    def _forget_searches(self) -> None:
-        """Drop the request that waits, and forget the one under way."""
         self._request: SearchRequest | None = None
         self._requested_at: float | None = None  # local time from which a keyframe has been waiting
-        self._searching_since: float | None = None  # the same of the keyframe that is being searched for
+        self._searching_since: float | None = None  # the same of the keyframe under way
 
     def begin_epoch(self, epoch: int) -> None:
-        """Drop what waits, and forget what is under way: there is another odometry frame."""
+        """Drop all frames and requests, waiting or under way: there is another odometry frame."""
         self._counters.dropped += self._frame is not None
         self.epoch = epoch
-        self._frame = self._frame_under_way = self._search_result = self.considered = None
-        self._forget_searches()
+        self._forget_epoch()
 
     # ---- frames for the tracking engine
 
-    def put_frame(self, frame: PairedFrame, now: float, travelled: float, turned: float) -> None:
-        """Make a frame the next one; one that waits already is dropped, and the engine is behind."""
-        message, before = frame.message, self._frame
-        self._counters.dropped += before is not None
+    def put_frame(self, frame: PairedFrame, now: float) -> None:
+        """Make a frame the next one; a frame that waits already is dropped, and the engine is behind."""
+        message, waiting = frame.message, self._frame
+        self._counters.dropped += waiting is not None
         job = FrameJob(
-            self.robot, self.epoch, message.stamp_ns, message.points, frame.T_odom_body, message.times,
-            frame.segment, defer=before is not None, first_epoch=self._first_epoch,
-        )  # fmt: skip
-        waiting_since = now if before is None else before.waiting_since
-        self._frame = QueuedFrame(job, frame.received, waiting_since, travelled, turned)
+            robot=self.robot,
+            epoch=self.epoch,
+            stamp_ns=message.stamp_ns,
+            points=message.points,
+            T_odom_body=frame.T_odom_body,
+            times=message.times,
+            segment=frame.segment,
+            defer=waiting is not None,
+            first_epoch=self._first_epoch,
+        )
+        self._frame = QueuedFrame(job, frame, now if waiting is None else waiting.waiting_since)
 
     @property
     def has_frame(self) -> bool:
-        """Whether a frame may be taken."""
+        """Whether a frame may be taken; without the lock: perhaps no more."""
         return self._frame is not None and self._frame_under_way is None
 
-    def take_frame(
-        self,
-        require_verification: bool,
-        hint: Pose | None = None,
-        calibration: Calibration | None = None,
-        guess: PlaceGuess | None = None,
-    ) -> FrameJob | None:
+    def take_frame(self, require_verification: bool, hints: PlaceHints) -> FrameJob | None:
         """Hand out the newest frame, with the result of a search if one has come; None while one is under way."""
         if self._frame is None or self._frame_under_way is not None:
             return None
+        hint = hints.pending
         job = replace(
             self._frame.job,
             require_verification=require_verification,
             search_result=self._search_result,
             hint=hint,
-            guess=guess,
-            calibration=None if hint is None else calibration,
+            guess=hints.pending_guess,
+            calibration=None if hint is None else hints.calibration,
         )
-        self._frame_under_way = replace(self._frame, job=job)
+        self._frame_under_way = self._frame._replace(job=job)
         self._frame = self._search_result = None
         return job
 
     def frame_done(self, job: FrameJob, result: FrameResult, now: float) -> QueuedFrame | None:
-        """Count a frame's fix, and queue what it asks to search for; return the frame if its fix still matters."""
+        """Count a frame's fix and queue its search request; return the frame if its fix still matters."""
         if job.epoch < self._first_epoch:
             return None
         self._counters.processed += 1
@@ -137,7 +263,7 @@ class EngineQueue:
         if job.epoch != self.epoch or frame is None:
             return None
         self._frame_under_way = None
-        self.latency.add(now - frame.received)
+        self.latency.add(now - frame.paired.received)
         self.longest_wait = max(self.longest_wait, now - frame.waiting_since)
         if result.fix.state.has_place:
             self._request = self._requested_at = self.considered = None
@@ -146,7 +272,7 @@ class EngineQueue:
         return frame
 
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> bool:
-        """Count a frame of no use (``rejected``) or that the engine failed at; return whether that still matters."""
+        """Count a frame of no use (``rejected``) or an engine's failure at it; return whether that still matters."""
         if job.epoch < self._first_epoch:
             return False
         self._counters.count("rejected" if rejected else "engine_errors")
@@ -162,7 +288,7 @@ class EngineQueue:
     # ---- requests for the search engine
 
     def put_search_request(self, request: SearchRequest, now: float) -> None:
-        """Make a request the next one; one that waits already is skipped, and its wait goes on."""
+        """Make a request the next one; a request that waits already is skipped, and its wait goes on."""
         self._counters.searches_skipped += self._request is not None
         if request.epoch != self._search_epoch:
             self._search_epoch, self._requested_at = request.epoch, None
@@ -172,7 +298,7 @@ class EngineQueue:
 
     @property
     def search_demand(self) -> SearchDemand | None:
-        """Demand for a search; None while there is nothing to search for, or a search is under way."""
+        """Demand for a search; None without a keyframe, or while a search is under way. Without the lock."""
         since = self._requested_at
         if since is None or self._searching_since is not None:
             return None
@@ -190,7 +316,7 @@ class EngineQueue:
     def search_done(self, job: SearchJob, result: SearchResult, now: float) -> None:
         """Count a search; its result goes with the next frame.
 
-        An acceptance that still waits is kept: a result after it comes from a search that began again.
+        An acceptance that still waits goes before a later result, which comes from a search that began again.
         """
         if job.epoch < self._first_epoch:
             return
@@ -202,7 +328,7 @@ class EngineQueue:
         self._searching_since = None
         self.considered = result.considered
         if result.accepted is not None:
-            self._request = self._requested_at = None  # what came meanwhile need not be searched for
+            self._request = self._requested_at = None  # a keyframe that came meanwhile need not be searched for
         if job.request.epoch == self._search_epoch:
             self._searches += 1
             self._support = self._support + 1 if result.evidence.state is State.AMBIGUOUS else 0

@@ -1,19 +1,21 @@
-"""Engines of many robots on one map: the quick one tracks, the slow one searches.
+"""Engines of many robots: the quick one tracks, the slow one searches, a third one computes lidar odometry.
 
-They share nothing but the map's file, so each can have a process of its own: a search must delay neither the
-frames of other robots nor the pose clock. A third one, :mod:`coview_stream.stream.node.odometry_engine`, needs no map.
+They share nothing but the map's file, so each can have a process of its own: a search must delay neither the frames of
+other robots nor the pose clock. The odometry engine needs no map.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import Trust
 from coview_stream.config import LocalizerConfig
+from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
@@ -23,9 +25,11 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 from coview_stream.odometry.deskew import deskew
-from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, Result, SearchJob
+from coview_stream.odometry.lidar_odometry import KissRegistration, LidarOdometry, ScanRegistration
+from coview_stream.stream.node.engine_queue import FrameJob, FrameResult, Job, Result, SearchJob
+from coview_stream.stream.node.inputs import OdometryJob, OdometryResult
 
-_CROPS = 24  # of the map with their search grids, shared by all robots; set by hand
+_CROPS = 24  # of the map with their search grids, shared by all robots
 
 
 class Engine(Protocol):
@@ -167,6 +171,64 @@ class SearchEngine:
         """Do nothing: all jobs are alike."""
 
 
+class OdometryEngine:
+    """One :class:`LidarOdometry` per robot.
+
+    Args:
+        registration: made for each robot.
+
+    Raises:
+        DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
+    """
+
+    kernels: tuple[str, ...] = ()
+    later_kernels: tuple[str, ...] = ()
+
+    def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
+        self._registration = registration
+        self._robots: dict[str, tuple[int, LidarOdometry]] = {}
+        self._trajectories: dict[str, tuple[int, int]] = {}  # epoch and restarts at the newest pose
+        registration(LidarOdometryConfig())  # a missing library shows now rather than at the first frame
+
+    def run(self, job: Job) -> OdometryResult:
+        """Return the odometry of one frame.
+
+        Raises:
+            CloudError, RunError: it cannot be placed; the next one may be.
+        """
+        if not isinstance(job, OdometryJob):
+            raise TypeError(f"{type(job).__name__}: the odometry engine makes odometry")
+        begin = time.perf_counter()
+        lidar = self._lidar(job)
+        pose = lidar.step(job.points, job.times, job.stamp_ns * 1e-9)
+        trajectory = job.epoch, lidar.restarts
+        restarted = self._trajectories.get(job.robot) != trajectory
+        self._trajectories[job.robot] = trajectory
+        points = None if job.times is None else lidar.points
+        return OdometryResult(pose, points, restarted, time.perf_counter() - begin)
+
+    def forget(self, robot: str) -> None:
+        """Drop a robot's odometry."""
+        self._robots.pop(robot, None)
+        self._trajectories.pop(robot, None)
+
+    def prepare(self) -> None:
+        """Do nothing: local maps grow with the frames."""
+
+    def prepare_later(self) -> None:
+        """Do nothing."""
+
+    def _lidar(self, job: OdometryJob) -> LidarOdometry:
+        """Return the robot's lidar odometry, which begins again with a new epoch."""
+        epoch, lidar = self._robots.get(job.robot, (None, None))
+        if lidar is None:
+            lidar = LidarOdometry(job.config, self._registration(job.config))
+        elif epoch != job.epoch:
+            lidar.reset()
+        self._robots[job.robot] = job.epoch, lidar
+        return lidar
+
+
 def kernels_of(kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return first and later kernels of the engine ``track``, ``search`` or ``odometry``, which need not be open."""
     if kind == "odometry":
@@ -189,8 +251,6 @@ def open_engine(
             features, which cannot be used.
     """
     if kind == "odometry":
-        from coview_stream.stream.node.odometry_engine import OdometryEngine
-
         return OdometryEngine()
     if config is not None and config.registration.method == "gicp":
         gicp.library()

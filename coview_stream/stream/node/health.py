@@ -1,4 +1,4 @@
-"""Health of a node for its operators: whether it lives and can serve, and its metrics, as JSON and for Prometheus."""
+"""Health of a node for its operators: a document over zenoh and HTTP, and metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
+from coview_stream.stream.maps.map_follower import MapFollower
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.http_server import HttpServer, Reply
@@ -22,25 +23,27 @@ from coview_stream.version import __version__
 
 log = logging.getLogger(__name__)
 
-_MAX_BEAT = 2.0  # seconds without a tick of the pose clock, besides two of its periods; set by hand
-_INTERVAL = 1.0  # seconds between two documents; set by hand
+_MAX_BEAT = 2.0  # seconds without a tick of the pose clock, besides two of its periods
+_INTERVAL = 1.0  # seconds between two documents
 
 
 class NodeHealth:
     """Health and metrics of a node.
 
-    It is *live* as long as its pose clock ticks and none of its threads has ended: one that is not has to be started
-    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, and where it was
-    told to connect to something, it is connected.
+    It is *live* as long as its pose clock ticks and none of its threads has ended: otherwise it has to be started
+    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, and it is connected
+    if it was told to connect.
 
     Args:
         node: the node.
-        needs_connection: whether it was told to connect to something.
+        needs_connection: whether it was told to connect to a router or peer.
+        follower: of the map's sources elsewhere; None of a map that is here.
     """
 
-    def __init__(self, node: Node, needs_connection: bool = False) -> None:
+    def __init__(self, node: Node, needs_connection: bool = False, follower: MapFollower | None = None) -> None:
         self._node = node
         self._needs_connection = needs_connection
+        self._follower = follower
         self._errors = RateLimitedErrors(log)
 
     def live_reasons(self) -> list[str]:
@@ -63,7 +66,7 @@ class NodeHealth:
         return reasons
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return everything as plain data; of robots, those that this node serves."""
         node = self._node
         live, ready = self.live_reasons(), self.ready_reasons()
         feed = node.feeds[0]
@@ -75,7 +78,7 @@ class NodeHealth:
             "live": {"ok": not live, "reasons": live},
             "ready": {"ok": not (live or ready), "reasons": live + ready},
             "map": {"sha256": node.map_sha256, "reload": dict(node.reloader.last) if node.reloader else None}
-            | ({"source": dict(node.map_follower.last)} if node.map_follower else {}),
+            | ({"source": dict(self._follower.last)} if self._follower else {}),
             "memory_bytes": _memory(os.getpid()),
             "engines": {
                 name: {
@@ -90,14 +93,14 @@ class NodeHealth:
                 session.keys.robot: {
                     "state": session.state()[0].reported,
                     "reason": session.state()[1],
-                    "served_by": None if (of := node.elections) is None else of.served_by(session.keys.robot),
-                    "serves": of is None or of.served_by(session.keys.robot) == of.node,
-                    "pose_rate_hz": node.pose_rates[session.keys.robot].rate(now),
+                    "served_by": node.identity.node,
+                    "serves": True,
+                    "pose_rate_hz": node.reporter.rates[session.keys.robot].rate(now),
                     "latency_ms": session.queue.latency.to_json(),
                     "counters": session.counters.to_json(),
                 }
                 for session in list(node.sessions)
-                if node.endpoints[session.keys.robot].active
+                if node.endpoints[session.keys.robot].serving
             },
         }
 
@@ -110,7 +113,7 @@ class NodeHealth:
         """Publish the document once a second until ``stopping`` is set."""
         publisher = self._node.transport.publisher(keys.health, "report")
         while not stopping.wait(_INTERVAL):
-            with self._errors.catch("health"):  # what cannot be told once must not end the telling
+            with self._errors.catch("health"):  # one document that fails must not end the others
                 publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
 
 
@@ -125,8 +128,8 @@ def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> Http
         return Reply(prometheus_text(document()).encode(), "text/plain; version=0.0.4; charset=utf-8")
 
     def health(_: str) -> Reply:
-        found = document()
-        return Reply(f"{json.dumps(found)}\n".encode(), "application/json", 200 if found["ready"]["ok"] else 503)
+        plain = document()
+        return Reply(f"{json.dumps(plain)}\n".encode(), "application/json", 200 if plain["ready"]["ok"] else 503)
 
     routes = {"/metrics": metrics, "/health": health}
     server = HttpServer(address, routes, ("--metrics", METRICS_ADDRESS), open_to_names=True)

@@ -1,7 +1,7 @@
-"""The node: threads and clocks between the sessions of the robots and the engines.
+"""The node: threads and clocks between the sessions of the robots and the engines, and the change of its map.
 
-Who waits for whom: the transport's threads decode and queue; one thread feeds each engine and waits for it; the pose
-clock and the status clock wait for neither.
+The transport's threads decode and queue; one thread feeds each engine and waits for it; the pose clock and the status
+clock wait for neither.
 """
 
 from __future__ import annotations
@@ -12,124 +12,135 @@ import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.stream.maps.map_follower import MapFollower
-from coview_stream.stream.node.counters import PoseRate
-from coview_stream.stream.node.election import Elections
+from coview_stream.errors import CoViewError
+from coview_stream.localization.state import State
+from coview_stream.stream.node.counters import Rate
 from coview_stream.stream.node.engine_feed import EngineFeed
-from coview_stream.stream.node.engine_process import EngineRunner
-from coview_stream.stream.node.fleet import FleetShares
-from coview_stream.stream.node.jobs import Job
-from coview_stream.stream.node.robot_endpoints import RobotEndpoints
-from coview_stream.stream.node.scheduling import Rate
+from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineRunner
+from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
-from coview_stream.stream.node.status import Reporter
+from coview_stream.stream.node.status import NodeIdentity, Reporter
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
 
-_MAX_POSE_TICKS = 200.0  # of the pose clock, per second; set by hand, as are those below
+_MAX_POSE_TICKS = 200.0  # of the pose clock, per second
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
-_JOIN_TIMEOUT = 0.3  # of these, for the threads to finish what they are at
+_JOIN_TIMEOUT = 0.3  # of these, for the threads to finish their work
+_MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map while the new one has not verified its place
+_STEP = 0.02  # seconds between two looks at a change of the map
+
+Service = Callable[[threading.Event], None]
+"""Work on a thread of its own, until the event is set."""
 
 
-class Reloader(Protocol):
-    """Changes the map of a running node: :class:`~coview_stream.stream.node.reload.MapReloader`."""
+class OpenedMap(NamedTuple):
+    """A map with engines that are ready for jobs.
 
-    @property
-    def last(self) -> dict[str, Any]:
-        """What became of the newest change."""
-        ...
+    Attributes:
+        sha256: of the map.
+        engines: by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``.
+        sessions: one per robot, in the node's order; none of them has had a message.
+        file: that it was opened from; None where nobody reads it.
+    """
 
-    def request(self) -> dict[str, Any]:
-        """Ask for a change; return at once."""
-        ...
+    sha256: str
+    engines: Mapping[str, EngineRunner]
+    sessions: Sequence[Session]
+    file: Path | None = None
+
+
+OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
+"""Opens the map's file again, unless its hash is the one given; the function returns True to give up."""
 
 
 class Node:
     """Serves several robots on one map.
 
     Args:
-        sessions: one per robot.
+        opened: the map.
         transport: where messages come from and go to; the node closes it.
-        track: runs the jobs of the tracking engine.
-        search: runs those of the search engine.
         config: rates and limits.
         pose_format: codec of the poses; None leaves it to each robot's keys.
-        odometry: runs the jobs of the odometry engine, for robots that send none; None if there are none.
-        background: what else has a thread of its own, by name; each runs until the event that it is given is set.
-        elections: whether this node or another one serves a robot; None: this one serves them all.
+        geo: publishes poses as places on Earth as well; None: does not.
+        shared: a fleet says which robots this node serves; else it serves them all.
+        open_map: opens the map again, at a reload; None if there is no way to.
+        on_reload: called with True when a change of the map begins, with False when it is over.
+        map_files: file of the map by its hash; the node adds those of later maps.
 
     Attributes:
-        sessions: one per robot, those in force; the list given, whose items another map replaces.
+        sessions: one per robot, those in force.
+        identity: of the node, in its statuses.
         started: local time at which it was made.
-        elections: as given.
         beat: local time at which the pose clock has ticked last.
-        reloader: changes the map; None if there is no way to open one.
-        map_follower: has it changed when its source elsewhere changes; None of a map that is here.
-        map_files: what the map was opened from, by its hash; also of one that is to take its place.
+        reporter: publishes the statuses.
+        endpoints: of each robot, by its name.
+        reloader: changes the map; None if there is no way to.
         feeds: of the engines of the map that is served, and of another that is to take its place.
     """
 
     def __init__(
         self,
-        sessions: Sequence[Session],
+        opened: OpenedMap,
         transport: Transport,
-        track: EngineRunner,
-        search: EngineRunner,
         config: NodeConfig | None = None,
+        *,
         pose_format: str | None = None,
-        odometry: EngineRunner | None = None,
-        background: Mapping[str, Callable[[threading.Event], None]] | None = None,
-        elections: Elections | FleetShares | None = None,
+        geo: GeoOutput | None = None,
+        shared: bool = False,
+        open_map: OpenMap | None = None,
+        on_reload: Callable[[bool], None] = lambda busy: None,
+        map_files: dict[str, Path] | None = None,
     ) -> None:
-        self.sessions = sessions if isinstance(sessions, list) else list(sessions)  # in place: others look at it
+        self.sessions = list(opened.sessions)
         self.transport = transport
         self.config = config or NodeConfig()
+        self.identity = NodeIdentity(period=round(1.0 / self.config.status_rate, 3))
+        self.map_files: dict[str, Path] = {} if map_files is None else map_files
+        self._shared = shared
         self._errors = RateLimitedErrors(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._background = dict(background or {})
-        self.elections = elections
-        self._reporter = Reporter(self.sessions, transport, self._errors, elections)
-        engines = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
-        self.feeds: tuple[EngineFeed, ...] = (self.make_feed(self.sessions, engines),)
+        self._ending: threading.Thread | None = None
+        self.reporter = Reporter(self.sessions, transport, self._errors, self.identity)
+        self.feeds: tuple[EngineFeed, ...] = (self._make_feed(opened),)
         self._robots = [
-            RobotEndpoints(session, transport, self._reporter, self._wake_engines_for, pose_format, elections)
+            RobotEndpoints(session, transport, self.reporter, self._wake_engines_for, pose_format, geo)
             for session in self.sessions
         ]
         self.endpoints = {robot.session.keys.robot: robot for robot in self._robots}
-        self._ending: threading.Thread | None = None
+        self.reloader = None if open_map is None else MapReloader(self, open_map, on_reload)
         self.started = self.beat = time.monotonic()
-        self.reloader: Reloader | None = None
-        self.map_follower: MapFollower | None = None
-        self.map_files: Mapping[str, Path] = {}
 
     # ---- life
 
-    def start(self) -> None:
-        """Declare everything and start the threads."""
+    def start(self, services: Mapping[str, Service] | None = None) -> None:
+        """Declare everything and start the threads, those of ``services`` by name as well."""
         self.declare()
         for feed in self.feeds:
             feed.start()
-        self._start_thread("poses", self._run_pose_clock)
-        self._start_thread("status", self._reporter.run, self.config.status_rate, self._stopping)
-        for name, run in self._background.items():
-            self._start_thread(name, run, self._stopping)
-
-    def _start_thread(self, name: str, target: Callable[..., None], *args: object) -> None:
-        thread = threading.Thread(target=target, name=f"coview-{name}", args=args, daemon=True)
-        thread.start()
-        self._threads.append(thread)  # now, for one that has not started counts as one that has ended
+        running = {"poses": self._run_pose_clock, "status": self._run_reporter} | dict(services or {})
+        if self.reloader is not None:
+            running["reload"] = self.reloader.run
+        for name, run in running.items():
+            thread = threading.Thread(target=run, name=f"coview-{name}", args=(self._stopping,), daemon=True)
+            thread.start()
+            self._threads.append(thread)  # now, for one that has not started counts as one that has ended
 
     def declare(self) -> None:
         """Declare publishers, subscriptions, queryables and liveliness tokens of all robots."""
         node_id = uuid.uuid4().hex
+        map_view = MapViewAnswer(self.map_files, lambda: self.map_sha256) if self.map_files else None
         for number, robot in enumerate(self._robots, 1):
             robot.declare(node_id, number)
+            if map_view is not None:
+                self.transport.answer(robot.session.keys.map_view, map_view)
+            if not self._shared:
+                robot.begin_serving()
 
     def close(self, timeout: float = _CLOSE_TIMEOUT) -> bool:
         """Publish a last status, undeclare, end the engines; later calls only wait.
@@ -139,7 +150,7 @@ class Node:
         """
         if not self._stopping.is_set():
             self._stopping.set()
-            self._reporter.changed.set()
+            self.reporter.changed.set()
             for feed in self.feeds:
                 feed.stop()
             self._ending = threading.Thread(target=self._end, name="coview-end", daemon=True)
@@ -154,31 +165,8 @@ class Node:
         last = time.monotonic() + _JOIN_TIMEOUT
         for thread in self._threads:
             thread.join(timeout=max(0.0, last - time.monotonic()))
-        self._reporter.publish_last(time.monotonic())
+        self.reporter.publish_last(time.monotonic())
         self.transport.close()
-
-    # ---- the engines
-
-    def _wake_engines_for(self, session: Session) -> None:
-        for feed in self.feeds:
-            feed.wake_for(session)
-
-    def next_job(self, engine: str) -> tuple[Session, Job] | None:
-        """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
-        return self.feeds[0].next_job(engine)
-
-    def work(self, engine: str, session: Session, job: Job) -> None:
-        """Do one job; see :meth:`EngineFeed.work`."""
-        self.feeds[0].work(engine, session, job)
-
-    def watch(self, engine: str) -> None:
-        """Look after an engine without a job; see :meth:`EngineFeed.watch`."""
-        self.feeds[0].watch(engine)
-
-    @property
-    def map_sha256(self) -> str:
-        """Hash of the map that is served; during a change of the map, of the one before."""
-        return self.feeds[0].sessions[0].map_sha256
 
     @property
     def ended_threads(self) -> list[str]:
@@ -186,64 +174,34 @@ class Node:
         threads = [*self._threads, *(thread for feed in self.feeds for thread in feed.threads)]
         return [t.name for t in threads if not (t.is_alive() or self._stopping.is_set())]
 
-    @property
-    def pose_rates(self) -> dict[str, PoseRate]:
-        """Rates at which the poses of each robot go out."""
-        return self._reporter.rates
+    # ---- the engines
 
-    def run_beside(self, name: str, run: Callable[[threading.Event], None]) -> None:
-        """Add something that has a thread of its own, to be started with the others."""
-        self._background[name] = run
+    def _make_feed(self, opened: OpenedMap) -> EngineFeed:
+        return EngineFeed(opened.sessions, opened.engines, self._errors, self._note_change)
 
-    def make_feed(self, sessions: Sequence[Session], engines: Mapping[str, EngineRunner]) -> EngineFeed:
-        """Return a feed of engines whose robots are this node's."""
-        return EngineFeed(sessions, engines, self._errors, self._note_change)
+    def _wake_engines_for(self, session: Session) -> None:
+        for feed in self.feeds:
+            feed.wake_for(session)
 
     def _note_change(self, session: Session | None) -> None:
         if session is None:
-            self._reporter.changed.set()
+            self.reporter.changed.set()
         elif session in self.sessions:  # else it is of a map that is not in force yet
-            self._reporter.report_change(session)
+            self.reporter.report_change(session)
 
-    def reload(self) -> dict[str, Any]:
-        """Ask for the map's file to be opened again; ``ok`` is False where this node cannot."""
-        if self.reloader is None:
-            return {"ok": False, "error": "this node was not made with a way to open a map"}
-        return self.reloader.request()
+    # ---- the clocks
 
-    # ---- another map, beside the one that is served
+    def _run_reporter(self, stopping: threading.Event) -> None:
+        self.reporter.run(self.config.status_rate, stopping)
 
-    def add_map(self, feed: EngineFeed) -> None:
-        """Have the robots' messages go to the sessions and engines of another map as well, which publish nothing."""
-        for left in self.feeds[1:]:  # of a change that failed half way
-            left.close(_JOIN_TIMEOUT)
-        self.feeds = (self.feeds[0], feed)
-        for robot, session in zip(self._robots, feed.sessions, strict=True):
-            robot.add_session(session)
-        feed.start()
-
-    def switch_robot(self, number: int) -> None:
-        """Publish from now on what the other map's session says of a robot, the ``number``-th."""
-        robot = self._robots[number]
-        robot.switch_session()
-        self.sessions[number] = robot.session
-        self._reporter.changed.set()
-
-    def drop_map(self) -> None:
-        """End the engines of the first map, when all robots are on the other one."""
-        old, self.feeds = self.feeds[0], self.feeds[1:]
-        old.close(_JOIN_TIMEOUT)
-
-    # ---- the pose clock
-
-    def _run_pose_clock(self) -> None:
+    def _run_pose_clock(self, stopping: threading.Event) -> None:
         # robots are served one after the other over the period: poses of many at once are more than the queues of
         # zenoh and of a router hold for urgent messages, and those that came last would be dropped
         rate = self.config.pose_rate
         groups = max(1, min(len(self._robots), int(_MAX_POSE_TICKS / rate)))
         clock = Rate(rate * groups, time.monotonic(), slack=0.5 / rate)
         group = 0
-        while not self._stopping.wait(clock.remaining(time.monotonic())):
+        while not stopping.wait(clock.remaining(time.monotonic())):
             self.beat = now = time.monotonic()
             if clock.take_tick(now):
                 self.publish_poses(now, self._robots[group::groups])
@@ -254,3 +212,145 @@ class Node:
         for robot in self._robots if robots is None else robots:
             with self._errors.catch(robot.session.keys.robot):
                 robot.publish_pose(now)
+
+    # ---- another map
+
+    @property
+    def map_sha256(self) -> str:
+        """Hash of the map that is served; during a change of the map, of the one before."""
+        return self.feeds[0].sessions[0].map_sha256
+
+    def reload(self) -> dict[str, Any]:
+        """Ask for the map's file to be opened again; ``ok`` is False where this node cannot."""
+        if self.reloader is None:
+            return {"ok": False, "error": "this node was not made with a way to open a map"}
+        return self.reloader.request()
+
+    def add_map(self, opened: OpenedMap) -> None:
+        """Hand the robots' messages to the sessions and engines of another map as well, which publish nothing."""
+        for feed in self.feeds[1:]:  # of a change that failed half way
+            feed.close(_JOIN_TIMEOUT)
+        added = self._make_feed(opened)
+        self.feeds = (self.feeds[0], added)
+        for robot, session in zip(self._robots, opened.sessions, strict=True):
+            robot.add_session(session)
+        added.start()
+
+    def switch_robot(self, number: int) -> None:
+        """Publish from now on the poses of the ``number``-th robot on the other map."""
+        robot = self._robots[number]
+        robot.switch_session()
+        self.sessions[number] = robot.session
+        self.reporter.changed.set()
+
+    def drop_map(self) -> None:
+        """End the engines of the first map, when all robots are on the other one."""
+        old, self.feeds = self.feeds[0], self.feeds[1:]
+        old.close(_JOIN_TIMEOUT)
+
+
+class MapReloader:
+    """Changes the map of a running node when asked to, one change at a time, on a thread of its own.
+
+    Each robot keeps the old map, and its poses, until the new one has verified its place: both get all messages
+    meanwhile, and the place on the old map is a hypothesis on the new one. A robot without a place changes at once, one
+    that is not found on the new map after a minute changes without a place, and is searched for.
+
+    Args:
+        node: the node; its map is the old one.
+        open_map: opens the new map.
+        on_change: called with True when a change begins, with False when it is over.
+
+    Attributes:
+        last: outcome of the newest change: ``result`` (``none``, ``loading``, ``handing over``, ``changed``,
+            ``unchanged``, ``refused`` or ``failed``), ``map_sha256`` and ``error``.
+        max_handover: most seconds that a robot keeps the old map.
+    """
+
+    def __init__(self, node: Node, open_map: OpenMap, on_change: Callable[[bool], None] = lambda busy: None) -> None:
+        self._node = node
+        self._open_map = open_map
+        self._on_change = on_change
+        self._asked = threading.Event()
+        self._busy = False
+        self.max_handover = _MAX_HANDOVER
+        self.last: dict[str, Any] = {"result": "none", "map_sha256": node.map_sha256, "error": None}
+
+    @property
+    def outcome(self) -> str:
+        """Result of the newest change that was asked for: as of :attr:`last`, ``loading`` until it is over."""
+        return "loading" if self._busy or self._asked.is_set() else str(self.last["result"])
+
+    def request(self) -> dict[str, Any]:
+        """Ask for a change; return the newest outcome. Asked for during a change, another one follows."""
+        self._asked.set()
+        return {"ok": True, "busy": self._busy, "last": dict(self.last)}
+
+    def run(self, stopping: threading.Event) -> None:
+        """Change the map whenever that is asked for, until ``stopping`` is set."""
+        while not stopping.is_set():
+            if not self._asked.wait(0.1):
+                continue
+            self._busy = True
+            self._asked.clear()
+            self._on_change(True)
+            try:
+                self._change(stopping)
+            except Exception as error:  # the next one is to be answered all the same
+                self._note("failed", repr(error))
+                log.exception("the change of the map failed")
+            finally:
+                self._busy = False
+                self._on_change(False)
+
+    def _note(self, result: str, error: str | None = None) -> None:
+        self.last = {"result": result, "map_sha256": self._node.map_sha256, "error": error}
+
+    def _change(self, stopping: threading.Event) -> None:
+        self._note("loading")
+        log.info("loading the map again")
+        try:
+            opened = self._open_map(self._node.map_sha256, stopping.is_set)
+        except CancelledError:
+            return
+        except (CoViewError, DiedError, OSError, MemoryError) as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            self._note("refused", why)
+            log.error("the new map is refused, going on with the one before: %s", why)
+            return
+        except Exception as error:
+            self._note("refused", repr(error))
+            log.exception("the new map is refused, going on with the one before")
+            return
+        if opened is None:
+            self._note("unchanged")
+            log.info("the map has not changed")
+            return
+        self._note("handing over")
+        begin = time.monotonic()
+        try:
+            files = self._node.map_files
+            for sha256 in files.keys() - {self._node.map_sha256}:
+                files.pop(sha256)
+            if opened.file is not None:
+                files[opened.sha256] = opened.file
+            for old, new in zip(self._node.sessions, opened.sessions, strict=True):
+                new.begin_beside(old)
+            self._node.add_map(opened)
+        except BaseException:
+            for engine in opened.engines.values():
+                engine.close()
+            raise
+        waiting = dict(enumerate(opened.sessions))
+        while waiting and not stopping.wait(_STEP):
+            for number, new in list(waiting.items()):
+                verified = new.state()[0] is State.TRACKING
+                has_place = self._node.sessions[number].state()[0].has_place
+                if verified or not has_place or time.monotonic() - begin > self.max_handover:
+                    self._node.switch_robot(number)
+                    del waiting[number]
+        if waiting:
+            return  # the node ends, and all engines with it
+        self._node.drop_map()
+        self._note("changed")
+        log.info("map %s is in force after %.1f s", opened.sha256[:16], time.monotonic() - begin)

@@ -1,23 +1,32 @@
-"""Endpoints of one robot on the network."""
+"""Endpoints of one robot on the network, and their answers: poses, places on Earth, statuses, the view of the map."""
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
-from coview_stream.errors import InputError
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.map_parts import MapParts
+from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
+from coview_stream.clouds.reference_system import GeoReference
+from coview_stream.errors import CoViewError, InputError, MapError
+from coview_stream.geometry.transforms import yaw_of
 from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.messages import encode_pose
-from coview_stream.messages.types import Encoded, PoseMessage, Sample
-from coview_stream.stream.node.election import Elections
-from coview_stream.stream.node.fleet import FleetShares
-from coview_stream.stream.node.initial_pose import decode_guess, guess_of_fields
+from coview_stream.messages import encode_location, encode_pose
+from coview_stream.messages.types import Encoded, LocationMessage, PoseMessage, Sample
+from coview_stream.stream.node.last_place import decode_guess, guess_of_fields
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport import rmw
 from coview_stream.stream.transport.transport import Publisher, Transport
+
+log = logging.getLogger("coview_stream.node")
 
 _ROS_NODE = "coview_stream"
 
@@ -31,7 +40,7 @@ class RobotEndpoints:
         reporter: publishes the robot's status.
         wake_engines: called with the session when there may be a job.
         pose_format: codec of the poses; None leaves it to the robot's keys.
-        elections: whether this node serves it; None: it does.
+        geo: publishes poses as places on Earth as well; None: does not.
     """
 
     def __init__(
@@ -41,9 +50,8 @@ class RobotEndpoints:
         reporter: Reporter,
         wake_engines: Callable[[Session], None],
         pose_format: str | None = None,
-        elections: Elections | FleetShares | None = None,
+        geo: GeoOutput | None = None,
     ) -> None:
-        self._elections = elections
         self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
         self._switching = threading.Lock()  # no pose of the session before is published after the switch
         self._transport = transport
@@ -51,10 +59,9 @@ class RobotEndpoints:
         self._wake_engines = wake_engines
         self._pose_format = pose_format or session.keys.pose_format
         self._bare = session.keys.bare and pose_format is None
+        self._geo = geo
         self._publisher: Publisher | None = None
-        self.beside: list[Callable[[PoseMessage], None]] = []  # called with every pose that goes out
-        self.waits = False
-        """Whether it listens only from :meth:`listen` on, not once it is declared."""
+        self._locations: Publisher | None = None
         self._endings: list[Callable[[], None]] = []  # of subscriptions
 
     @property
@@ -67,19 +74,27 @@ class RobotEndpoints:
         self._sessions = (self._sessions[0], session)
 
     def switch_session(self) -> None:
-        """Go over to that session, which goes on from what the one in force has counted and published."""
+        """Go over to that session, with the counters and the newest pose of the one in force."""
         with self._switching:
             old, new = self._sessions
             new.continue_from(old)
             self._sessions = (new,)
 
+    # ---- declarations
+
     def declare(self, node_id: str, number: int) -> None:
-        """Declare everything; ``node_id`` is of our ROS node, and ``number`` of this robot there, from 1."""
+        """Declare everything but the inputs; ``node_id`` is of our ROS node, ``number`` of this robot there, from 1."""
         keys, transport = self.session.keys, self._transport
-        self._publisher = self._pose_publisher(node_id, number)
+        self._publisher = transport.publisher(keys.pose, "realtime")
+        if keys.rmw:
+            token = rmw.publisher_token(keys.pose, node_id, _ROS_NODE, number)
+            if number == 1:
+                transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), node_id, _ROS_NODE))
+            transport.announce(token)
+            self._publisher = rmw.RmwPublisher(self._publisher, token, time.time_ns)
+        if self._geo is not None:
+            self._locations = transport.publisher(keys.location, "data")
         self._reporter.declare(self.session)
-        if not self.waits:
-            self.listen()
         transport.answer(keys.relocalize, self.relocalize)
         transport.answer(keys.reset, self.reset)
         transport.answer(keys.suggest, self.suggest)
@@ -87,61 +102,50 @@ class RobotEndpoints:
         transport.announce(keys.alive)
 
     @property
-    def listening(self) -> bool:
-        """Whether clouds and odometry are taken in."""
+    def serving(self) -> bool:
+        """Whether this node serves the robot: takes its clouds and odometry in, and publishes poses and statuses."""
         return bool(self._endings)
 
-    @property
-    def active(self) -> bool:
-        """Whether this node serves the robot or stands by for it; not where another node of its fleet serves it."""
-        return self.listening or not self.waits
-
-    def listen(self) -> None:
+    def begin_serving(self) -> None:
         """Take clouds and odometry in from now on."""
-        keys, transport = self.session.keys, self._transport
-        if self.session.odometry_source == "robot":
-            self._endings.append(transport.subscribe(keys.odometry, self.on_odometry, "all"))
-        self._endings.append(transport.subscribe(keys.cloud, self.on_cloud, "newest"))
+        keys = self.session.keys
+        if self.session.inputs.odometry_source == "robot":
+            self._endings.append(self._transport.subscribe(keys.odometry, self.on_odometry, "all"))
+        self._endings.append(self._transport.subscribe(keys.cloud, self.on_cloud, "newest"))
+        self._reporter.served.add(keys.robot)
 
-    def stop_listening(self) -> None:
+    def end_serving(self) -> None:
         """Take no clouds and no odometry in: nobody has to send them here."""
+        self._reporter.served.discard(self.session.keys.robot)
         endings, self._endings = self._endings, []
         for end in endings:
             end()
 
-    def _pose_publisher(self, node_id: str, number: int) -> Publisher:
-        keys = self.session.keys
-        publisher = self._transport.publisher(keys.pose, "realtime")
-        if not keys.rmw:
-            return publisher
-        token = rmw.publisher_token(keys.pose, node_id, _ROS_NODE, number)
-        if number == 1:
-            self._transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), node_id, _ROS_NODE))
-        self._transport.announce(token)
-        return rmw.RmwPublisher(publisher, token, time.time_ns)
+    # ---- messages
 
     def on_cloud(self, sample: Sample) -> None:
         """Take in a cloud."""
-        self._note_heard()
         for session in self._sessions:
             session.on_cloud(sample, time.monotonic())
             self._wake_engines(session)
 
     def on_odometry(self, sample: Sample) -> None:
         """Take in an odometry sample."""
-        self._note_heard()
         for session in self._sessions:
             session.on_odometry(sample, time.monotonic())
             self._wake_engines(session)
 
-    def _note_heard(self) -> None:
-        if self._elections is not None:
-            self._elections.hear_robot(self.session.keys.robot)
+    def on_initial_pose(self, sample: Sample) -> None:
+        """Take in a guess of the place."""
+        try:
+            self._guess(decode_guess(sample))
+        except InputError as error:
+            self.session.errors.add_first(f"{sample.key}: initial poses of no use", str(error))
 
     def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/relocalize``."""
         for session in self._sessions:
-            session.relocalize()
+            session.restart_search("asked to search again", forget=True)
         return self._answer()
 
     def reset(self, parameters: dict[str, str]) -> dict[str, Any]:
@@ -156,13 +160,6 @@ class RobotEndpoints:
         note = "" if taken else "the place is known, the guess is ignored; ask rpc/relocalize first"
         return self._answer() | {"taken": taken, "note": note}
 
-    def on_initial_pose(self, sample: Sample) -> None:
-        """Take in a guess of the place."""
-        try:
-            self._guess(decode_guess(sample))
-        except InputError as error:
-            self.session.errors.add_first(f"{sample.key}: initial poses of no use", str(error))
-
     def _guess(self, guess: PlaceGuess) -> bool:
         taken = [session.guess_place(guess) for session in self._sessions]  # all of them
         return any(taken)
@@ -172,22 +169,115 @@ class RobotEndpoints:
         state, reason = self.session.state()
         return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
 
+    # ---- poses
+
     def publish_pose(self, now: float) -> None:
         """Let time pass in the session, and publish the pose if it is known."""
-        if not self.active:
+        if not self.serving:
             return
         with self._switching:
-            self._publish_pose(now)
+            for session in self._sessions:
+                session.tick(now)
+            pose = self.session.pose()
+            if pose is not None and self._publisher is not None:
+                encoded = encode_pose(pose, self._pose_format)
+                self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
+                if self._geo is not None and self._locations is not None:
+                    self._geo.publish(pose, self._locations)
+                self._reporter.rates[pose.robot].add(now)
         self._reporter.report_change(self.session)
 
-    def _publish_pose(self, now: float) -> None:
-        for session in self._sessions:
-            session.tick(now)
-        robot = self.session.keys.robot
-        serves = self._elections is None or self._elections.claim(robot) is not None
-        if serves and self._publisher is not None and (pose := self.session.pose()) is not None:
-            encoded = encode_pose(pose, self._pose_format)
-            self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
-            for take in self.beside:
-                take(pose)
-            self._reporter.rates[robot].add(now)
+
+class GeoOutput:
+    """Publication of poses as places on Earth, by the reference system of the map in force, which may change.
+
+    Args:
+        files: of the maps that the node has opened, by their hashes.
+        sha256: of the map to begin with.
+        encoding: of the messages.
+
+    Raises:
+        InputError, DependencyError: as of :class:`GeoReference`.
+    """
+
+    def __init__(self, files: Mapping[str, Path], sha256: str, encoding: str) -> None:
+        self._files = files
+        self._encoding = encoding
+        self._lock = threading.Lock()
+        loaded = BaseMap.load(files[sha256], check=False)
+        self._sha256, self._references = loaded.sha256, _references(loaded)
+
+    def publish(self, pose: PoseMessage, publisher: Publisher) -> None:
+        """Publish a pose, where the map has a reference and the pose a place on Earth."""
+        geo = self.reference(pose.map_sha256, pose.frame_id)
+        if geo is not None and (message := location_of(pose, geo)) is not None:
+            publisher.put(encode_location(message, self._encoding))
+
+    def reference(self, sha256: str, name: str = "") -> GeoReference | None:
+        """Return the reference of a map by its hash, and of several maps by the name of the one; None for none."""
+        with self._lock:
+            if sha256 != self._sha256:
+                try:
+                    loaded = BaseMap.load(self._files[sha256], check=False)
+                    self._sha256, self._references = loaded.sha256, _references(loaded)
+                except (CoViewError, KeyError) as error:
+                    log.warning("no latitude and longitude on the new map: %s", error)
+                    self._sha256, self._references = sha256, {}
+            if sha256 != self._sha256:  # the file is of another map by now
+                return None
+            return self._references.get(name, self._references.get(""))
+
+
+def _references(base_map: BaseMap) -> dict[str, GeoReference]:
+    """Return the references of a map's parts by name; of one map its own, without a name."""
+    parts = MapParts.of(base_map.parameters)
+    if parts is None:
+        return {"": GeoReference(base_map.crs)}
+    return {part.name: GeoReference(part.crs) for part in parts}
+
+
+def location_of(pose: PoseMessage, geo: GeoReference) -> LocationMessage | None:
+    """Return a pose as a place on Earth; None where it has none."""
+    position = pose.T_map_body[:3, 3]
+    latitude, longitude, height = geo.geodetic(position[None])[0].tolist()
+    if not np.isfinite([latitude, longitude, height]).all():
+        return None
+    return LocationMessage(
+        stamp_ns=pose.stamp_ns,
+        robot=pose.robot,
+        latitude=latitude,
+        longitude=longitude,
+        height=height,
+        heading=geo.heading(position, yaw_of(pose.T_map_body)),
+        covariance=geo.enu_covariance(position, pose.covariance),
+        confidence=pose.confidence,
+    )
+
+
+class MapViewAnswer:
+    """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.summary.MapView.to_json` of the map that is served.
+
+    Args:
+        files: of the maps that the node has opened, by their hashes.
+        sha256: returns the hash of the map that is served.
+    """
+
+    def __init__(self, files: Mapping[str, Path], sha256: Callable[[], str]) -> None:
+        self._files = files
+        self._sha256 = sha256
+        self._made: tuple[str, dict[str, Any]] | None = None
+
+    def __call__(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Return the view; it is made once for each map.
+
+        Raises:
+            MapError: the file cannot be read, or is of another map than the one that is served.
+        """
+        served = self._sha256()
+        if self._made is None or self._made[0] != served:
+            path = self._files[served]
+            base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
+            if base_map.sha256 != served:
+                raise MapError(f"{path}: the file is of another map than the one that is served")
+            self._made = served, MapView.of(base_map, POINTS_ON_WIRE).to_json()
+        return self._made[1]

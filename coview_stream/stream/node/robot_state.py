@@ -1,4 +1,4 @@
-"""State of one robot as its node publishes it: what is known of its place, why, and how that has changed."""
+"""State of one robot as its node publishes it: the engine's state, and the vetoes of the session."""
 
 from __future__ import annotations
 
@@ -13,53 +13,67 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
-from coview_stream.localization.state import Event, State, next_state
+from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.engine_queue import QueuedFrame
-from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
+from coview_stream.stream.node.last_place import PlaceHints
 
 _NS = 1_000_000_000
-_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all; set by hand
+_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all
 
-_RESTORING = (Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED)
-"""Events that end DOUBTED and LOST, if the engine has a pose after the frame that brings them and the frame counts."""
+
+def session_state(engine: State | None, lost: bool, unverified: bool) -> State:
+    """Return the state of a robot.
+
+    Args:
+        engine: state of the tracking engine in this odometry epoch; None before its first frame.
+        lost: the place was lost, and no fix has restored it yet.
+        unverified: after a pause of odometry, no frame has verified the place yet.
+    """
+    if lost:
+        return State.LOST
+    if engine is State.TRACKING and unverified:
+        return State.DOUBTED
+    return engine or State.SEARCHING
 
 
 class RobotState:
     """State and odometry correction of one robot, from one reset of its session to the next; the session locks it.
 
-    The state follows from the events of the tracking engine and from those that only the session sees: odometry that
-    pauses, restarts or stays away. The newest fix tells what the engine itself holds in this odometry epoch.
-
     Attributes:
-        state: of the robot; there is a pose while it is TRACKING.
         last_frame_ns: stamp of the newest processed frame; None before the first.
-        calibration: what is corrected of its sensor and odometry at the newest frame, in every state.
+        calibration: of its sensor and odometry at the newest frame, in every state.
     """
 
-    def __init__(self, robot: str, map_sha256: str, counters: Counters, hint: PoseHint) -> None:
-        """Begin in SEARCHING; ``hint`` outlives resets."""
+    def __init__(self, robot: str, map_sha256: str, counters: Counters, hints: PlaceHints) -> None:
+        """Begin in SEARCHING; ``hints`` outlive resets."""
         self.robot = robot
         self.map_sha256 = map_sha256
-        self.state = State.SEARCHING
         self.last_frame_ns: int | None = None
         self.calibration: Calibration | None = None
-        self._hint = hint
+        self._hints = hints
         self._counters = counters
+        self._lost = False
         self._loss_reason = ""
         self._restart_reason = ""
         self._forget_epoch()
 
     def _forget_epoch(self) -> None:
         """Forget all that refers to the odometry frame, which has ended."""
-        self._hint.begin_epoch()
+        self._hints.begin_epoch()
         self._fix: Fix | None = None
         self._correction: OdomCorrection | None = None
         self._verify_from_ns: int | None = None  # frames from this stamp on may verify the place
         self._published: PoseMessage | None = None
+
+    @property
+    def state(self) -> State:
+        """State of the robot; there is a pose while it is TRACKING."""
+        engine = None if self._fix is None else self._fix.state
+        return session_state(engine, self._lost, self.requires_verification)
 
     @property
     def evidence(self) -> KeyframeEvidence | None:
@@ -79,59 +93,53 @@ class RobotState:
     # ---- events
 
     def add_fix(self, fix: Fix, frame: QueuedFrame, events: Sequence[Event]) -> None:
-        """Apply the engine's ``events`` up to a frame, in order, and the fix after it."""
+        """Apply the fix after a frame; the engine's ``events`` up to it say how often the place was lost."""
         stamp_ns = self.last_frame_ns = frame.job.stamp_ns
-        before, lost_before = self.state, self._fix is not None and self._fix.state is State.LOST
+        before, engine_before = self.state, None if self._fix is None else self._fix.state
+        reason = fix.evidence.reason if fix.evidence else "evidence gone"
+        if Event.PLACE_GIVEN_UP in events and engine_before is not State.LOST:
+            self._lose(reason)  # else a place accepted with this same frame was given up: no second loss
         self._fix = fix
+        self._lost |= fix.state is State.LOST
         self.calibration = fix.calibration or self.calibration
         asked = frame.job.require_verification
         if asked and self._verify_from_ns is not None and stamp_ns >= self._verify_from_ns:
             self._verify_from_ns = None  # from here on a doubt is the engine's own
-        verified = fix.state is State.TRACKING and self._verify_from_ns is None
-        for event in events:
-            if event is Event.PLACE_GIVEN_UP:
-                if not lost_before:  # else that place was accepted with this same frame, and is no second loss
-                    self._lose(event, fix.evidence.reason if fix.evidence else "evidence gone")
-            elif verified or event not in _RESTORING or self.state not in (State.DOUBTED, State.LOST):
-                self._apply(event)
-        if verified:
+        if fix.state is State.TRACKING and self._verify_from_ns is None:
+            self._lost = False
             self._counters.fixes += before is not State.TRACKING
-            self._correction = OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned)
-            self._hint.update(self._correction.T_map_body, self.calibration)
+            self._correction = OdomCorrection.of(fix, stamp_ns, frame.paired.travelled, frame.paired.turned)
+            self._hints.verified(self._correction.T_map_body, self.calibration)
 
     def restart_search(self, reason: str) -> None:
         """Forget the place: there is another odometry frame."""
         if self.engine_has_place:
             self._loss_reason = reason
-        self._apply(Event.ODOMETRY_RESTARTED)
+        if self.state.has_place:
+            self._lose(reason)
         self._restart_reason = f"searching anew: {reason}"
         self._forget_epoch()
 
     def require_verification(self, from_ns: int) -> None:
         """Give no pose until a frame stamped ``from_ns`` or later has verified the place."""
         self._verify_from_ns = from_ns if self._verify_from_ns is None else max(self._verify_from_ns, from_ns)
-        self._apply(Event.VERIFICATION_REQUIRED)
 
     def on_silence(self, reason: str, newest_ns: int) -> None:
         """Lose the place until a frame from after the odometry of ``newest_ns`` has verified it."""
+        self._lose(reason)
         self._verify_from_ns = newest_ns + 1
-        self._lose(Event.SILENCE, reason)
 
     def explain_loss(self, reason: str) -> None:
         """Give a newer reason for a loss, if the place is lost: why it does not come back."""
         if self.state is State.LOST:
             self._loss_reason = reason
 
-    def _lose(self, event: Event, reason: str) -> None:
-        """Lose the place for a reason, which replaces that of a loss before; a loss for two reasons counts once."""
-        self._loss_reason = reason
-        self._apply(event)
+    def _lose(self, reason: str) -> None:
+        """Lose the place; a loss for two reasons counts once, and the newer reason replaces the older."""
+        self._counters.losses += self.state is not State.LOST
+        self._lost, self._loss_reason = True, reason
 
-    def _apply(self, event: Event) -> None:
-        before, self.state = self.state, next_state(self.state, event)
-        self._counters.losses += self.state is State.LOST and before is not State.LOST
-
-    # ---- what is published
+    # ---- published
 
     def reason(self) -> str | None:
         """Return one clause that gives the reason of the state; None before the first frame has been processed."""
@@ -152,13 +160,12 @@ class RobotState:
         return self._correction if self.state is State.TRACKING else None
 
     def pose(self, odometry: OdometryBuffer) -> PoseMessage | None:
-        """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING."""
-        correction, before = self.correction, self._published
-        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
-        if pose is None or (before is not None and pose.stamp_ns < before.stamp_ns):
+        """Return the newest odometry, corrected, with its stamp, to be published; None unless TRACKING."""
+        pose, previous = self.newest_pose(odometry), self._published
+        if pose is None or (previous is not None and pose.stamp_ns < previous.stamp_ns):
             return None
-        if before is not None and pose.stamp_ns == before.stamp_ns:
-            pose = before  # never publish two different poses for one stamp
+        if previous is not None and pose.stamp_ns == previous.stamp_ns:
+            pose = previous  # never publish two different poses for one stamp
         self._published = pose
         self._counters.poses += 1
         return pose
@@ -167,40 +174,36 @@ class RobotState:
         """Publish nothing older than another state has, nor another pose for the same stamp."""
         self._published = other._published
 
+    def newest_pose(self, odometry: OdometryBuffer) -> PoseMessage | None:
+        """Return the newest odometry, corrected; None unless TRACKING."""
+        correction = self.correction
+        return None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
+
     def age(self, odometry: OdometryBuffer) -> float | None:
-        """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
+        """Return seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
         newest, correction = odometry.newest, self.correction
         return None if newest is None or correction is None else correction.age(newest.stamp_ns)
 
     def protection_level(self, odometry: OdometryBuffer) -> ProtectionLevel | None:
-        """Protection level of the pose at the newest odometry; None unless TRACKING."""
-        correction = self.correction
-        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
+        """Return the protection level of the pose at the newest odometry; None unless TRACKING."""
+        pose = self.newest_pose(odometry)
         return None if pose is None else pose.protection
-
-    def last_known_pose(self, odometry: OdometryBuffer) -> LastKnownPose:
-        """Return where the robot is, if that is known, for the next start of the node."""
-        correction, forgotten = self.correction, self._hint.forgotten
-        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
-        if pose is None:
-            return LastKnownPose(forgotten)
-        return LastKnownPose(forgotten, pose.stamp_ns, pose.T_map_body, self.calibration)
 
 
 @dataclass(frozen=True)
 class OdomCorrection:
-    """Correction of odometry: the newest verified ``T_map_odom``, and how far odometry had driven at its frame.
+    """Correction of odometry: the newest verified ``T_map_odom``, and the odometry's way up to its frame.
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, source frame of the map.
         T_map_body: (4, 4) map <- body at the frame that it comes from.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame.
-        confidence: probability, in [0, 1], of the place, as the search that found it has it.
-        verified_ns: stamp of the newest registration that spoke for it.
+        confidence: probability of the place, in [0, 1], of the search that accepted it.
+        verified_ns: stamp of the newest registration that supported it.
         travelled: metres that odometry had driven at the frame.
         turned: radians that it had turned.
-        drift: how fast it seems to drift.
-        doubt: times as wide as the covariance alone has it is the protection level.
+        drift: estimate of its drift.
+        doubt: factor on the protection level that the covariance alone gives.
     """
 
     T_map_odom: Pose
@@ -218,19 +221,24 @@ class OdomCorrection:
         """Make it of a fix that has a pose; ``stamp_ns`` is its frame's."""
         if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
-        doubt = 1.0 if fix.protection is None else fix.protection.doubt
-        verified = stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS))
         return cls(
-            fix.T_map_odom, fix.T_map_body, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift,
-            doubt,
-        )  # fmt: skip
+            T_map_odom=fix.T_map_odom,
+            T_map_body=fix.T_map_body,
+            covariance=fix.covariance,
+            confidence=fix.confidence,
+            verified_ns=stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS)),
+            travelled=travelled,
+            turned=turned,
+            drift=fix.drift,
+            doubt=1.0 if fix.protection is None else fix.protection.doubt,
+        )
 
     def age(self, stamp_ns: int) -> float:
-        """Seconds of sensor time from the newest registration to ``stamp_ns``."""
+        """Return seconds of sensor time from the newest registration to ``stamp_ns``."""
         return max(0.0, (stamp_ns - self.verified_ns) / _NS)
 
     def pose(self, odometry: OdometryBuffer, robot: str, map_sha256: str) -> PoseMessage | None:
-        """Newest odometry, corrected, with its own stamp and what it may have drifted meanwhile; None before any."""
+        """Return the newest odometry, corrected, with its own stamp and its drift since; None before any."""
         newest = odometry.newest
         if newest is None:
             return None
@@ -256,10 +264,10 @@ class OdomCorrection:
 
 @dataclass(frozen=True)
 class Transition:
-    """One change of state, or LOST for another reason than before: the robot is then searched for otherwise.
+    """One change of the state, or LOST for another reason than before, which changes the search.
 
     Attributes:
-        number: counted from 1 since the session began; a gap tells how many were missed.
+        number: counted from 1 since the session began; a gap shows how many are missing.
         stamp_ns: of the robot's newest processed frame, nanoseconds; None before the first.
         before: the state that ended.
         state: the state that began.
@@ -275,7 +283,7 @@ class Transition:
     evidence: KeyframeEvidence | None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for the status."""
+        """Return plain data for the status."""
         return {
             "number": self.number,
             "stamp_ns": self.stamp_ns,
@@ -287,7 +295,7 @@ class Transition:
 
 
 class StateHistory:
-    """The newest changes of a robot's reported state, with what led to each."""
+    """The newest changes of a robot's reported state, each with its reason and evidence."""
 
     def __init__(self) -> None:
         self._state = State.SEARCHING

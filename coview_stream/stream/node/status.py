@@ -1,87 +1,135 @@
-"""Statuses of all robots: the document, when it goes out, and the connection that it tells of."""
+"""Statuses of all robots: the document, its size, its times, and the connection that it shows."""
 
 from __future__ import annotations
 
+import json
 import logging
+import socket
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from coview_stream.localization.state import State
 from coview_stream.messages.json_messages import encode_hypotheses
-from coview_stream.messages.types import Encoded
-from coview_stream.stream.node.counters import PoseRate
-from coview_stream.stream.node.election import Elections
-from coview_stream.stream.node.fleet import FleetShares
-from coview_stream.stream.node.scheduling import Rate
+from coview_stream.messages.types import Encoded, HypothesesMessage
+from coview_stream.stream.node.counters import PoseRate, Rate
 from coview_stream.stream.node.session import Session
-from coview_stream.stream.node.status_size import encode_status
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Publisher, Transport
 from coview_stream.version import __version__
 
 log = logging.getLogger("coview_stream.node")
 
-_JSON = "application/json"
+MAX_STATUS = 3500
+"""Bytes of a status, whatever happens; a usual one has 2,000. A default zenoh-pico loses one of 5 kB silently."""
 
-_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood; set by hand
+_JSON = "application/json"
+_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
+_TEXT, _SHORT_TEXT = 300, 100  # characters
+_MAX_READ = 65_536  # bytes of a status that is read
+_MAX_NAME = 64  # characters of a node's name or host
+_MAX_PERIOD = 60.0  # seconds between two statuses
+
+
+@dataclass(frozen=True)
+class NodeIdentity:
+    """Identity of a node in its statuses.
+
+    Attributes:
+        node: unlike that of any other node.
+        host: name of its machine, for people.
+        period: seconds between its statuses.
+        ending: it serves no longer.
+    """
+
+    node: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
+    host: str = field(default_factory=lambda: socket.gethostname()[:_MAX_NAME])
+    period: float = 1.0
+    ending: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.node} on {self.host}" if self.host else self.node
+
+    def to_json(self, ending: bool = False) -> dict[str, Any]:
+        """Return it as it stands in a status."""
+        return {"id": self.node, "term": 0, "period_s": self.period, "ending": ending, "host": self.host}
+
+    @classmethod
+    def read(cls, status: bytes) -> NodeIdentity | None:
+        """Return the identity in a status, from anyone; None where none can be read."""
+        if len(status) > _MAX_READ:
+            return None
+        try:
+            node = json.loads(status)["node"]
+            name, period, ending, host = node["id"], node["period_s"], node["ending"], node.get("host", "")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return None
+        numeric = isinstance(period, int | float) and type(period) is not bool and 0.0 < period <= _MAX_PERIOD
+        if not (numeric and isinstance(ending, bool) and _is_name(name) and name and _is_name(host)):
+            return None
+        return cls(name, host, float(period), ending)
+
+
+def _is_name(text: object) -> bool:
+    """Whether it can be logged."""
+    return isinstance(text, str) and len(text) <= _MAX_NAME and text.isprintable()
 
 
 class Reporter:
-    """Publishes statuses. What goes wrong with one robot's silences no other.
+    """Publishes statuses. A robot's error silences no other robot.
 
     Args:
         sessions: one per robot.
         transport: where statuses go to.
-        errors: logs what goes wrong.
-        elections: of robots that another node serves nothing is said; None: this one serves them all.
+        errors: logs errors.
+        identity: of this node.
 
     Attributes:
         changed: set it when a state may have changed.
         rates: of each robot's poses; add to it when one goes out.
+        served: robots that this node serves: of all others nothing is published.
     """
 
     def __init__(
-        self,
-        sessions: Sequence[Session],
-        transport: Transport,
-        errors: RateLimitedErrors,
-        elections: Elections | FleetShares | None = None,
+        self, sessions: Sequence[Session], transport: Transport, errors: RateLimitedErrors, identity: NodeIdentity
     ) -> None:
-        self._elections = elections
+        self.identity = identity
         self.changed = threading.Event()
         self.rates = {s.keys.robot: PoseRate() for s in sessions}
+        self.served: set[str] = set()
         self._sessions = sessions
         self._transport = transport
         self._errors = errors
         self._started = time.monotonic()
         self._connection = ConnectionMonitor()
-        self._reported: dict[str, tuple[str, object]] = {}  # states, as in the statuses, and what rivals were told
+        self._reported: dict[str, tuple[str, bool]] = {}  # state, and whether it was published
         self._publishers: dict[str, Publisher] = {}
         self._hypotheses: dict[str, Publisher] = {}
 
     def declare(self, session: Session) -> None:
-        """Declare a robot's status, and the places that a search for it considers."""
+        """Declare a robot's status, and the hypotheses of its search."""
         keys = session.keys
         self._publishers[keys.robot] = self._transport.publisher(keys.status, "report")
         self._hypotheses[keys.robot] = self._transport.publisher(keys.hypotheses, "report")
 
     def report_change(self, session: Session) -> None:
-        """Have the status published at once if the robot's state is another than its last status says."""
+        """Have the status published at once if the robot's state is another than in its last status."""
         if self._has_changed(session):
             self.changed.set()
 
     def _has_changed(self, session: Session) -> bool:
         return self._news(session) != self._reported.get(session.keys.robot)
 
-    def _news(self, session: Session) -> tuple[str, object]:
-        told = None if self._elections is None else self._elections.told(session.keys.robot)
-        return session.state()[0].reported, told
+    def _news(self, session: Session) -> tuple[str, bool]:
+        return session.state()[0].reported, session.keys.robot in self.served
 
     def run(self, rate: float, stopping: threading.Event) -> None:
-        """Publish at ``rate``, and at once what has changed, until ``stopping``; set ``changed`` as well, to end."""
+        """Publish at ``rate``, and changes at once, until ``stopping``; set ``changed`` as well, to end."""
         clock = Rate(rate, time.monotonic())
         while not stopping.is_set():
             self.changed.wait(timeout=clock.remaining(time.monotonic()))
@@ -98,20 +146,12 @@ class Reporter:
             with self._errors.catch("connection"):
                 self._check_connection(now)
         for session in self._sessions:
-            with self._errors.catch(f"{session.keys.robot}: status"):
+            robot = session.keys.robot
+            with self._errors.catch(f"{robot}: status"):
                 if all_robots or self._has_changed(session):
                     self._publish_status(session, now)
-                if all_robots:
-                    self._publish_hypotheses(session)
-
-    def _publish_hypotheses(self, session: Session) -> None:
-        """Publish what a search considers, while there is one."""
-        robot = session.keys.robot
-        if self._elections is not None and self._elections.claim(robot) is None:
-            return
-        message = session.hypotheses()
-        if message is not None:
-            self._hypotheses[robot].put(encode_hypotheses(message))
+                if all_robots and robot in self.served and (message := hypotheses(session)) is not None:
+                    self._hypotheses[robot].put(encode_hypotheses(message))
 
     def publish_last(self, now: float) -> None:
         """Publish that the node ends, and no robot is tracked any more."""
@@ -121,27 +161,23 @@ class Reporter:
 
     def _check_connection(self, now: float) -> None:
         self._connection.update(self._transport.connection())
-        if self._elections is not None:
-            self._elections.check_connection()
         if not (self._connection.connection.routers or self._connection.connection.peers):
             for session in self._sessions:
-                session.on_disconnected(now)
+                session.inputs.disconnected_at = now
 
     def _publish_status(self, session: Session, now: float, closing: bool = False) -> None:
         robot = session.keys.robot
         state, reason = session.state()
-        before, now_told = self._reported.get(robot, ("", None)), self._news(session)
-        self._reported[robot] = now_told  # published or not: it is not tried again at once
-        if state.reported != before[0] and not closing:
-            name = session.map_name()
+        before, _ = self._reported.get(robot, ("", False))
+        self._reported[robot] = self._news(session)  # published or not: it is not tried again at once
+        if state.reported != before and not closing:
+            name = map_name(session)
             log.info("%s: %s%s (%s)", robot, state.reported, "" if name is None else f" on {name}", reason)
-        claim = None if self._elections is None else self._elections.claim(robot)
-        if self._elections is not None and claim is None:
+        if robot not in self.served:
             return
         rate, uptime = self.rates[robot].rate(now), now - self._started
         document = status(session, self._connection.connection, self._connection.reconnects, rate, uptime)
-        if claim is not None:
-            document["node"] = replace(claim, ending=closing).to_json()
+        document["node"] = self.identity.to_json(closing)
         if closing:
             document["reason"] = "the node is shutting down"
             if state is State.TRACKING:
@@ -149,11 +185,15 @@ class Reporter:
         self._publishers[robot].put(Encoded(encode_status(document), _JSON))
 
 
+# ---- the document
+
+
 def status(session: Session, connection: Connection, reconnects: int, rate: float, uptime: float) -> dict[str, Any]:
     """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
-    state, reason = session.state()
-    age, level = session.age(), session.protection_level()
-    known, queue, calibration = session.robot_state, session.queue, session.calibration
+    with session.lock:
+        state, reason = session.state()
+        robot, queue, odometry = session.robot_state, session.queue, session.inputs.odometry
+        age, level, correction = robot.age(odometry), robot.protection_level(odometry), robot.correction
     return {
         "robot": session.keys.robot,
         "stamp_ns": time.time_ns(),
@@ -161,17 +201,17 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "reason": reason,
         "version": __version__,
         "map_sha256": session.map_sha256,
-        **({} if session.parts is None else {"map": session.map_name()}),
-        "odometry": session.odometry_source,
+        **({} if session.parts is None else {"map": map_name(session)}),
+        "odometry": session.inputs.odometry_source,
         "uptime_s": round(uptime, 1),
-        "last_frame_ns": known.last_frame_ns,
-        "evidence": None if known.evidence is None else known.evidence.to_json(),
-        "calibration": None if calibration is None else calibration.to_json(session.config.mount),
+        "last_frame_ns": robot.last_frame_ns,
+        "evidence": None if robot.evidence is None else robot.evidence.to_json(),
+        "calibration": None if robot.calibration is None else robot.calibration.to_json(session.config.mount),
         "transitions": session.history.to_json(),
         "pose": {
             "rate_hz": rate,
             "age_s": None if age is None else round(age, 3),
-            "confidence": session.confidence(),
+            "confidence": None if correction is None else correction.confidence,
             "protection_level": None if level is None else level.to_json(),
         },
         "latency_ms": queue.latency.to_json(),
@@ -184,21 +224,127 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
     }
 
 
+def map_name(session: Session) -> str | None:
+    """Return the robot's map of several; None while that is not known, and of one map."""
+    correction = session.robot_state.correction
+    return None if session.parts is None or correction is None else session.parts.at(correction.T_map_body[:3, 3]).name
+
+
+def hypotheses(session: Session) -> HypothesesMessage | None:
+    """Return the places that a robot's search considers; None while there is a place, and before the first search."""
+    with session.lock:
+        considered = session.queue.considered
+        if considered is None or session.robot_state.state.has_place:
+            return None
+    stamp_ns, robot, places = round(considered.stamp * 1e9), session.keys.robot, considered.places
+    if session.parts is None:
+        return HypothesesMessage(stamp_ns, robot, places, considered.none, session.map_sha256)
+    parts = [session.parts.at(place[:3]) for place in places]
+    places = places.copy()
+    places[:, :3] -= np.array([part.shift for part in parts]).reshape(-1, 3)
+    names = tuple(part.name for part in parts)
+    return HypothesesMessage(stamp_ns, robot, places, considered.none, session.map_sha256, maps=names)
+
+
+# ---- its size
+
+
+def encode_status(document: dict[str, Any]) -> bytes:
+    """Encode a status (JSON) in at most :data:`MAX_STATUS` bytes.
+
+    A longer one loses its least important parts first, and ``shortened`` names them: ids of the others on the network,
+    evidence of past changes of state, old errors, past changes, the end of long texts.
+    """
+    text = _encode(document)
+    if len(text) <= MAX_STATUS:
+        return text
+    short: dict[str, Any] = json.loads(text)
+    for name, shorten in _STEPS:
+        shorten(short)
+        short["shortened"] = list(dict.fromkeys([*short.get("shortened", ()), name]))
+        text = _encode(short)
+        if len(text) <= MAX_STATUS:
+            break
+    return text
+
+
+def _encode(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=True).encode()
+
+
+def _connection(document: dict[str, Any]) -> None:
+    connection = document["connection"]
+    for name in ("routers", "peers"):
+        connection[name] = connection[name][:2]
+
+
+def _evidence_of_transitions(document: dict[str, Any]) -> None:
+    for transition in document["transitions"]:
+        transition["evidence"] = None
+        transition["reason"] = _cut(transition["reason"], _SHORT_TEXT)
+
+
+def _errors(document: dict[str, Any]) -> None:
+    document["errors"] = [_cut(text, _SHORT_TEXT) for text in document["errors"][-3:]]
+
+
+def _transitions(document: dict[str, Any]) -> None:
+    document["transitions"] = document["transitions"][-1:]
+
+
+def _texts(document: dict[str, Any]) -> None:
+    document["reason"] = _cut(document["reason"], _TEXT)
+    if document.get("evidence"):
+        document["evidence"]["reason"] = _cut(document["evidence"]["reason"], _SHORT_TEXT)
+    if document.get("calibration"):
+        says = document["calibration"].get("says") or []
+        document["calibration"]["says"] = [_cut(text, _SHORT_TEXT) for text in says[:3]]
+
+
+_ESSENTIAL = (
+    "robot", "stamp_ns", "state", "reason", "version", "map_sha256", "last_frame_ns", "pose", "node", "shortened",
+)  # fmt: skip
+
+
+def _all_but_the_state(document: dict[str, Any]) -> None:
+    """Leave only the essentials: names and texts of hundreds of characters are all that can lead here."""
+    for name in document.keys() - set(_ESSENTIAL):
+        del document[name]
+    document["reason"] = _cut(document["reason"], _SHORT_TEXT)
+
+
+_STEPS: tuple[tuple[str, Callable[[dict[str, Any]], None]], ...] = (
+    ("connection", _connection),
+    ("transitions", _evidence_of_transitions),
+    ("errors", _errors),
+    ("transitions", _transitions),
+    ("reason", _texts),
+    ("all but the state", _all_but_the_state),
+)
+
+
+def _cut(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 4]} ..."
+
+
+# ---- the connection
+
+
 class ConnectionMonitor:
-    """Routers and peers that the node is connected to, and what has changed of them. Pure.
+    """Routers and peers that the node is connected to, and their changes. Pure.
 
     Attributes:
         connection: at the last update.
-        reconnects: how often a router came back, or another took its place. Peers come and go as they like.
+        reconnects: number of times that a router came back, or another took its place. Peers come and go.
     """
 
     def __init__(self) -> None:
         self.connection = Connection()
         self.reconnects = 0
-        self._missing: set[str] = set()  # routers that were there once and have not been replaced
+        self._missing: set[str] = set()  # routers that have gone and have not been replaced
 
     def update(self, connection: Connection) -> None:
-        """Take in the connection as it is now, and log what has changed."""
+        """Take in the connection as it is now, and log its changes."""
         before, self.connection = self.connection, connection
         self._update_routers(set(before.routers), set(connection.routers))
         for zid in sorted(set(connection.peers) - set(before.peers)):

@@ -1,6 +1,6 @@
 """Child process of an :class:`~coview_stream.stream.node.engine_process.EngineProcess`; not for people.
 
-``python -m coview_stream.stream.node.worker FD KIND NICE``; what to open comes over the pipe.
+``python -m coview_stream.stream.node.worker FD KIND NICE``; the map to open comes over the pipe.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pathlib import Path
 def main(argv: list[str]) -> int:
     """Load the kernels, open the engine, then answer jobs until the parent closes the pipe.
 
-    What the first jobs do not need is loaded while no job waits, one kernel after the other: a job that comes meanwhile
-    waits for that one: a quarter of a second at most from the cache, some seconds on the first run ever.
+    Kernels of later jobs are loaded one by one while no job waits: a job that comes meanwhile waits a quarter of a
+    second at most with the cache, some seconds on the first run ever.
     """
     descriptor, kind, nice = int(argv[0]), argv[1], int(argv[2])
     pipe = Connection(descriptor)
@@ -28,7 +28,6 @@ def main(argv: list[str]) -> int:
         os.nice(nice)
     _set_group_nice(nice)
     from coview_kernels import warm_up
-    from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig
     from coview_stream.errors import CoViewError
     from coview_stream.stream.node.engine_process import attempt
     from coview_stream.stream.node.engines import kernels_of, open_engine
@@ -50,19 +49,14 @@ def main(argv: list[str]) -> int:
         opening = pipe.recv()
         _set_group_nice(0)
         try:
-            method = RegistrationConfig(method=opening.registration)  # any text; it checks, as do the others
-            rule = AcceptanceConfig(risk=opening.risk)
-            config = LocalizerConfig(
-                registration=method, acceptance=rule, reloc=opening.reloc, sensor_leans=opening.sensor_leans
-            )
-            engine = open_engine(kind, opening.map_path, opening.sha256, config, opening.trust)
+            engine = open_engine(kind, *opening)
             pipe.send(("ready", None))
             engine.prepare()
         except CoViewError as error:
             pipe.send(("error", str(error)))
             return 1
         if not gc.isenabled():
-            gc.freeze()  # what is there stays; to look through it again and again would cost every job
+            gc.freeze()  # nearly all objects of the start stay: to look through them again would cost every job
             gc.enable()
         pipe.send(("prepared", None))
         _set_group_nice(nice)
@@ -83,5 +77,5 @@ def _set_group_nice(nice: int) -> None:
 
 
 if __name__ == "__main__":
-    gc.disable()  # nearly all that is made while a process starts stays: a tenth of the time
+    gc.disable()  # nearly all objects of the start stay: a tenth of the time
     sys.exit(main(sys.argv[1:]))

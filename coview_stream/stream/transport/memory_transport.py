@@ -156,6 +156,10 @@ class MemoryTransport:
         """Return what was published on keys that match ``key``, oldest first."""
         return [sample for sample in self.published if matches(key, sample.key)]
 
+    def withdraw(self, key: str) -> None:
+        """Drop a liveliness token, as of a process that has died."""
+        self._tokens.remove(key)
+
     def go_away(self) -> None:
         """Take the router away: publications are lost, queries fail, tokens are gone; declarations stay."""
         self._connected = False

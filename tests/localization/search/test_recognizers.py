@@ -16,8 +16,8 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.localization.search.votes import TableVote
 from coview_stream.localization.state import State
+from coview_stream.stream.node.engine_queue import SearchJob
 from coview_stream.stream.node.engines import SearchEngine
-from coview_stream.stream.node.jobs import SearchJob
 
 
 def search_of(base_map, reloc="auto", **settings):

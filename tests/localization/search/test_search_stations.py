@@ -17,8 +17,8 @@ from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.search.pose_hints import PoseHints
 from coview_stream.localization.search.search_stations import SearchStations
 from coview_stream.localization.state import State
+from coview_stream.stream.node.engine_queue import FrameJob
 from coview_stream.stream.node.engines import TrackEngine
-from coview_stream.stream.node.jobs import FrameJob
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from fake_robot import SHA, cloud, odometry, search_result, tracking
 from coview_stream.config.node import NodeConfig
 from coview_stream.messages import decode_pose
 from coview_stream.stream.node.engine_process import DiedError, attempt, unwrap
-from coview_stream.stream.node.jobs import FrameJob
-from coview_stream.stream.node.node import Node
+from coview_stream.stream.node.engine_queue import FrameJob
+from coview_stream.stream.node.node import Node, OpenedMap
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -64,7 +64,7 @@ class InlineRunner:
 
 def publish_statuses(node, now, all_robots=True):
     """Publish the status of every robot, or of those whose state has changed."""
-    node._reporter.publish(now, all_robots)
+    node.reporter.publish(now, all_robots)
 
 
 class Runner(InlineRunner):
@@ -88,15 +88,16 @@ class Runner(InlineRunner):
 class Site:
     """A node without threads, its robots, and the network between them."""
 
-    def __init__(self, *names, preset="native", engines=None, config=PATIENT, **more):
-        self.net = MemoryTransport()
+    def __init__(self, *names, preset="native", engines=None, config=PATIENT, net=None, **more):
+        self.net = net or MemoryTransport()
         self.engine = Engine()
         track, search = engines or (self.engine, self.engine)
         self.track, self.search = Runner(track), Runner(search)
         self.keys = {name: robot_keys(preset, "coview", name) for name in names}
         sessions = [Session(keys, SHA, config) for keys in self.keys.values()]
         self.sessions = dict(zip(names, sessions, strict=True))
-        self.node = Node(sessions, self.net, self.track, self.search, config, **more)
+        opened = OpenedMap(SHA, {"track": self.track, "search": self.search}, sessions)
+        self.node = Node(opened, self.net, config, **more)
 
     def moves(self, name, seconds, **place):
         self.net.publish(odometry(seconds, keys=self.keys[name], **place))
@@ -109,9 +110,9 @@ class Site:
     def work(self, name):
         """Let the engines do what there is to do for a robot."""
         session = self.sessions[name]
-        for engine, take in (("track", session.take_frame), ("search", session.take_search_request)):
-            if (job := take()) is not None:
-                self.node.work(engine, session, job)
+        for engine in ("track", "search"):
+            if (job := session.take_job(engine)) is not None:
+                self.node.feeds[0].work(engine, session, job)
 
     def frame(self, name, seconds, **fields):
         self.sees(name, seconds, **fields)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -17,18 +18,20 @@ from fake_robot import tracking
 from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.errors import CloudError, CoViewError, InputError
+from coview_stream.errors import CloudError, CoViewError, DependencyError
 from coview_stream.localization.state import State
-from coview_stream.stream.node import engine_process, worker
-from coview_stream.stream.node.engine_child import EngineChild
+from coview_stream.stream.node import worker
 from coview_stream.stream.node.engine_process import (
     CancelledError,
     DiedError,
+    EngineChild,
     EngineProcess,
     FailedError,
+    Opening,
     RejectedError,
+    engine_environment,
 )
-from coview_stream.stream.node.jobs import FrameJob
+from coview_stream.stream.node.engine_queue import FrameJob
 
 
 def job(points=None, robot="r1", stamp_ns=1_000_000_000):
@@ -73,6 +76,22 @@ def test_failed_engine_forgets_the_robot_and_returns_traceback():
     assert "Traceback" in str(caught.value)
     engine.error = None
     assert InlineRunner(engine).run(job()).fix.state is State.TRACKING
+
+
+@contextlib.contextmanager
+def checked(process):
+    """Check a process as the feed of the engines does, but more often; a stopped one is left alone."""
+    over = threading.Event()
+
+    def check():
+        while not over.wait(0.05):
+            process.end_hung_job()
+
+    thread = threading.Thread(target=check)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
 
 
 def alive(pid):
@@ -132,7 +151,7 @@ def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(world_f
         assert process.pid is None
         process.watch()
         assert process.pid not in (None, first)
-        until(lambda: process.watch() or not process._awaited, 60.0)  # ready before a job asks
+        until(lambda: process.watch() or process.ready, 60.0)  # ready before a job asks
     finally:
         process.close()
     with pytest.raises(DiedError, match="closed"):
@@ -180,11 +199,10 @@ def test_stopped_engine_is_ended_during_a_job(world_file, world_drive):
 @pytest.mark.slow
 def test_child_that_was_started_before_is_the_first(world_file, world_drive):
     child = EngineChild("track")
-    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, None, child=child)
+    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, child=child)
     try:
         process.start()
-        assert process.pid == child.take()[0].pid
-        child.close()  # does nothing: it is the engine's
+        assert process.pid == child.process.pid
         assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
         os.kill(process.pid, signal.SIGKILL)
         with pytest.raises(DiedError):
@@ -198,7 +216,7 @@ def test_child_that_was_started_before_is_the_first(world_file, world_drive):
 @pytest.mark.parametrize("adopted", [False, True])
 def test_child_without_a_map_ends_when_it_is_closed(adopted):
     child = EngineChild("search")
-    pid = child._process.pid
+    pid = child.process.pid
     assert alive(pid)
     EngineProcess("search", "unused", "0" * 64, child=child).close() if adopted else child.close()
     assert not alive(pid)
@@ -207,7 +225,7 @@ def test_child_without_a_map_ends_when_it_is_closed(adopted):
 
 @pytest.mark.slow
 def test_child_ends_with_its_parent():
-    code = "from coview_stream.stream.node.engine_child import EngineChild; print(EngineChild('track')._process.pid)"
+    code = "from coview_stream.stream.node.engine_process import EngineChild; print(EngineChild('track').process.pid)"
     paths = os.pathsep.join(p for p in sys.path if p)
     pid = int(subprocess.check_output([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths}))
     until(lambda: not alive(pid), 30.0)
@@ -225,39 +243,6 @@ def test_unreadable_map_fails_wait_ready(tmp_path):
     finally:
         process.close()
     assert process.pid is None
-
-
-def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
-    """And the child ends: the next job starts another, which may do better."""
-
-    class Unprepared(Engine):
-        kernels = ()
-
-        def prepare(self):
-            raise InputError("ground.onnx: no weights of the ground network; train them")
-
-    monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *given: Unprepared())
-    ended = []
-
-    class Thread:
-        """A child that is a thread of this process."""
-
-        def __init__(self, kind, nice):
-            self.ours, theirs = socket.socketpair()
-            given = [str(theirs.detach()), kind, str(nice)]
-            threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
-
-        def take(self):
-            return None, Connection(self.ours.detach())
-
-    monkeypatch.setattr(engine_process, "EngineChild", Thread)
-    monkeypatch.setattr("coview_stream.stream.node.engines.kernels_of", lambda kind: ((), ()))
-    process = EngineProcess("search", "unused", "0" * 64)
-    for times in (1, 2):
-        with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
-            process.run(job())
-        until(lambda times=times: ended == [1] * times, 5.0)
-    process.close()
 
 
 @pytest.mark.slow
@@ -281,7 +266,7 @@ def test_hung_worker_is_killed_during_send(world_file, world_drive):
         first = process.pid
         os.kill(first, signal.SIGSTOP)
         process.job_timeout = 0.3
-        with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+        with checked(process), pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
             process.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
         until(lambda: not alive(first), 5.0)
         process.job_timeout = 30.0
@@ -290,31 +275,40 @@ def test_hung_worker_is_killed_during_send(world_file, world_drive):
         process.close()
 
 
-def with_child(process, program):
-    """Give a process a child that runs ``program``, which finds its end of the pipe as ``fd``."""
-    ours, theirs = socket.socketpair()
-    with theirs:
-        code = f"import os, time; fd = {theirs.fileno()}\n{program}"
-        process._child = subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()])
-    process._pipe = Connection(ours.detach())
+READY = "[pipe.send((name, None)) for name in ('ready', 'prepared')]\n"
+
+
+class Program:
+    """A child that runs a program, which has its end of the pipe as ``pipe``, its descriptor as ``fd``."""
+
+    def __init__(self, program):
+        ours, theirs = socket.socketpair()
+        with theirs:
+            start = (
+                f"import os, time, multiprocessing.connection as mc; fd = {theirs.fileno()}; pipe = mc.Connection(fd)"
+            )
+            self.process = subprocess.Popen([sys.executable, "-c", f"{start}\n{program}"], pass_fds=[theirs.fileno()])
+        self.pipe = Connection(ours.detach())
+
+    close = EngineChild.close
 
 
 @pytest.mark.slow
 def test_truncated_answer_kills_the_worker():
-    process = EngineProcess("search", "unused", "0" * 64, job_timeout=0.3)
-    with_child(process, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
-    child = process.pid
-    with pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
+    child = Program(READY + "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
+    process = EngineProcess("search", "unused", "0" * 64, child=child, job_timeout=0.3)
+    pid = child.process.pid
+    with checked(process), pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
         process.run(job())
-    until(lambda: not alive(child), 5.0)
+    until(lambda: not alive(pid), 5.0)
     process.close()
 
 
 @pytest.mark.slow
 def test_opening_has_its_own_timeout_and_can_be_cancelled():
-    process = EngineProcess("track", "unused", "0" * 64, job_timeout=0.01, open_timeout=0.3)
-    with_child(process, "time.sleep(60)")
-    process._awaited = ["ready", "prepared"]
+    child = Program("time.sleep(60)")
+    process = EngineProcess("track", "unused", "0" * 64, child=child, job_timeout=0.01, open_timeout=0.3)
+    process.start()
     asked = []
 
     def cancelled():
@@ -330,21 +324,82 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled():
 
 @pytest.mark.slow
 def test_wait_until_prepared_can_be_cancelled():
-    process = EngineProcess("track", "unused", "0" * 64, open_timeout=5.0)
-    with_child(process, "time.sleep(60)")
-    process._awaited = ["prepared"]
+    child = Program("pipe.send(('ready', None)); time.sleep(60)")
+    process = EngineProcess("track", "unused", "0" * 64, child=child)
+    process.start()
+    process.wait_ready()
+    assert not process.ready
     with pytest.raises(CancelledError, match="track"):
         process.wait_prepared(lambda: True)
     process.close()
 
 
 @pytest.mark.slow
+def test_engine_that_cannot_prepare_says_why():
+    child = Program("pipe.send(('ready', None)); pipe.send(('error', 'ground.onnx: no weights; train them'))")
+    process = EngineProcess("search", "unused", "0" * 64, child=child)
+    with pytest.raises(DiedError, match="no weights; train them"):
+        process.run(job())
+    assert process.pid is None
+    process.close()
+
+
+@pytest.mark.slow
 def test_close_ends_a_running_job():
-    process = EngineProcess("track", "unused", "0" * 64)
-    with_child(process, "time.sleep(60)")
-    timer = threading.Timer(0.2, process.close)
+    process = EngineProcess("track", "unused", "0" * 64, child=Program(READY + "time.sleep(60)"))
+    timer = threading.Timer(0.5, process.close)
     timer.start()
     with pytest.raises(DiedError, match="died"):
         process.run(job())
     timer.join()
-    until(lambda: "coview-watch-track" not in [thread.name for thread in threading.enumerate()])
+
+
+# ---- the child
+
+
+@pytest.mark.parametrize(("cores", "threads"), [(1, "1"), (2, "1"), (8, "7")])
+def test_searches_leave_a_core_to_the_others(monkeypatch, cores, threads):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+    monkeypatch.delenv("COVIEW_THREADS", raising=False)
+    assert engine_environment("search")["COVIEW_THREADS"] == threads
+    assert "COVIEW_THREADS" not in engine_environment("track")
+
+
+def test_threads_that_the_user_asks_for_are_given(monkeypatch):
+    monkeypatch.setenv("COVIEW_THREADS", "5")
+    assert {engine_environment(kind)["COVIEW_THREADS"] for kind in ("search", "track")} == {"5"}
+    assert engine_environment("search")["OPENBLAS_NUM_THREADS"] == "1"
+
+
+class LackingEngine(Engine):
+    """An engine without a library that only its jobs need."""
+
+    def __init__(self):
+        super().__init__(DependencyError("no gtsam"))
+        self.asked = threading.Event()
+
+    def prepare(self):
+        """Do nothing."""
+
+    def prepare_later(self):
+        self.asked.set()
+        raise self.error
+
+
+def test_library_that_is_missing_is_the_jobs_error(monkeypatch):
+    engine = LackingEngine()
+    monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *args: engine)
+    monkeypatch.setattr(worker, "_set_group_nice", lambda nice: None)
+    ours, theirs = socket.socketpair()
+    with Connection(ours.detach()) as pipe:
+        child = threading.Thread(target=worker.main, args=([str(theirs.detach()), "odometry", "0"],), daemon=True)
+        child.start()
+        pipe.send(Opening("map", "hash"))
+        assert pipe.recv() == ("ready", None)
+        assert pipe.recv() == ("prepared", None)
+        assert engine.asked.wait(10.0)
+        pipe.send(job())
+        assert pipe.poll(10.0)
+        assert pipe.recv() == ("rejected", "no gtsam")
+    child.join(10.0)
+    assert not child.is_alive()

@@ -13,10 +13,9 @@ from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages.types import CloudMessage
 from coview_stream.stream.node.counters import Counters, ErrorLog
-from coview_stream.stream.node.engine_queue import EngineQueue
-from coview_stream.stream.node.frame_sync import PairedFrame
-from coview_stream.stream.node.jobs import SearchJob
-from coview_stream.stream.node.scheduling import SearchDemand
+from coview_stream.stream.node.engine_queue import EngineQueue, SearchDemand, SearchJob
+from coview_stream.stream.node.inputs import PairedFrame
+from coview_stream.stream.node.last_place import PlaceHints
 
 EPOCH = 4  # after resets: the first of this queue
 NOW = 1000.0
@@ -26,7 +25,7 @@ class Queue(EngineQueue):
     """A queue with counters of its own."""
 
     def __init__(self):
-        self.counters, self.errors = Counters(), ErrorLog()
+        self.counters, self.errors, self.hints = Counters(), ErrorLog(), PlaceHints()
         super().__init__("r1", EPOCH, self.counters, self.errors)
 
     @property
@@ -36,13 +35,17 @@ class Queue(EngineQueue):
 
     def put(self, seconds, now=NOW):
         """Queue a frame that came 0.1 s before ``now``; its odometry had driven as many metres as its stamp says."""
-        frame = PairedFrame(CloudMessage(ns(seconds), POINTS), now - 0.1, pose(seconds), None)
-        self.put_frame(frame, now, travelled=seconds, turned=0.5)
+        frame = PairedFrame(CloudMessage(ns(seconds), POINTS), now - 0.1, pose(seconds), None, seconds, 0.5)
+        self.put_frame(frame, now)
 
-    def take(self, seconds=0.0, now=NOW, **more):
+    def take(self, seconds=0.0, now=NOW):
         """Queue a frame and hand it out."""
         self.put(seconds, now)
-        return self.take_frame(False, **more)
+        return self.take_next()
+
+    def take_next(self):
+        """Hand out the frame that waits."""
+        return self.take_frame(False, self.hints)
 
     def ask(self, seconds=0.0, now=NOW, restart=1):
         """Queue a search request."""
@@ -63,25 +66,26 @@ def queue():
 
 
 def test_frame_goes_to_the_engine_as_it_was_put(queue):
-    assert queue.take_frame(False) is None
+    assert queue.take_next() is None
     queue.put(0.2)
-    job = queue.take_frame(True, hint := pose(3.0))
+    queue.hints.offer(hint := pose(3.0), None)
+    job = queue.take_frame(True, queue.hints)
     assert (job.robot, job.epoch, job.stamp_ns, job.defer) == ("r1", EPOCH, ns(0.2), False)
     assert (job.require_verification, job.search_result) == (True, None)
     assert job.hint is hint
     np.testing.assert_array_equal(job.T_odom_body, pose(0.2))
     frame = queue.frame_done(job, tracking(job), NOW)
-    assert (frame.job, frame.travelled, frame.turned) == (job, 0.2, 0.5)
+    assert (frame.job, frame.paired.travelled, frame.paired.turned) == (job, 0.2, 0.5)
     assert queue.counted == {"processed": 1}
 
 
 def test_newest_frame_replaces_the_one_that_waits(queue):
     for k in range(3):
         queue.put(0.1 * k, NOW + 0.1 * k)
-    job = queue.take_frame(False)
+    job = queue.take_next()
     assert job.stamp_ns == ns(0.2)
     assert job.defer  # the engine is behind
-    assert queue.take_frame(False) is None
+    assert queue.take_next() is None
     assert queue.counted == {"dropped": 2}
     queue.frame_done(job, tracking(job), NOW + 0.5)
     assert queue.longest_wait == pytest.approx(0.5)  # since the first of them
@@ -91,7 +95,7 @@ def test_only_one_frame_is_under_way(queue):
     job = queue.take(0.0)
     assert queue.take(0.1) is None
     queue.frame_done(job, tracking(job), NOW)
-    after = queue.take_frame(False)
+    after = queue.take_next()
     assert (after.stamp_ns, after.defer) == (ns(0.1), False)
 
 
@@ -108,7 +112,7 @@ def test_fix_of_an_old_epoch_is_only_counted(queue):
     job = queue.take(0.0)
     queue.put(0.1)
     queue.begin_epoch(EPOCH + 1)
-    assert queue.take_frame(False) is None  # the one that waited was dropped
+    assert queue.take_next() is None  # the one that waited was dropped
     assert queue.frame_done(job, unknown(job, ask=search_request()), NOW) is None
     assert queue.take_search_request() is None
     assert queue.counted == {"processed": 1, "dropped": 1}

@@ -17,8 +17,8 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transfo
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment
+from coview_stream.stream.node.engine_queue import FrameJob, SearchJob
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine, open_engine
-from coview_stream.stream.node.jobs import FrameJob, SearchJob
 
 FRAMES = 7
 OTHER_ODOMETRY = pose_from(rot_z(-1.2), [-300.0, 40.0, 7.0])

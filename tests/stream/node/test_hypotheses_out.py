@@ -14,7 +14,8 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import TransportError
 from coview_stream.localization.search.considered import Considered
 from coview_stream.messages.json_messages import decode_hypotheses
-from coview_stream.stream.node.map_view import MapViewAnswer
+from coview_stream.stream.node.robot_endpoints import MapViewAnswer
+from coview_stream.stream.node.status import hypotheses
 
 PLACES = Considered(1.5, np.array([[1.0, 2.0, 3.0, 0.5, 0.7, 9.0], [4.0, 5.0, 6.0, -0.5, 0.1, 2.0]]), 0.2)
 
@@ -25,8 +26,8 @@ def searched(site):
     session = site.sessions["r1"]
     site.engine.answer = lambda job: unknown(job, ask=search_request())
     site.sees("r1", 0.0)
-    site.node.work("track", session, session.take_frame())
-    session.handle_result(session.take_search_request(), replace(search_result(), considered=PLACES), time.monotonic())
+    site.node.feeds[0].work("track", session, session.take_job("track"))
+    session.handle_result(session.take_job("search"), replace(search_result(), considered=PLACES), time.monotonic())
     return session
 
 
@@ -54,9 +55,9 @@ def test_of_a_robot_with_a_place_nothing_goes_out(site, searched):
 
 
 def test_a_new_odometry_frame_forgets_them(site, searched):
-    assert searched.hypotheses() is not None
-    searched.relocalize()
-    assert searched.hypotheses() is None
+    assert hypotheses(searched) is not None
+    searched.restart_search("asked to search again", forget=True)
+    assert hypotheses(searched) is None
 
 
 def test_a_map_view_is_of_the_map_that_is_served(site, world_file):

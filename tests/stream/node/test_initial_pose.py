@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.node.initial_pose import decode_guess, guess_of_fields
+from coview_stream.stream.node.last_place import decode_guess, guess_of_fields
 
 
 def sample(payload):
@@ -91,13 +91,20 @@ def test_guess_is_told_again_to_an_engine_that_begins_anew():
     robot.session.restart_search("odometry jumped")
     assert robot.frame(0.1, unknown).guess == PlaceGuess(1.0, 2.0)  # how far it is from the circle is not known
     assert robot.frame(0.2, unknown).guess is None
-    robot.session.relocalize()
+    robot.session.restart_search("asked to search again", forget=True)
     assert robot.frame(0.3, unknown).guess is None
 
 
-@pytest.mark.parametrize("forget", ["reset", "relocalize", "give_up"])
+@pytest.mark.parametrize(
+    "forget",
+    [
+        lambda session: session.reset(),
+        lambda session: session.reset(forget=False),
+        lambda session: session.restart_search("asked to search again", forget=True),
+    ],
+)
 def test_guess_that_waits_is_forgotten_with_the_rest(forget):
     robot = Robot()
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, within=300.0))
-    getattr(robot.session, forget)()
+    forget(robot.session)
     assert robot.frame(0.0, unknown).guess is None

@@ -18,9 +18,9 @@ from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import inverse
 from coview_stream.stream.node.engine_process import DiedError, EngineProcess, RejectedError
-from coview_stream.stream.node.jobs import OdometryJob, OdometryResult
-from coview_stream.stream.node.lidar_session import LidarSession
-from coview_stream.stream.node.node import Node
+from coview_stream.stream.node.engine_queue import OdometryJob, OdometryResult
+from coview_stream.stream.node.node import Node, OpenedMap
+from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
@@ -93,18 +93,20 @@ def placing(job):
 @pytest.fixture
 def quiet():
     net = MemoryTransport()
-    session = LidarSession(KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0))
+    session = Session(
+        KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0), lidar=LidarOdometryConfig()
+    )
     track, engine = Runner(tracking), Runner(placing)
-    made = Node([session], net, track, track, session.config, odometry=engine)
+    made = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, session.config)
     made.declare()
     return made, net, engine
 
 
 def worked(node, *engines):
     for name in engines:
-        found = node.next_job(name)
+        found = node.feeds[0].next_job(name)
         if found is not None:
-            node.work(name, *found)
+            node.feeds[0].work(name, *found)
 
 
 def status(node, net):
@@ -152,7 +154,7 @@ def test_reset_request_resets_lidar_odometry(quiet):
     worked(node, "odometry", "track")
     assert net.query(KEYS.reset)["state"] == "SEARCHING"
     net.publish(cloud(0.0))
-    _, job = node.next_job("odometry")
+    _, job = node.feeds[0].next_job("odometry")
     assert job.epoch == 2
 
 
@@ -177,9 +179,9 @@ def test_aborted_odometry_engine_is_restarted(stand_in):
 def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
     net = MemoryTransport()
     config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
-    session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
+    session = Session(KEYS, SHA, config, lidar=LEVEL)
     track, engine = Runner(tracking), EngineProcess("odometry", "unused", "")
-    node = Node([session], net, track, track, config, odometry=engine)
+    node = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, config)
     node.start()
     stamps = iter(0.1 * k for k in range(100_000))
 

@@ -7,10 +7,11 @@ import pytest
 from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, state, tracking
 
 from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
-from coview_stream.stream.node.jobs import OdometryResult
-from coview_stream.stream.node.lidar_session import LidarSession
+from coview_stream.stream.node.engine_queue import OdometryResult
+from coview_stream.stream.node.session import Session
 
 TIMES = np.linspace(0.0, 0.1, len(POINTS))
 
@@ -19,7 +20,7 @@ class Robot:
     """A session and the two engines that work for it, at 10 Hz."""
 
     def __init__(self, config=None):
-        self.session = LidarSession(KEYS, SHA, config)
+        self.session = Session(KEYS, SHA, config, lidar=LidarOdometryConfig())
         self.now = 1000.0
         self.first = True
 
@@ -33,7 +34,7 @@ class Robot:
 
     def placed(self, restarted=None, **place):
         """Play the odometry engine for one frame; it drives 2 m/s."""
-        job = self.session.take_lidar_frame()
+        job = self.session.take_job("odometry")
         if job is None:
             return None
         restarted, self.first = (self.first if restarted is None else restarted), False
@@ -44,7 +45,7 @@ class Robot:
 
     def tracked(self):
         """Play the tracking engine for one frame."""
-        job = self.session.take_frame()
+        job = self.session.take_job("track")
         if job is not None:
             self.session.handle_result(job, tracking(job), self.now + 0.06)
         return job
@@ -111,8 +112,8 @@ def test_one_odometry_job_at_a_time():
     robot = Robot()
     robot.saw(0.0)
     robot.saw(0.1)
-    assert robot.session.take_lidar_frame() is not None
-    assert robot.session.take_lidar_frame() is None
+    assert robot.session.take_job("odometry") is not None
+    assert robot.session.take_job("odometry") is None
 
 
 def test_missing_clouds_and_rejected_clouds_have_different_reasons():
@@ -123,7 +124,7 @@ def test_missing_clouds_and_rejected_clouds_have_different_reasons():
     assert state(robot) is State.TRACKING  # verified by a frame after the pause
     for k in range(6):
         robot.saw(1.8 + 0.1 * k)
-        job = robot.session.take_lidar_frame()
+        job = robot.session.take_job("odometry")
         robot.session.handle_failure(job, "frame has 3 of 9 points between 1 and 100 m", rejected=True)
     robot.session.tick(robot.now)
     state_now, reason = robot.session.state()
@@ -138,7 +139,7 @@ def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
     assert robot.session.state()[1] == "waiting for clouds on coview/r1/in/cloud"
     robot.saw(0.0)
     assert robot.session.state()[1] == "no frame has been processed yet"
-    robot.session.handle_failure(robot.session.take_lidar_frame(), "no ground to take gravity from", rejected=True)
+    robot.session.handle_failure(robot.session.take_job("odometry"), "no ground to take gravity from", rejected=True)
     assert robot.session.state()[1] == "1 frames were of no use; see errors"
 
 
@@ -157,16 +158,16 @@ def test_lidar_odometry_restart_restarts_search():
 def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_lidar_frame()
+    job = robot.session.take_job("odometry")
     if kind == "restarted":
         robot.session.engine_restarted("odometry")
     robot.session.handle_failure(job, "Traceback\nBoom", rejected=False)
     said = {"failed": "lidar odometry failed on a frame", "restarted": "lidar odometry was started again: it died"}
     assert robot.session.state() == (State.LOST, said[kind])
     assert robot.counters.engine_errors == 1
-    assert robot.session.odometry.newest is None
+    assert robot.session.inputs.odometry.newest is None
     robot.saw(1.2)
-    again = robot.session.take_lidar_frame()
+    again = robot.session.take_job("odometry")
     assert again.epoch == job.epoch + 1
     assert ends(robot.counters) == robot.counters.received - 1
 
@@ -174,10 +175,10 @@ def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
 def test_odometry_result_of_old_epoch_is_dropped():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_lidar_frame()
+    job = robot.session.take_job("odometry")
     robot.session.engine_restarted("odometry")
     robot.session.handle_result(job, OdometryResult(np.eye(4), None, True, 0.0), robot.now)
-    assert robot.session.odometry.newest is None
+    assert robot.session.inputs.odometry.newest is None
     assert robot.counters.dropped == 1
     assert robot.frame(1.2, restarted=True) is not None
 
@@ -185,20 +186,20 @@ def test_odometry_result_of_old_epoch_is_dropped():
 def test_reset_drops_odometry_and_running_job():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_lidar_frame()
+    job = robot.session.take_job("odometry")
     robot.session.reset()
     robot.session.handle_result(job, OdometryResult(np.eye(4), None, False, 0.0), robot.now)
     assert counted(robot) == {}
     robot.saw(0.3)  # with any stamp
-    assert robot.session.take_lidar_frame().epoch > job.epoch
+    assert robot.session.take_job("odometry").epoch > job.epoch
 
 
 def test_restart_search_keeps_lidar_odometry():
     robot = Robot().drive(0.0, 1.0)
     robot.session.restart_search("asked to search again")
     robot.saw(1.1)
-    assert robot.session.take_lidar_frame().epoch == 1
-    assert robot.session.odometry.newest.stamp_ns == ns(1.0)
+    assert robot.session.take_job("odometry").epoch == 1
+    assert robot.session.inputs.odometry.newest.stamp_ns == ns(1.0)
 
 
 def test_stray_stamps_are_counted_and_restarted_clock_is_followed():
@@ -207,13 +208,13 @@ def test_stray_stamps_are_counted_and_restarted_clock_is_followed():
     robot.now += 0.1
     robot.session.on_cloud(cloud(2.0), robot.now)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
-    before = robot.session.take_lidar_frame()
+    before = robot.session.take_job("odometry")
     assert before is None
     for k in range(1, 16):
         robot.session.on_cloud(cloud(0.1 * k), 1006.0 + 0.1 * k)
     assert robot.counters.clock_restarts == 1
     assert robot.session.state() == (State.LOST, "the sender's clock started anew")
-    job = robot.session.take_lidar_frame()
+    job = robot.session.take_job("odometry")
     assert job.epoch == 2
     assert job.stamp_ns < ns(2.0)
 
@@ -228,5 +229,5 @@ def test_long_pause_restarts_lidar_odometry():
 def test_undecodable_cloud_is_only_counted():
     robot = Robot()
     robot.session.on_cloud(Sample(KEYS.cloud, b"rubbish", "video/raw"), 1000.0)
-    assert robot.session.take_lidar_frame() is None
+    assert robot.session.take_job("odometry") is None
     assert counted(robot) == {"received": 1, "unknown_encoding": 1}

@@ -78,13 +78,13 @@ def test_engine_that_died_while_idle_is_reported(pair, caplog):
         raise DiedError("the search engine died (by signal 9)")
 
     pair.search.watch = dead
-    pair.node.watch("search")
+    pair.node.feeds[0].watch("search")
     status = pair.status("r1")
     assert (status["state"], status["counters"]["engine_restarts"]) == ("TRACKING", 1)
     assert status["errors"] == ["the search engine is started again: the search engine died (by signal 9)"]
     assert "by signal 9" in caplog.text
     pair.track.watch = dead
-    pair.node.watch("track")
+    pair.node.feeds[0].watch("track")
     assert pair.status("r1")["state"] == "LOST"
 
 
@@ -151,9 +151,9 @@ def test_robots_are_served_round_robin():
         for name in names:
             for flood in range(10 if name == "r2" else 1):  # one sends ten times as much
                 site.sees(name, STEP * k + 0.001 * flood)
-        session, job = site.node.next_job("track")
+        session, job = site.node.feeds[0].next_job("track")
         served.append(job.robot)
-        site.node.work("track", session, job)
+        site.node.feeds[0].work("track", session, job)
     assert served == list(names) * 10
 
 

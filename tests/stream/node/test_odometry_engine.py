@@ -11,9 +11,8 @@ from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CloudError, DependencyError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.odometry import lidar_odometry as kiss
-from coview_stream.stream.node.engines import open_engine
-from coview_stream.stream.node.jobs import FrameJob, OdometryJob
-from coview_stream.stream.node.odometry_engine import OdometryEngine
+from coview_stream.stream.node.engine_queue import FrameJob, OdometryJob
+from coview_stream.stream.node.engines import OdometryEngine, open_engine
 
 LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.stream.node.scheduling import Rate
+from coview_stream.stream.node.counters import Rate
 
 
 def ticks(rate, times):

@@ -13,7 +13,7 @@ from sockets import until
 
 from coview_stream.errors import MapError
 from coview_stream.stream.node.engine_process import CancelledError, DiedError
-from coview_stream.stream.node.reload import MapReloader, OpenedMap
+from coview_stream.stream.node.node import OpenedMap
 from coview_stream.stream.node.session import Session
 
 OTHER = "b" * 64
@@ -23,18 +23,17 @@ class Change:
     """A running node of robots, and another map that is opened for it."""
 
     def __init__(self, *names, max_handover=60.0):
-        self.site = Site(*names)
         self.engine = Engine()
         self.runners = Runner(self.engine), Runner(self.engine)
         self.error = None
         self.notices = []
-        self.reloader = MapReloader(self.site.node, self.open, self.notices.append, max_handover)
-        self.site.node.reloader = self.reloader
-        self.site.node.run_beside("reload", self.reloader.run)
+        self.site = Site(*names, open_map=self.open, on_reload=self.notices.append)
+        self.reloader = self.site.node.reloader
+        self.reloader.max_handover = max_handover
         self.site.node.start()
         self.step = 0
 
-    def open(self, cancelled):
+    def open(self, served, cancelled):
         if self.error is not None:
             raise self.error
         sessions = [Session(keys, OTHER, self.site.node.config) for keys in self.site.keys.values()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from coview_stream.stream.node.scheduling import RoundRobin
+from coview_stream.stream.node.engine_queue import RoundRobin
 
 ROBOTS = ("a", "b", "c", "d")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.stream.node.scheduling import SearchDemand, search_order
+from coview_stream.stream.node.engine_queue import SearchDemand, search_order
 
 NOW = 1000.0
 KEYFRAMES = 1.33  # seconds between those of a robot: 2 m at 1.5 m/s

@@ -38,7 +38,7 @@ def test_processed_frame_is_counted(robot):
 def test_rejected_frame_is_counted(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
-    robot.session.handle_failure(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    robot.session.handle_failure(robot.session.take_job("track"), "cloud has 3 finite points", rejected=True)
     assert counted(robot) == {"received": 1, "rejected": 1, "odometry_received": 5}
     assert list(robot.session.errors.texts) == ["r1: frames of no use; the first: cloud has 3 finite points"]
 
@@ -47,7 +47,7 @@ def test_engine_error_is_reported_by_its_last_line(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
     trace = "Traceback:\n  somewhere\nValueError: boom\n"
-    robot.session.handle_failure(robot.session.take_frame(), trace, rejected=False)
+    robot.session.handle_failure(robot.session.take_job("track"), trace, rejected=False)
     assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
     assert list(robot.session.errors.texts) == ["r1: frames that the engine failed at; the first: ValueError: boom"]
 
@@ -57,30 +57,30 @@ def test_frame_replaced_by_a_newer_one_is_dropped(robot):
     for t in (0.2, 0.3, 0.4):
         robot.saw(t, now=1001.0)
     assert robot.counters.dropped == 2
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.stamp_ns == ns(0.4)
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
 
 
 def test_running_frame_is_not_dropped(robot):
     robot.drive(0.0, 1.0)
     robot.saw(0.2, now=1001.0)
-    busy = robot.session.take_frame()
+    busy = robot.session.take_job("track")
     robot.saw(0.3, now=1001.0)
     robot.saw(0.4, now=1001.0)
-    assert robot.session.take_frame() is None  # one at a time
+    assert robot.session.take_job("track") is None  # one at a time
     assert robot.counters.dropped == 1
     robot.session.handle_result(busy, tracking(busy), 1001.1)
-    assert robot.session.take_frame().stamp_ns == ns(0.4)
+    assert robot.session.take_job("track").stamp_ns == ns(0.4)
 
 
 def test_late_frame_is_counted(robot):
     robot.drive(0.0, 7.0)
     robot.saw(1.9, now=1007.0)
     assert robot.counters.late == 1
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
     robot.saw(2.1, now=1007.0)
-    assert robot.session.take_frame() is not None
+    assert robot.session.take_job("track") is not None
 
 
 def test_out_of_order_and_duplicate_frames_are_counted(robot):
@@ -90,7 +90,7 @@ def test_out_of_order_and_duplicate_frames_are_counted(robot):
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 0)
     robot.saw(0.4, now=1001.0)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
-    assert robot.session.take_frame().stamp_ns == ns(0.5)
+    assert robot.session.take_job("track").stamp_ns == ns(0.5)
 
 
 def test_duplicate_of_a_waiting_frame_is_counted(robot):
@@ -105,7 +105,7 @@ def test_waiting_frames_are_sorted_by_stamp(robot):
     for t in (0.3, 0.2):
         robot.saw(t, now=1000.3)
     robot.moved(0.25, now=1000.3)
-    assert robot.session.take_frame().stamp_ns == ns(0.2)
+    assert robot.session.take_job("track").stamp_ns == ns(0.2)
     robot.moved(0.35, now=1000.35)
     assert counted(robot) == {"received": 2, "odometry_received": 5}
 
@@ -178,17 +178,17 @@ def test_missing_frames_by_sequence_number_are_counted(robot):
 
 def test_searches_and_skipped_searches_are_counted(robot):
     robot.frame(0.0, unknown, ask=search_request(0.0))
-    job = robot.session.take_search_request()
+    job = robot.session.take_job("search")
     assert job.request.stamp == 0.0
     robot.frame(0.1, unknown, ask=search_request(0.1))
-    assert robot.session.take_search_request() is None  # one at a time
+    assert robot.session.take_job("search") is None  # one at a time
     assert robot.counters.searches_skipped == 0
     robot.frame(0.2, unknown, ask=search_request(0.2))
     assert (robot.counters.searches_skipped, robot.counters.searches) == (1, 0)
     robot.session.handle_result(job, search_result(), robot.now)
     assert robot.counters.searches == 1
-    assert robot.session.take_search_request().request.stamp == 0.2
-    assert robot.session.take_search_request() is None
+    assert robot.session.take_job("search").request.stamp == 0.2
+    assert robot.session.take_job("search") is None
 
 
 def test_fixes_poses_and_losses_are_counted(robot):
@@ -218,7 +218,7 @@ def test_frame_without_odometry_is_not_counted_missing():
     robot = Robot()
     robot.moved(0.0, x=0.0)
     robot.saw(0.0, attachment=numbered(1, 0.0))
-    robot.session.take_frame()
+    robot.session.take_job("track")
     robot.saw(0.3, attachment=numbered(2, 0.3))
     robot.session.tick(robot.now + 1.0)  # the second found none
     robot.moved(0.45, x=0.0)

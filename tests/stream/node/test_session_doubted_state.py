@@ -38,7 +38,7 @@ def test_odometry_pause_while_doubted_keeps_the_place(covered):
     assert covered.counters.losses == 0
     covered.moved(1.0, x=0.5)
     covered.saw(0.95)
-    job = covered.session.take_frame()
+    job = covered.session.take_job("track")
     assert (job.epoch, job.require_verification) == (epoch, True)
     covered.session.handle_result(job, tracking(job), covered.now)
     assert covered.session.pose() is not None
@@ -51,7 +51,7 @@ def test_odometry_timeout_while_doubted_keeps_the_place(covered):
     covered.moved(0.9, x=0.4)
     covered.moved(1.0, x=0.5)
     covered.saw(0.95)
-    job = covered.session.take_frame()
+    job = covered.session.take_job("track")
     assert (job.epoch, job.require_verification) == (epoch, True)
     covered.session.handle_result(job, tracking(job), covered.now)
     assert state(covered) is State.TRACKING
@@ -97,7 +97,7 @@ def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(an
     assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
     assert robot.counters.losses == 1
     robot.saw(3.9, now=robot.now)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.stamp_ns == ns(3.9)
     for k in range(80, 84):  # while the frame is under way
         robot.moved(0.05 * k, x=0.3)
@@ -113,7 +113,7 @@ def test_loss_has_newest_reason_and_is_counted_once():
     for answer, stamp in ((doubted, 0.1), (unknown, 0.2)):
         robot.moved(stamp, now=silent + stamp)
         robot.saw(stamp - 0.01, now=silent + stamp)
-        job = robot.session.take_frame()
+        job = robot.session.take_job("track")
         more = {"state": State.LOST, "reason": "in doubt for 60 s"} if answer is unknown else {}
         robot.session.handle_result(job, answer(job, **more), silent + stamp)
         if answer is doubted:
@@ -130,14 +130,14 @@ def test_frame_from_before_gap_does_not_count_as_verification():
     robot.drive(0.05, 0.3)
     robot.saw(0.2)
     robot.session.tick(robot.now + 0.6)  # silence: LOST, the next frame is suspect
-    busy = robot.session.take_frame()
+    busy = robot.session.take_job("track")
     assert busy.require_verification
     robot.moved(2.0, x=0.6, now=robot.now + 1.7)  # the robot was carried away meanwhile
     assert robot.counters.odometry_gaps == 1
     robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
     robot.saw(2.05)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.require_verification
 
 
@@ -145,13 +145,13 @@ def test_frame_from_before_gap_does_not_count_as_verification():
 def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
     robot = Robot().localized(0.0)
     robot.drive(0.05, 0.3)
-    robot.session.on_disconnected(robot.now + 1.0)
+    robot.session.inputs.disconnected_at = robot.now + 1.0
     robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
     assert robot.session.pose() is None
     assert robot.session.state()[0] is state
     robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
     robot.saw(0.35 + seconds)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.require_verification or state is State.LOST
     robot.session.handle_result(job, tracking(job), robot.now + 0.01)
     assert robot.session.pose() is not None

@@ -50,10 +50,10 @@ def test_reset_clears_the_session(robot):
 @pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
 def test_results_of_old_epoch_are_ignored(robot, how):
     robot.frame(0.0, unknown, ask=search_request(0.0))
-    searching = robot.session.take_search_request()
+    searching = robot.session.take_job("search")
     robot.drive(0.05, 0.2)
     robot.saw(0.15)
-    busy = robot.session.take_frame()
+    busy = robot.session.take_job("track")
     if how == "begin_anew":
         robot.session.restart_search("asked to")
     elif how == "reset":
@@ -67,25 +67,25 @@ def test_results_of_old_epoch_are_ignored(robot, how):
     robot.moved(0.3, x=far)
     robot.moved(0.35, x=far)
     robot.saw(0.33)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.search_result is None
     assert job.epoch > busy.epoch
     # the old frame's end does not end the new one
     robot.session.handle_result(job, unknown(job, ask=search_request(1.0)), robot.now)
-    assert robot.session.take_search_request().epoch == job.epoch
+    assert robot.session.take_job("search").epoch == job.epoch
 
 
 def test_failure_of_old_epoch_does_not_end_running_frame(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15)
-    old = robot.session.take_frame()
+    old = robot.session.take_job("track")
     robot.session.restart_search("asked to")
     robot.saw(0.18)
-    busy = robot.session.take_frame()
+    busy = robot.session.take_job("track")
     assert busy is not None
     robot.session.handle_failure(old, "boom", rejected=False)
     robot.saw(0.19)
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
     robot.session.handle_result(busy, tracking(busy), robot.now)
     assert robot.session.pose() is not None
 
@@ -93,7 +93,7 @@ def test_failure_of_old_epoch_does_not_end_running_frame(robot):
 def test_search_result_goes_with_the_next_frame_once(robot):
     robot.frame(0.0, unknown, ask=search_request(0.0))
     said = search_result()
-    robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
+    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
     assert robot.frame(0.1, unknown).search_result is said
     assert robot.frame(0.2, unknown).search_result is None
 
@@ -101,26 +101,26 @@ def test_search_result_goes_with_the_next_frame_once(robot):
 def test_search_result_is_kept_when_frame_is_rejected(robot):
     robot.frame(0.0, unknown, ask=search_request(0.0))
     said = search_result()
-    robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
+    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
     robot.drive(0.05, 0.2)
     robot.saw(0.1)
-    robot.session.handle_failure(robot.session.take_frame(), "too few points", rejected=True)
+    robot.session.handle_failure(robot.session.take_job("track"), "too few points", rejected=True)
     robot.saw(0.15)
-    assert robot.session.take_frame().search_result is said
+    assert robot.session.take_job("track").search_result is said
 
 
 def test_failed_search_skips_only_its_keyframe(robot):
     robot.frame(0.0, unknown, ask=search_request(0.0))
-    robot.session.handle_failure(robot.session.take_search_request(), "boom")
+    robot.session.handle_failure(robot.session.take_job("search"), "boom")
     assert robot.frame(0.1, unknown, ask=search_request(0.1)).search_result is None
-    assert robot.session.take_search_request() is not None
+    assert robot.session.take_job("search") is not None
 
 
 def test_engine_failure_starts_new_epoch(robot):
     epoch = robot.localized(0.0).frame(0.1).epoch
     robot.drive(0.15, 0.3)
     robot.saw(0.25)
-    robot.session.handle_failure(robot.session.take_frame(), "boom", rejected=False)
+    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=False)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     assert robot.frame(0.4, unknown).epoch != epoch
@@ -130,7 +130,7 @@ def test_frame_result_of_before_reset_is_ignored():
     robot = Robot()
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.reset()
     robot.session.handle_result(job, tracking(job), robot.now)
     assert robot.counters.received == robot.counters.processed == 0
@@ -139,7 +139,7 @@ def test_frame_result_of_before_reset_is_ignored():
 def test_search_result_of_before_reset_is_ignored():
     robot = Robot()
     robot.frame(0.0, unknown, ask=search_request(0.0))
-    job = robot.session.take_search_request()
+    job = robot.session.take_job("search")
     robot.session.reset()
     robot.session.handle_result(job, search_result(), robot.now)
     assert robot.counters.searches == 0
@@ -150,14 +150,14 @@ def test_odometry_gap_during_first_fix_restarts_search():
     robot.frame(0.0, unknown, state=State.AMBIGUOUS)
     robot.drive(0.05, 0.3)
     robot.saw(0.2)
-    busy = robot.session.take_frame()  # carries the verdict that will be accepted
+    busy = robot.session.take_job("track")  # carries the verdict that will be accepted
     robot.moved(2.0, x=0.6, now=robot.now + 0.02)
     assert robot.counters.odometry_gaps == 1
     robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)
     assert robot.session.pose() is None
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
     robot.saw(2.05)
-    assert robot.session.take_frame().epoch > busy.epoch  # the search begins anew
+    assert robot.session.take_job("track").epoch > busy.epoch  # the search begins anew
 
 
 def test_long_odometry_outage_loses_the_place():

@@ -20,15 +20,15 @@ def robot():
 def test_frame_is_paired_with_odometry_at_its_stamp(robot):
     robot.drive(0.0, 0.5, rate=10.0)
     robot.saw(0.325, now=1000.5)
-    np.testing.assert_allclose(robot.session.take_frame().T_odom_body, pose(0.65), atol=1e-9)
+    np.testing.assert_allclose(robot.session.take_job("track").T_odom_body, pose(0.65), atol=1e-9)
 
 
 def test_frame_waits_for_odometry_after_its_stamp(robot):
     robot.drive(0.0, 0.1)
     robot.saw(0.12)
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
     robot.moved(0.15)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.stamp_ns == ns(0.12)
     np.testing.assert_allclose(job.T_odom_body, pose(0.24), atol=1e-9)
 
@@ -38,7 +38,7 @@ def test_frame_without_odometry_does_not_block_others(robot):
     robot.drive(0.0, 0.1)
     robot.saw(3600.0, now=1000.1)
     robot.saw(0.05, now=1000.1)
-    assert robot.session.take_frame().stamp_ns == ns(0.05)
+    assert robot.session.take_job("track").stamp_ns == ns(0.05)
     robot.session.tick(1000.5)
     assert robot.counters.no_odometry == 1
     robot.drive(0.15, 0.6)
@@ -52,16 +52,16 @@ def test_waiting_clouds_are_bounded(robot):
         robot.saw(0.2 + 0.001 * k, now=1000.2)
     assert 92 - 1 <= robot.counters.dropped <= 92 + 1
     robot.moved(0.35)
-    assert robot.session.take_frame().stamp_ns == ns(0.299)
+    assert robot.session.take_job("track").stamp_ns == ns(0.299)
 
 
 def test_sweep_waits_for_odometry_at_its_end(robot):
     robot.drive(0.0, 0.2)
     times = np.linspace(0.0, 0.1, len(POINTS))
     robot.saw(0.15, now=1000.26, codec="foxglove", times=times)
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
     robot.moved(0.26)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     np.testing.assert_allclose(job.times, times, atol=1e-6)
     assert job.segment.stamps.tolist()[0] <= ns(0.15)
     assert job.segment.stamps.tolist()[-1] >= ns(0.25)
@@ -71,15 +71,15 @@ def test_sweep_wait_is_bounded(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.26, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
     robot.session.tick(1000.40)
-    assert robot.session.take_frame() is None
+    assert robot.session.take_job("track") is None
     robot.session.tick(1000.42)
-    assert robot.session.take_frame() is not None
+    assert robot.session.take_job("track") is not None
 
 
 def test_sweep_with_times_before_the_stamp(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.18, codec="foxglove", times=np.linspace(-0.1, 0.0, len(POINTS)))
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.segment.stamps.tolist()[0] <= ns(0.08)
     assert job.segment.stamps.tolist()[-1] >= ns(0.18)
 
@@ -88,7 +88,7 @@ def test_deskew_option_off():
     robot = Robot(NodeConfig(deskew=False))
     robot.drive(0.0, 0.2)
     robot.saw(0.18, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
-    assert robot.session.take_frame().segment is None
+    assert robot.session.take_job("track").segment is None
 
 
 def test_reason_names_the_missing_messages(robot):
@@ -131,7 +131,7 @@ def test_error_log_is_deduplicated_and_bounded(robot):
 def test_latency_is_measured_from_cloud_to_result(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.2)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.handle_result(job, tracking(job), 1000.26)
     assert robot.session.queue.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
     assert robot.session.queue.engine_latency.to_json()["p50"] == 10.0
@@ -144,7 +144,7 @@ def test_longest_wait_excludes_sender_pauses(robot):
     robot.drive(60.1, 60.4)
     robot.saw(60.2)
     robot.saw(60.3)  # takes the place of the other, which has waited since 60.2
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.handle_result(job, tracking(job), 1061.0)
     assert robot.session.queue.longest_wait == pytest.approx(0.8, abs=0.01)
 
@@ -154,7 +154,7 @@ def test_codec_options_override_encoding():
     sample, moved = cloud(0.0), odometry(0.0)
     session.on_cloud(Sample(sample.key, sample.payload, "video/raw", sample.attachment), 0.0)
     session.on_odometry(Sample(moved.key, moved.payload, "video/raw"), 0.0)
-    assert session.take_frame() is not None
+    assert session.take_job("track") is not None
 
 
 def test_frame_that_replaced_another_defers_registration():
@@ -162,8 +162,8 @@ def test_frame_that_replaced_another_defers_registration():
     robot.drive(-0.1, 0.5)
     robot.saw(0.0)
     robot.saw(0.1)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert (job.stamp_ns, job.defer) == (ns(0.1), True)
     robot.session.handle_result(job, tracking(job), robot.now)
     robot.saw(0.2)
-    assert not robot.session.take_frame().defer
+    assert not robot.session.take_job("track").defer

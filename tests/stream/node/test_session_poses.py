@@ -18,12 +18,20 @@ def robot():
     return Robot()
 
 
+def age(robot):
+    return robot.session.robot_state.age(robot.session.inputs.odometry)
+
+
+def level(robot):
+    return robot.session.robot_state.protection_level(robot.session.inputs.odometry)
+
+
 def test_no_pose_before_the_first_fix(robot):
     robot.drive(0.0, 1.0)
     assert robot.session.pose() is None
     robot.frame(1.1, unknown)
     assert robot.session.pose() is None
-    assert robot.session.age() is None
+    assert age(robot) is None
     robot.frame(1.2, unknown, state=State.AMBIGUOUS)
     assert robot.session.pose() is None
     assert robot.counters.poses == 0
@@ -37,7 +45,7 @@ def test_pose_is_corrected_newest_odometry(robot):
     np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(0.8), atol=1e-9)
     assert (sent.robot, sent.state, sent.map_sha256, sent.confidence) == ("r1", "TRACKING", SHA, 0.8)
     assert sent.age == pytest.approx(0.4)
-    assert robot.session.age() == pytest.approx(0.4)
+    assert age(robot) == pytest.approx(0.4)
 
 
 def test_pose_covariance_grows_with_distance_and_turn():
@@ -70,9 +78,9 @@ def test_protection_level_grows_with_distance_and_keeps_its_doubt():
     later = robot.session.pose()
     assert later.protection == protection_level(later.covariance, 1.5)
     assert later.protection.metres > begin.protection.metres
-    assert robot.session.protection_level() == later.protection
+    assert level(robot) == later.protection
     robot.frame(2.1, doubted)
-    assert robot.session.protection_level() is None
+    assert level(robot) is None
 
 
 def test_heading_error_propagates_to_position():
@@ -100,7 +108,7 @@ def test_correction_does_not_change_published_stamps(robot):
         robot.moved(0.05 * k)
         if k % 2 == 0:
             robot.saw(0.05 * k - 0.02)
-            job = robot.session.take_frame()
+            job = robot.session.take_job("track")
             robot.session.handle_result(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
         sent = robot.session.pose()
         stamps.append(sent.stamp_ns)
@@ -133,7 +141,7 @@ def test_odometry_timeout_ends_pose(robot):
     assert robot.session.pose() is not None
     robot.session.tick(robot.now + 0.51)
     assert robot.session.pose() is None
-    assert robot.session.age() is None
+    assert age(robot) is None
     assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
     assert robot.counters.losses == 1
 
@@ -146,26 +154,26 @@ def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     robot.saw(0.19, now=silent + 0.02)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.require_verification
     robot.session.handle_result(job, doubted(job), silent + 0.05)
     assert robot.session.pose() is None
     robot.moved(0.3, now=silent + 0.1)
     robot.saw(0.29, now=silent + 0.1)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.handle_result(job, tracking(job), silent + 0.15)
     assert state(robot) is State.TRACKING
     assert robot.session.pose() is not None
     robot.moved(0.4, now=silent + 0.2)
     robot.saw(0.39, now=silent + 0.2)
-    assert not robot.session.take_frame().require_verification
+    assert not robot.session.take_job("track").require_verification
 
 
 def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     robot.localized(0.0)
     robot.drive(0.05, 0.3)
     robot.saw(0.25)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.tick(robot.now + 0.6)
     robot.session.handle_result(job, tracking(job), robot.now + 0.7)
     assert robot.session.pose() is None
@@ -192,7 +200,7 @@ def test_dead_reckoning_ends_after_timeout():
     assert robot.session.pose() is None
     assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
     robot.saw(2.19)
-    assert robot.session.take_frame().require_verification
+    assert robot.session.take_job("track").require_verification
 
 
 def test_rejected_frames_do_not_extend_dead_reckoning():
@@ -200,7 +208,7 @@ def test_rejected_frames_do_not_extend_dead_reckoning():
     for k in range(1, 30):
         robot.moved(0.05 * k)
         robot.saw(0.05 * k - 0.01)
-        job = robot.session.take_frame()
+        job = robot.session.take_job("track")
         robot.session.handle_failure(job, "too few points", rejected=True)
         robot.session.tick(robot.now)
     assert state(robot) is State.LOST
@@ -215,7 +223,7 @@ def test_odometry_gap_ends_pose_until_a_frame_is_verified(robot):
     assert "pause" in reason(robot)
     robot.moved(0.9, x=0.0, now=1000.2)
     robot.saw(0.85, now=1000.2)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.require_verification
     robot.session.handle_result(job, tracking(job), 1000.3)
     assert robot.session.pose() is not None
@@ -228,7 +236,7 @@ def test_odometry_jump_restarts_search(robot):
     assert robot.session.state() == (State.LOST, "odometry jumped")
     robot.moved(0.2, x=900.1)
     robot.saw(0.18)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     assert job.epoch != first.epoch
     assert not job.require_verification  # the engine begins anew as well
     assert job.search_result is None
@@ -241,7 +249,7 @@ def test_restarted_sender_clock_may_publish_older_stamps():
         robot.session.tick(robot.now)
     assert robot.session.state() == (State.LOST, "the sender's clock started anew")
     robot.saw(1.42, now=1102.0)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.handle_result(job, tracking(job), 1102.0)
     assert robot.session.pose().stamp_ns == ns(1.45)
 
@@ -252,7 +260,7 @@ def test_one_stamp_never_gets_two_poses():
     robot.saw(0.0)
     robot.drive(0.05, 0.1)
     robot.saw(0.1)
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     before = robot.session.pose()
     robot.session.handle_result(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
     assert robot.session.pose() is before
@@ -268,7 +276,7 @@ def test_late_cloud_covariance_includes_odometry_since():
     robot = Robot()
     robot.drive(0.0, 3.0)  # 2 m/s
     robot.saw(1.0, now=1003.0)  # two seconds in the network
-    job = robot.session.take_frame()
+    job = robot.session.take_job("track")
     robot.session.handle_result(job, tracking(job, drift=drift, covariance=known), 1003.0)
     grown = robot.session.pose().covariance - known
     np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)

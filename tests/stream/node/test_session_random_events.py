@@ -68,10 +68,10 @@ class Chaos:
         elif event == "odometry garbage":
             session.on_odometry(Sample(KEYS.odometry, value, "application/json"), self.now)
         elif event == "take":
-            if (job := session.take_frame()) is not None:
+            if (job := session.take_job("track")) is not None:
                 self.jobs.append(job)
         elif event == "take search":
-            if (search := session.take_search_request()) is not None:
+            if (search := session.take_job("search")) is not None:
                 self.searches.append(search)
         elif event == "searched" and self.searches:
             if value:
@@ -120,7 +120,7 @@ class Chaos:
         assert state is State.TRACKING
         assert counters.fixes > 0
         assert self.session.age() is not None
-        newest = self.session.odometry.newest
+        newest = self.session.inputs.odometry.newest
         assert sent.stamp_ns == newest.stamp_ns
         restarts = counters.clock_restarts
         if self.published is not None and self.published[0] == restarts:

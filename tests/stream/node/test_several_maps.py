@@ -15,8 +15,8 @@ from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages.json_messages import decode_hypotheses, encode_hypotheses
 from coview_stream.messages.types import Sample
-from coview_stream.stream.node.initial_pose import guess_of_fields
-from coview_stream.stream.node.status import status
+from coview_stream.stream.node.last_place import guess_of_fields
+from coview_stream.stream.node.status import hypotheses, status
 from coview_stream.stream.transport.transport import Connection
 
 WEST, EAST = np.array([-5000.0, 10.0, 0.0]), np.array([40.0, 0.0, -2.0])
@@ -52,7 +52,7 @@ def test_status_says_the_map_while_a_place_is_known(robot):
     counted = robot.counters.poses
     assert told() == "east"
     assert robot.counters.poses == counted  # asking for the map is no pose
-    robot.session.relocalize()
+    robot.session.restart_search("asked to search again", forget=True)
     assert told() is None
     assert "map" not in status(Robot().session, Connection((), ()), 0, 0.0, 0.0)
 
@@ -62,8 +62,8 @@ def test_places_that_a_search_considers_are_each_on_a_map(robot):
     robot.frame(0.1, lambda job: unknown(job, ask=search_request()))
     places = np.array([[60.0, 2.0, 3.0, 0.5, 0.7, 9.0], [-20.0, 5.0, 6.0, -0.5, 0.1, 2.0]])
     result = replace(search_result(), considered=Considered(1.5, places, 0.2))
-    robot.session.handle_result(robot.session.take_search_request(), result, robot.now)
-    message = robot.session.hypotheses()
+    robot.session.handle_result(robot.session.take_job("search"), result, robot.now)
+    message = hypotheses(robot.session)
     assert message.maps == ("east", "west")
     np.testing.assert_allclose(message.places[:, :3], places[:, :3] - np.array([EAST, WEST]))
     again = decode_hypotheses(Sample("k", encode_hypotheses(message).payload, "application/json"))
@@ -73,10 +73,10 @@ def test_places_that_a_search_considers_are_each_on_a_map(robot):
 def test_guess_names_its_map(robot):
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, map="west"))
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, map="west", within=1e6))
-    part, area = robot.session.parts.named("west"), robot.session._guess.area(np.zeros(3))
+    part, area = robot.session.parts.named("west"), robot.session.hints.guess.area(np.zeros(3))
     beside = np.array([[part.begin + 1.0, 2.0], [part.end - 1.0, 2.0], [part.begin - 1.0, 2.0], [part.end + 1.0, 2.0]])
     np.testing.assert_array_equal(area.holds(beside), [True, True, False, False])
-    taken = robot.session._guess
+    taken = robot.session.hints.guess
     assert (taken.x, taken.y, taken.map) == (1.0 + WEST[0], 2.0 + WEST[1], None)
     with pytest.raises(InputError, match="no map is named: this node has west, east"):
         robot.session.guess_place(PlaceGuess(1.0, 2.0))

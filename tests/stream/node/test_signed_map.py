@@ -6,7 +6,6 @@ import os
 import time
 
 import pytest
-from sockets import free_endpoint
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, Trust, make_keys, read_verify_key
@@ -33,7 +32,7 @@ def save(world_map, folder, key, **more):
 def options_of(site):
     keys = [robot_keys("native", "coview", "r1")]
     verify = read_verify_key(site / "ours.pub")
-    return serve.ServeOptions(site / "site.coview", keys, listen=[free_endpoint()], verify_key=verify)
+    return serve.ServeOptions(site / "site.coview", keys, verify_key=verify)
 
 
 @pytest.mark.parametrize(("key", "said"), [(None, "not signed"), ("theirs", "another key")])

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.stream.node.status import status
-from coview_stream.stream.node.status_size import MAX_STATUS, encode_status
+from coview_stream.stream.node.status import MAX_STATUS, NodeIdentity, encode_status, status
 from coview_stream.stream.transport.transport import Connection
 
 LONG = "the place that fits best is 1 in 3 to be wrong, and another one fits as well; " * 8
@@ -69,3 +68,27 @@ def test_long_name_of_a_robot_stays_whole(length):
     document["robot"] = "r" * length
     short = json.loads(encode_status(document))
     assert short["robot"] == "r" * length
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"", b"{", b"[]", b"7", b"null", b'{"node": 3}', b"[" * 100_000, b" " * 70_000,
+        *(
+            json.dumps({"node": {"id": "a", "term": 1, "period_s": 1.0, "ending": False} | wrong}).encode()
+            for wrong in (
+                {"id": ""}, {"id": 4}, {"id": "x" * 65}, {"period_s": 0}, {"period_s": -1.0}, {"period_s": 1e9},
+                {"period_s": float("nan")}, {"period_s": None}, {"period_s": True}, {"ending": 1}, {"id": "a\nb"},
+                {"host": "\x1b[2J"}, {"host": 3}, {"host": "x" * 65},
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_status_of_a_stranger_names_no_node(text):
+    assert NodeIdentity.read(text) is None
+
+
+def test_node_is_read_as_it_was_written():
+    node = NodeIdentity("abc", "machine-7", 0.5)
+    assert NodeIdentity.read(json.dumps({"state": "LOST", "node": node.to_json()}).encode()) == node
+    assert NodeIdentity.read(json.dumps({"node": node.to_json(ending=True)}).encode()).ending

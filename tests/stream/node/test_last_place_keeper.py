@@ -16,12 +16,11 @@ from sockets import until
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.state import State
-from coview_stream.stream.node import last_pose
-from coview_stream.stream.node import last_pose_keeper as memory
+from coview_stream.stream.node import last_place, last_place_keeper
+from coview_stream.stream.node.engine_queue import FrameJob
 from coview_stream.stream.node.engines import TrackEngine
-from coview_stream.stream.node.jobs import FrameJob
-from coview_stream.stream.node.last_pose import LastPose, file_of, load, save
-from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
+from coview_stream.stream.node.last_place import LastPlace, file_of, load, save
+from coview_stream.stream.node.last_place_keeper import LastPlaceKeeper
 
 BEFORE = pose_from(rot_z(1.0), [30.0, 40.0, 1.5])
 
@@ -42,7 +41,7 @@ def jobs_of(robot, count=3, answer=unknown, begin=0.1):
 
 
 def test_pose_hint_goes_with_one_frame(robot):
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     first, *others = jobs_of(robot)
     assert first is BEFORE
     assert others == [None, None]
@@ -50,10 +49,10 @@ def test_pose_hint_goes_with_one_frame(robot):
 
 def test_calibration_goes_with_the_pose_hint_alone(robot):
     known = Calibration(pitch=0.05)
-    robot.session.hint_pose(BEFORE, known)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE, calibration=known))
     jobs = [robot.frame(0.1 + 0.1 * k, unknown) for k in range(2)]
     assert [job.calibration for job in jobs] == [known, None]
-    robot.session.relocalize()
+    robot.session.restart_search("asked to search again", forget=True)
     assert robot.frame(0.5, unknown).calibration is None
 
 
@@ -65,13 +64,13 @@ def test_calibration_is_kept_with_the_pose_and_begins_the_next_start(robot, tmp_
         return replace(result, fix=replace(result.fix, calibration=known))
 
     robot.frame(0.1, calibrated)
-    assert robot.session.calibration == known
+    assert robot.session.robot_state.calibration == known
     robot.frame(0.2, unknown)
-    assert robot.session.calibration == known  # of the robot, not of the place
+    assert robot.session.robot_state.calibration == known  # of the robot, not of the place
     robot.frame(0.3, calibrated)
-    LastPoseKeeper(tmp_path, [robot.session]).keep()
+    LastPlaceKeeper(tmp_path, [robot.session]).keep()
     later = Robot()
-    LastPoseKeeper(tmp_path, [later.session]).hint()
+    LastPlaceKeeper(tmp_path, [later.session]).hint()
     later.moved(0.0)
     assert later.frame(0.1, unknown).calibration == known
 
@@ -91,19 +90,19 @@ def test_calibration_of_a_robot_without_a_place_is_told_but_not_kept(robot, tmp_
         return unknown(job, State.LOST)
 
     robot.frame(0.1, told(tracking, known))
-    keeper = LastPoseKeeper(tmp_path, [robot.session])
+    keeper = LastPlaceKeeper(tmp_path, [robot.session])
     keeper.keep()
     robot.frame(0.2, told(lost, relearnt))
-    assert robot.session.calibration == relearnt
+    assert robot.session.robot_state.calibration == relearnt
     keeper.keep()
     assert load(tmp_path, robot.session.keys.robot, SHA).calibration == known
     robot.session.reset()
-    assert robot.session.calibration is None
+    assert robot.session.robot_state.calibration is None
 
 
 def test_calibration_is_offered_again_with_each_odometry_frame(robot):
     known = Calibration(pitch=0.05)
-    robot.session.hint_pose(BEFORE, known)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE, calibration=known))
     assert robot.frame(0.1, unknown).calibration == known
     robot.session.engine_restarted()
     assert robot.frame(0.3, unknown).calibration == known
@@ -112,30 +111,30 @@ def test_calibration_is_offered_again_with_each_odometry_frame(robot):
 def test_pose_hint_waits_while_a_frame_is_running(robot):
     robot.saw(0.0)
     robot.moved(0.05)
-    job = robot.session.take_frame()
-    robot.session.hint_pose(BEFORE)
+    job = robot.session.take_job("track")
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     robot.session.handle_result(job, unknown(job), robot.now)
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
 def test_pose_hint_is_kept_when_frame_is_rejected(robot):
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     robot.saw(0.0)
     robot.moved(0.05)
-    robot.session.handle_failure(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    robot.session.handle_failure(robot.session.take_job("track"), "cloud has 3 finite points", rejected=True)
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
 def test_pose_hint_is_dropped_when_engine_fails(robot):
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     robot.saw(0.0)
     robot.moved(0.05)
-    robot.session.handle_failure(robot.session.take_frame(), "boom", rejected=False)
+    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=False)
     assert jobs_of(robot) == [None, None, None]
 
 
 def test_pose_hint_is_sent_again_after_engine_restart(robot):
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     jobs_of(robot, 1)
     robot.session.engine_restarted("search")
     assert jobs_of(robot, 1, begin=0.2) == [None]
@@ -145,7 +144,7 @@ def test_pose_hint_is_sent_again_after_engine_restart(robot):
 
 def test_pose_hint_is_ignored_while_tracking(robot):
     robot.localized(0.1)
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     assert jobs_of(robot, 2, tracking, 0.2) == [None, None]
     robot.session.engine_restarted()
     np.testing.assert_allclose(jobs_of(robot, 1, begin=0.4)[0], T_MAP_ODOM @ pose(0.6), atol=1e-9)
@@ -159,40 +158,40 @@ def test_odometry_jump_hints_the_last_pose(robot):
     robot.moved(0.35, x=500.1)
     robot.saw(0.4, now=robot.now)
     robot.moved(0.45, x=500.2)
-    np.testing.assert_allclose(robot.session.take_frame().hint, place, atol=1e-9)
+    np.testing.assert_allclose(robot.session.take_job("track").hint, place, atol=1e-9)
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
 def test_reset_or_relocalize_drops_pose_hints(robot, ask):
-    robot.session.hint_pose(BEFORE)
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
     robot.localized(0.1)
-    getattr(robot.session, ask)()
-    assert robot.session.last_known_pose().T_map_body is None
+    robot.session.reset() if ask == "reset" else robot.session.restart_search("asked", forget=True)
+    assert robot.session.last_place() is None
     robot.moved(0.2)
     robot.session.engine_restarted()
-    robot.session.hint_pose(BEFORE)  # by a disk that has been slow
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))  # by a disk that has been slow
     robot.moved(0.25)
     assert jobs_of(robot, 3, begin=0.3) == [None] * 3
     # but what has been found since then is known
     robot.frame(0.8)
-    assert robot.session.last_known_pose().stamp_ns == ns(0.81)
+    assert robot.session.last_place().stamp_ns == ns(0.81)
     robot.session.engine_restarted()
     assert jobs_of(robot, 1, begin=0.9)[0] is not None
 
 
 def test_last_known_pose_is_the_newest(robot):
-    assert robot.session.last_known_pose().T_map_body is None
+    assert robot.session.last_place() is None
     robot.frame(0.1, unknown)
-    assert robot.session.last_known_pose().T_map_body is None
+    assert robot.session.last_place() is None
     robot.localized(0.2)
     robot.moved(0.4)
     poses = robot.counters.poses
-    now = robot.session.last_known_pose()
+    now = robot.session.last_place()
     assert now.stamp_ns == ns(0.4)
     np.testing.assert_allclose(now.T_map_body, T_MAP_ODOM @ pose(0.8), atol=1e-9)
     assert robot.counters.poses == poses  # nothing has been published
     robot.session.tick(robot.now + 60.0)
-    assert robot.session.last_known_pose().T_map_body is None
+    assert robot.session.last_place() is None
 
 
 # ---- the engine
@@ -220,7 +219,7 @@ def test_pose_hint_reaches_the_localizer(world_map, world_drive):
 def remembering(folder, *names, **more):
     site = Site(*names)
     site.node.declare()
-    return site, LastPoseKeeper(folder, list(site.sessions.values()), **more)
+    return site, LastPlaceKeeper(folder, list(site.sessions.values()), **more)
 
 
 def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
@@ -240,28 +239,28 @@ def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     assert "r1: was last at 100.0, -20.0" in caplog.text
     for name, place in (("r1", saved.T_map_body), ("r2", None)):
         again.sees(name, 5.0)
-        suggested = again.sessions[name].take_frame().hint
+        suggested = again.sessions[name].take_job("track").hint
         assert suggested is None if place is None else np.array_equal(suggested, place)
     assert again.status("r1")["state"] == "SEARCHING"  # it is never trusted
 
 
 def test_last_pose_of_another_map_is_ignored(tmp_path):
-    save(tmp_path, LastPose("r1", "cd" * 32, 5, BEFORE))
+    save(tmp_path, "r1", LastPlace("cd" * 32, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1")
     kept.hint()
     site.sees("r1", 0.0)
-    assert site.sessions["r1"].take_frame().hint is None
+    assert site.sessions["r1"].take_job("track").hint is None
 
 
 def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
     file_of(tmp_path, "r1", SHA).write_text("{")
-    save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
+    save(tmp_path, "r2", LastPlace(SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
     kept.hint()
     (line,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
     assert str(file_of(tmp_path, "r1", SHA)) in line
     site.sees("r2", 0.0)
-    assert site.sessions["r2"].take_frame().hint is not None
+    assert site.sessions["r2"].take_job("track").hint is not None
     site.frame("r1", 0.0)
     kept.keep()
     assert load(tmp_path, "r1", SHA) is not None
@@ -269,7 +268,12 @@ def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
 
 def writes(monkeypatch):
     made = []
-    monkeypatch.setattr(memory, "save", lambda folder, last: (made.append(last), save(folder, last)))
+
+    def record(folder, robot, place):
+        made.append(place)
+        save(folder, robot, place)
+
+    monkeypatch.setattr(last_place_keeper, "save", record)
     return made
 
 
@@ -291,8 +295,8 @@ def test_standing_robot_is_saved_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
 def test_reset_or_relocalize_deletes_saved_pose(tmp_path, ask):
-    save(tmp_path, LastPose("r1", SHA, 5, BEFORE))
-    save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
+    save(tmp_path, "r1", LastPlace(SHA, 5, BEFORE))
+    save(tmp_path, "r2", LastPlace(SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
     kept.hint()
     site.net.query(f"coview/r1/rpc/{ask}")
@@ -322,7 +326,7 @@ def test_failing_disk_logs_one_warning(tmp_path, caplog, monkeypatch):
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(last_pose.os, "fsync", full)
+    monkeypatch.setattr(last_place.os, "fsync", full)
     for k in range(5, 9):
         site.moves("r1", 0.2 * k)
         kept.keep()
@@ -336,21 +340,20 @@ def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, 
     site, kept = remembering(tmp_path, "r1", "r2")
     for name in ("r1", "r2"):
         site.frame(name, 0.0)
-    monkeypatch.setattr(site.sessions["r1"], "last_known_pose", fail)
+    monkeypatch.setattr(site.sessions["r1"], "last_place", fail)
     kept.keep()
     assert load(tmp_path, "r2", SHA) is not None
     assert "unforeseen" in caplog.text
 
 
 def running(site, kept):
-    site.node._background = {"last-pose": kept.run}
-    site.node.start()
+    site.node.start({"last-pose": kept.run})
     return site
 
 
 def test_running_node_saves_periodically_and_at_close(tmp_path):
     site = Site("r1")
-    kept = LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.05)
+    kept = LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.05)
     running(site, kept)
     try:
         site.sees("r1", 0.0)
@@ -367,13 +370,13 @@ def test_running_node_saves_periodically_and_at_close(tmp_path):
 def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch):
     hanging, released = threading.Event(), threading.Event()
 
-    def hang(folder, last):
+    def hang(folder, robot, place):
         hanging.set()
         released.wait(30.0)
 
-    monkeypatch.setattr(memory, "save", hang)
+    monkeypatch.setattr(last_place_keeper, "save", hang)
     site = Site("r1")
-    running(site, LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
+    running(site, LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
     try:
         site.sees("r1", 0.0)
         until(hanging.is_set)
@@ -390,9 +393,9 @@ def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_hanging_disk_at_start_does_not_block_the_node(tmp_path, monkeypatch):
     released = threading.Event()
-    monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))
+    monkeypatch.setattr(last_place_keeper, "load", lambda *args: released.wait(30.0))
     site = Site("r1")
-    running(site, LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
+    running(site, LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
     try:
         site.sees("r1", 0.0)
         until(lambda: site.net.samples("coview/r1/out/pose"))
@@ -407,4 +410,4 @@ def test_last_pose_is_hinted_after_engine_death(tmp_path):
     site.track.dead = True
     site.frame("r1", STEP)
     site.sees("r1", 2 * STEP)
-    np.testing.assert_allclose(site.sessions["r1"].take_frame().hint, T_MAP_ODOM @ pose(0.0), atol=1e-9)
+    np.testing.assert_allclose(site.sessions["r1"].take_job("track").hint, T_MAP_ODOM @ pose(0.0), atol=1e-9)

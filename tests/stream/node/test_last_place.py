@@ -15,39 +15,39 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.stream.node import last_pose
-from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, remove_parts, save
+from coview_stream.stream.node import last_place
+from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, forget, load, remove_parts, save
 
 SHA = "0123456789abcdef" * 4
 UTM = [512_345.678_901, 5_403_210.123_456, 287.4]
-LAST = LastPose("r1", SHA, 1_700_000_000_123_456_789, exp_se3(np.array([0.02, -0.01, 2.1, *UTM])))
+LAST = LastPlace(SHA, 1_700_000_000_123_456_789, exp_se3(np.array([0.02, -0.01, 2.1, *UTM])))
 
 
 def same(a, b):
-    assert (a.robot, a.map_sha256, a.stamp_ns) == (b.robot, b.map_sha256, b.stamp_ns)
+    assert (a.map_sha256, a.stamp_ns) == (b.map_sha256, b.stamp_ns)
     np.testing.assert_array_equal(a.T_map_body, b.T_map_body)  # every bit
 
 
 def test_last_pose_round_trip(tmp_path):
-    path = save(tmp_path / "made" / "now", LAST)
+    path = save(tmp_path / "made" / "now", "r1", LAST)
     assert path.name == "r1-0123456789abcdef.json"
-    found = load(tmp_path / "made" / "now", "r1", SHA)
-    same(found, LAST)
-    assert found.T_map_body.dtype == np.float64
+    loaded = load(tmp_path / "made" / "now", "r1", SHA)
+    same(loaded, LAST)
+    assert loaded.T_map_body.dtype == np.float64
 
 
 def test_calibration_comes_back_with_the_pose(tmp_path):
     known = Calibration(0.01, -0.05, 0.03, 1e-4, 0.002, 0.001, 1e-5)
-    save(tmp_path, replace(LAST, calibration=known))
+    save(tmp_path, "r1", replace(LAST, calibration=known))
     assert load(tmp_path, "r1", SHA).calibration == known
-    save(tmp_path, LAST)
+    save(tmp_path, "r1", LAST)
     assert load(tmp_path, "r1", SHA).calibration is None
 
 
 def test_calibration_of_a_robot_whose_sensor_cannot_lean_comes_back(tmp_path):
     """Lidar odometry knows the tilt for sure: its sigma is zero."""
     known = CalibrationEstimator(sensor_leans=False).calibration
-    save(tmp_path, replace(LAST, calibration=known))
+    save(tmp_path, "r1", replace(LAST, calibration=known))
     assert load(tmp_path, "r1", SHA).calibration == known
 
 
@@ -56,7 +56,7 @@ def test_calibration_of_a_robot_whose_sensor_cannot_lean_comes_back(tmp_path):
     [5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": -0.1}, {"scale": float("nan")}, {"ground": float("nan")}],
 )
 def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
-    path = save(tmp_path, LAST)
+    path = save(tmp_path, "r1", LAST)
     document = json.loads(path.read_text()) | {"calibration": wrong}
     path.write_text(json.dumps(document))
     assert load(tmp_path, "r1", SHA) is None
@@ -64,15 +64,15 @@ def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
 
 
 def test_calibration_with_fields_of_another_release_is_read(tmp_path):
-    path = save(tmp_path, LAST)
+    path = save(tmp_path, "r1", LAST)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"calibration": {"pitch": 0.05, "phase_of_moon": 3}}))
     assert load(tmp_path, "r1", SHA).calibration == Calibration(pitch=0.05)
 
 
 def test_newer_pose_replaces_older_file(tmp_path):
-    save(tmp_path, LAST)
+    save(tmp_path, "r1", LAST)
     newer = replace(LAST, stamp_ns=LAST.stamp_ns + 5, T_map_body=np.eye(4))
-    save(tmp_path, newer)
+    save(tmp_path, "r1", newer)
     same(load(tmp_path, "r1", SHA), newer)
     assert [p.name for p in tmp_path.iterdir()] == ["r1-0123456789abcdef.json"]
 
@@ -83,9 +83,9 @@ def test_missing_file_gives_none_without_warning(tmp_path, caplog):
 
 
 def test_each_robot_and_map_has_its_own_file(tmp_path):
-    save(tmp_path, LAST)
-    save(tmp_path, replace(LAST, robot="r2"))
-    save(tmp_path, replace(LAST, map_sha256="f" * 64))
+    save(tmp_path, "r1", LAST)
+    save(tmp_path, "r2", LAST)
+    save(tmp_path, "r1", replace(LAST, map_sha256="f" * 64))
     assert len(list(tmp_path.iterdir())) == 3
     assert load(tmp_path, "r3", SHA) is None
     assert load(tmp_path, "r1", "e" * 64) is None
@@ -96,8 +96,8 @@ NAMES = ("site/hall 3/r1", "..", "a\\b", "C:r1", "Roboter Ä", "R1", "rué" * 90
 
 @pytest.mark.parametrize("name", NAMES)
 def test_any_robot_name_gives_a_safe_file_name(tmp_path, name):
-    save(tmp_path / "state", replace(LAST, robot=name))
-    assert load(tmp_path / "state", name, SHA).robot == name
+    save(tmp_path / "state", name, LAST)
+    same(load(tmp_path / "state", name, SHA), LAST)
     (file,) = (tmp_path / "state").iterdir()
     assert file.name.isascii()
     assert len(file.name) < 120
@@ -152,7 +152,7 @@ def test_unusable_content_is_a_warning_naming_the_file(tmp_path, caplog, what):
     assert record.levelno == logging.WARNING
     assert str(path) in record.getMessage()
     assert len(record.getMessage()) < len(str(path)) + 250
-    save(tmp_path, LAST)  # and the next pose takes its place
+    save(tmp_path, "r1", LAST)  # and the next pose takes its place
     assert load(tmp_path, "r1", SHA) is not None
 
 
@@ -163,18 +163,18 @@ def test_unreadable_file_is_a_warning(tmp_path, caplog):
 
 
 def test_failed_save_raises_and_keeps_the_old_pose(tmp_path, monkeypatch):
-    save(tmp_path, LAST)
+    save(tmp_path, "r1", LAST)
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(last_pose.os, "fsync", full)
+    monkeypatch.setattr(last_place.os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        save(tmp_path, replace(LAST, stamp_ns=9))
+        save(tmp_path, "r1", replace(LAST, stamp_ns=9))
     same(load(tmp_path, "r1", SHA), LAST)
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        save(tmp_path / "file", LAST)
+        save(tmp_path / "file", "r1", LAST)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes and links as in POSIX")
@@ -182,13 +182,13 @@ def test_only_the_owner_may_read_and_no_link_is_followed(tmp_path):
     folder = tmp_path / "state"
     foreign = tmp_path / "foreign"
     foreign.write_text("mine")
-    path = save(folder, LAST)
+    path = save(folder, "r1", LAST)
     assert folder.stat().st_mode & 0o777 == 0o700
     assert path.stat().st_mode & 0o777 == 0o600
     path.unlink()
     path.symlink_to(foreign)
     path.with_suffix(".part").symlink_to(foreign)
-    save(folder, LAST)
+    save(folder, "r1", LAST)
     assert foreign.read_text() == "mine"
     assert not path.is_symlink()
 
@@ -198,7 +198,7 @@ def test_only_the_owner_may_read_and_no_link_is_followed(tmp_path):
 def test_link_or_pipe_in_place_of_the_file_is_a_warning(tmp_path, caplog, what):
     path = file_of(tmp_path, "r1", SHA)
     if what == "link":
-        path.symlink_to(save(tmp_path / "elsewhere", LAST))
+        path.symlink_to(save(tmp_path / "elsewhere", "r1", LAST))
     else:
         os.mkfifo(path)
     assert load(tmp_path, "r1", SHA) is None
@@ -206,7 +206,7 @@ def test_link_or_pipe_in_place_of_the_file_is_a_warning(tmp_path, caplog, what):
 
 
 def test_what_a_power_cut_left_behind_is_removed(tmp_path):
-    path = save(tmp_path, LAST)
+    path = save(tmp_path, "r1", LAST)
     path.with_suffix(".part").write_text("of an earlier release")
     (tmp_path / f"{path.stem}.k2j3h4.part").write_text("half")
     other = tmp_path / f"r2-{SHA[:16]}.abc.part"
@@ -217,8 +217,8 @@ def test_what_a_power_cut_left_behind_is_removed(tmp_path):
 
 
 def test_forget_deletes_the_file_of_one_robot(tmp_path):
-    save(tmp_path, LAST)
-    save(tmp_path, replace(LAST, robot="r2"))
+    save(tmp_path, "r1", LAST)
+    save(tmp_path, "r2", LAST)
     for _ in range(2):
         forget(tmp_path, "r1", SHA)
     assert load(tmp_path, "r1", SHA) is None
@@ -226,14 +226,14 @@ def test_forget_deletes_the_file_of_one_robot(tmp_path):
 
 
 def test_default_state_folder_by_platform(monkeypatch, tmp_path):
-    monkeypatch.setattr(last_pose.sys, "platform", "linux")
+    monkeypatch.setattr(last_place.sys, "platform", "linux")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert default_folder() == tmp_path / "coview-stream"
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     for nowhere in ("", "relative"):
         monkeypatch.setenv("XDG_STATE_HOME", nowhere)
         assert default_folder() == tmp_path / "home/.local/state/coview-stream"
-    monkeypatch.setattr(last_pose.sys, "platform", "win32")
+    monkeypatch.setattr(last_place.sys, "platform", "win32")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "AppData"))
     assert default_folder() == tmp_path / "AppData/coview-stream"
 
@@ -241,6 +241,6 @@ def test_default_state_folder_by_platform(monkeypatch, tmp_path):
         raise RuntimeError("no home")
 
     monkeypatch.delenv("LOCALAPPDATA")
-    monkeypatch.setattr(last_pose.Path, "home", homeless)
+    monkeypatch.setattr(last_place.Path, "home", homeless)
     with pytest.raises(ConfigError, match="--no-state"):
         default_folder()

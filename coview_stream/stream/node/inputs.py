@@ -1,0 +1,438 @@
+"""Inputs of one robot: clouds and odometry, decoded and paired by their stamps.
+
+A robot that sends no odometry has its odometry computed here from its clouds (:class:`LidarInputs`). Pure logic: no
+thread, no network, no clock; the session holds the lock. Times called ``now`` are local and monotonic, in seconds;
+stamps are the robot's.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import MessageError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.messages import decode_cloud, decode_odometry
+from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
+from coview_stream.odometry.buffer import OdometryBuffer, SampleKind, Segment
+from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of, last_line
+from coview_stream.stream.transport.keys import RobotKeys
+
+_NS = 1_000_000_000
+_NEVER = float("-inf")
+_MAX_WAITING = 8  # frames that wait for their odometry
+_MAX_LIDAR_WAITING = 2  # frames that wait for the odometry engine: it needs every frame, but no old one
+_END_WAIT = 0.15  # seconds that a frame waits for odometry up to its last point
+
+_COUNTED_AS = {
+    SampleKind.GAP: "odometry_gaps",
+    SampleKind.OUTAGE: "odometry_gaps",
+    SampleKind.JUMP: "odometry_jumps",
+    SampleKind.RESTART: "clock_restarts",
+    SampleKind.DUPLICATE: "odometry_duplicate",
+    SampleKind.OUT_OF_ORDER: "odometry_out_of_order",
+}
+_BREAKS = {
+    SampleKind.GAP: "odometry paused",
+    SampleKind.OUTAGE: "odometry was away for too long",
+    SampleKind.JUMP: "odometry jumped",
+    SampleKind.RESTART: "the sender's clock started anew",
+}
+
+
+class Break(NamedTuple):
+    """Interruption of the odometry: frames from before and after it must not be searched for as one place.
+
+    Attributes:
+        reason: one clause for people.
+        verify_from_ns: after a short pause, the first stamp behind it: a place that is known need only be verified.
+    """
+
+    reason: str
+    verify_from_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class OdometryJob:
+    """One lidar frame for the odometry engine.
+
+    Attributes:
+        robot: name.
+        epoch: number of its lidar odometry; a new one makes the engine begin it again.
+        stamp_ns: sensor time, nanoseconds.
+        points: (N, 3) float32 body frame, metres.
+        times: (N,) seconds after the stamp at which each point was measured; None for no deskewing.
+        config: of its lidar odometry.
+    """
+
+    robot: str
+    epoch: int
+    stamp_ns: int
+    points: Points
+    times: Floats | None
+    config: LidarOdometryConfig
+
+
+@dataclass(frozen=True)
+class OdometryResult:
+    """Lidar odometry at a frame.
+
+    Attributes:
+        T_odom_body: (4, 4) odometry at its stamp.
+        points: (N, 3) deskewed; None if the job had no times.
+        restarted: the pose is not connected to those before it.
+        seconds: that the engine took.
+    """
+
+    T_odom_body: Pose
+    points: Points | None
+    restarted: bool
+    seconds: float
+
+
+class ReceivedFrame(NamedTuple):
+    """A lidar frame, and the local time in seconds at which it came."""
+
+    message: CloudMessage
+    received: float
+
+
+@dataclass(frozen=True)
+class PairedFrame:
+    """A lidar frame with its odometry.
+
+    Attributes:
+        message: the frame.
+        received: local time at which it came, seconds.
+        T_odom_body: (4, 4) odometry at its stamp.
+        segment: odometry while it was measured; None for no deskewing.
+        travelled: metres that odometry had driven at its stamp.
+        turned: radians that odometry had turned at its stamp.
+    """
+
+    message: CloudMessage
+    received: float
+    T_odom_body: Pose
+    segment: Segment | None
+    travelled: float
+    turned: float
+
+
+class FrameSync:
+    """Frames in the order of their stamps, until odometry covers them; counts those that end here."""
+
+    def __init__(self, config: NodeConfig, odometry: OdometryBuffer, counters: Counters) -> None:
+        self.config = config
+        self.odometry = odometry
+        self.counters = counters
+        self._waiting: list[ReceivedFrame] = []
+        self._passed_ns: int | None = None  # stamp of the newest frame that went on
+
+    def __len__(self) -> int:
+        """Return how many frames wait."""
+        return len(self._waiting)
+
+    def add(self, message: CloudMessage, now: float) -> None:
+        """Add a frame that came at local time ``now``."""
+        stamp_ns = message.stamp_ns
+        if stamp_ns == self._passed_ns or any(f.message.stamp_ns == stamp_ns for f in self._waiting):
+            self.counters.duplicate += 1
+        elif self._passed_ns is not None and stamp_ns < self._passed_ns:
+            self.counters.out_of_order += 1
+        else:
+            self._waiting.append(ReceivedFrame(message, now))
+            self._waiting.sort(key=lambda f: f.message.stamp_ns)
+            if len(self._waiting) > _MAX_WAITING:
+                # the one that came first, not the oldest stamp: a stray stamp must not stay for ever
+                self._waiting.remove(min(self._waiting, key=lambda f: f.received))
+                self.counters.dropped += 1
+
+    def take_paired(self, now: float) -> Iterator[PairedFrame]:
+        """Hand out the frames that have their odometry, oldest first; count those for which none came in time."""
+        for frame in list(self._waiting):
+            message, waited = frame.message, now - frame.received
+            where = self.odometry.covers(message.stamp_ns)
+            if where > 0 and waited < self.config.pairing_wait:
+                return
+            if where == 0 and waited < _END_WAIT and self.odometry.covers(self._span(message)[1]) > 0:
+                return
+            self._waiting.remove(frame)
+            pose = self.odometry.at(message.stamp_ns) if where == 0 else None
+            if pose is None:
+                self.counters.count("late" if where < 0 else "no_odometry")
+                continue
+            self._passed_ns = message.stamp_ns
+            deskewed = self.config.deskew and message.times is not None
+            segment = self.odometry.around(*self._span(message)) if deskewed else None
+            driven, turned = self.odometry.driven_since(message.stamp_ns)  # it may have waited for a while
+            travelled = self.odometry.travelled - driven
+            yield PairedFrame(message, frame.received, pose, segment, travelled, self.odometry.turned - turned)
+
+    def _span(self, message: CloudMessage) -> tuple[int, int]:
+        """First and last stamp (ns) at which the frame's points were measured."""
+        if message.times is None or not self.config.deskew or not len(message.times):
+            return message.stamp_ns, message.stamp_ns
+        times = np.nan_to_num(message.times, nan=0.0)
+        first, last = min(0.0, float(times.min())), max(0.0, float(times.max()))
+        return message.stamp_ns + round(first * _NS), message.stamp_ns + round(last * _NS)
+
+
+class Inputs:
+    """Clouds and odometry of a robot that sends both, from one reset of its session to the next.
+
+    Attributes:
+        odometry: buffer of the newest samples.
+        odometry_source: ``robot``, or the library that computes the odometry here.
+        disconnected_at: local time at which nothing was connected to the node: a pause of odometry says nothing about
+            the robot then.
+    """
+
+    odometry_source = "robot"
+
+    def __init__(
+        self,
+        keys: RobotKeys,
+        config: NodeConfig,
+        codecs: tuple[str | None, str | None],
+        counters: Counters,
+        errors: ErrorLog,
+    ) -> None:
+        """Begin without any message; ``codecs`` of clouds and odometry go before the messages' own encodings."""
+        self.keys = keys
+        self.config = config
+        self.codecs = codecs
+        self.counters = counters
+        self.errors = errors
+        self.odometry = OdometryBuffer(config)
+        self.disconnected_at = _NEVER
+        self._frames = FrameSync(config, self.odometry, counters)
+        self._missing = MissingFrames()
+        self._cloud_at = _NEVER  # local time of the newest readable cloud
+
+    # ---- messages
+
+    def decode_cloud(self, sample: Sample) -> CloudMessage:
+        """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
+        message = decode_cloud(sample, self.codecs[0], self.keys.cloud_hint, self.config.max_payload)
+        message = message.limited(self.config.max_points)
+        return replace(message, points=self.config.mount.to_body(message.points))
+
+    def decode_odometry(self, sample: Sample) -> OdometryMessage:
+        """Return an odometry sample; MessageError: it cannot be read."""
+        return decode_odometry(sample, self.codecs[1], self.keys.odometry_hint, self.config.max_payload)
+
+    def count_undecodable(self, error: MessageError, key: str, prefix: str = "") -> None:
+        """Count a message that could not be decoded; log only the first one of a kind whose reasons all differ."""
+        name = counter_of(error)
+        self.counters.count(f"{prefix}received")
+        self.counters.count(prefix + name)
+        if name == "unknown_encoding":
+            self.errors.add(str(error))
+        else:
+            self.errors.add_first(f"{key}: {name} messages", str(error).removeprefix(f"{key}: "))
+
+    def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
+        """Add a cloud, which waits for its odometry."""
+        self._count_cloud(message, now)
+        self._frames.add(message, now)
+        return None
+
+    def _count_cloud(self, message: CloudMessage, now: float) -> None:
+        self._cloud_at = now
+        self.counters.received += 1
+        self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
+
+    def add_odometry(self, message: OdometryMessage, now: float) -> Break | None:
+        """Add an odometry sample; return the break if it does not continue those before it."""
+        self.counters.odometry_received += 1
+        unreachable = self.odometry_source == "robot" and self.disconnected_at > self.odometry.arrived
+        kind = self.odometry.add(message, now, unreachable)
+        if kind in _COUNTED_AS:
+            self.counters.count(_COUNTED_AS[kind])
+        if kind not in _BREAKS:
+            return None
+        return Break(_BREAKS[kind], message.stamp_ns if kind is SampleKind.GAP else None)
+
+    def take_paired(self, now: float) -> Iterator[PairedFrame]:
+        """Hand out the frames that have their odometry, oldest first."""
+        return self._frames.take_paired(now)
+
+    def drop_frames(self) -> None:
+        """Drop the frames that wait: they belong to an odometry frame that has ended."""
+        self.counters.dropped += len(self._frames)
+        self._frames = FrameSync(self.config, self.odometry, self.counters)
+
+    def continue_from(self, other: Inputs) -> None:
+        """Go on with the odometry of the robot's session on another map."""
+        self.odometry.continue_from(other.odometry)
+        self._cloud_at = other._cloud_at
+
+    # ---- lidar odometry: none here
+
+    @property
+    def has_job(self) -> bool:
+        """Whether a frame waits for the odometry engine, without the lock."""
+        return False
+
+    def take_job(self) -> OdometryJob | None:
+        """Hand the oldest frame to the odometry engine."""
+        return None
+
+    def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
+        """Add the odometry of a frame, and the frame; each break has to be applied before the iteration goes on."""
+        return iter(())
+
+    def job_failed(self, job: OdometryJob, reason: str, rejected: bool) -> Break | None:
+        """Count a frame without odometry; return the break if the engine has forgotten the robot."""
+        return None
+
+    def restart_odometry(self, reason: str) -> Break | None:
+        """Begin the lidar odometry again."""
+        return None
+
+    # ---- reasons for people
+
+    def waiting_for(self) -> str:
+        """Return the missing input of a robot of which no frame has been processed."""
+        keys, counters = self.keys, self.counters
+        has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
+        if not counters.received:
+            return f"waiting for clouds on {keys.cloud}"
+        if counters.received == counters.malformed + counters.oversized + counters.unknown_encoding:
+            return "not one cloud could be read; see errors"
+        if not has_odometry and counters.odometry_received:
+            return "not one odometry sample could be read; see errors"
+        if not has_odometry:
+            return f"waiting for odometry on {keys.odometry}"
+        if counters.engine_errors:
+            return f"frames at which the engine failed: {counters.engine_errors}; see errors"
+        if counters.rejected:
+            return f"{counters.rejected} frames were of no use; see errors"
+        if counters.late or counters.no_odometry:
+            return "odometry and clouds have no common stamps: are both of one clock?"
+        return "no frame has been processed yet"
+
+    def silent(self, now: float) -> str:
+        """Return the inputs that have not come for ``max_outage``, and for how long; empty for none."""
+        arrived = {"clouds": self._cloud_at}
+        if self.odometry_source == "robot":
+            arrived["odometry"] = self.odometry.arrived
+        silent = {name: now - at for name, at in arrived.items() if at > _NEVER and now - at > self.config.max_outage}
+        return " and ".join(f"no {name} for {seconds:.0f} s" for name, seconds in silent.items())
+
+    def silence_reason(self, now: float) -> str:
+        """Return why there is no odometry."""
+        return f"no odometry for {self.config.odometry_timeout:g} s"
+
+
+class LidarInputs(Inputs):
+    """Inputs of a robot that sends only clouds: each goes through lidar odometry before it is paired with it.
+
+    Frames go to the odometry engine in the order of their stamps; one is under way, and at most two wait. An
+    :class:`OdometryBuffer` classifies the stamps: the same strays, pauses and restarted clocks, without a motion.
+    Whenever lidar odometry restarts, the search does too, for the drive in between is not known.
+    """
+
+    odometry_source = "kiss-icp"
+
+    def __init__(
+        self,
+        keys: RobotKeys,
+        config: NodeConfig,
+        codecs: tuple[str | None, str | None],
+        counters: Counters,
+        errors: ErrorLog,
+        lidar: LidarOdometryConfig,
+        epoch: int,
+    ) -> None:
+        """As of :class:`Inputs`; ``epoch`` is a number that no job of this robot has had before."""
+        super().__init__(keys, config, codecs, counters, errors)
+        self.lidar = lidar
+        self._first_epoch = self._epoch = epoch
+        self._stamps = OdometryBuffer(config)
+        self._waiting: deque[ReceivedFrame] = deque()
+        self._under_way: ReceivedFrame | None = None
+
+    def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
+        """Queue a cloud for the odometry engine."""
+        self._count_cloud(message, now)
+        kind = self._stamps.add(OdometryMessage(message.stamp_ns, np.eye(4)), now)
+        if kind is SampleKind.DUPLICATE:
+            self.counters.duplicate += 1
+            return None
+        if kind is SampleKind.OUT_OF_ORDER:
+            self.counters.out_of_order += 1
+            return None
+        if kind is SampleKind.RESTART:
+            self.counters.dropped += len(self._waiting)
+            self._waiting.clear()
+        elif len(self._waiting) == _MAX_LIDAR_WAITING:
+            self.counters.dropped += 1
+            self._waiting.popleft()
+        self._waiting.append(ReceivedFrame(message, now))
+        if kind is not SampleKind.RESTART:
+            return None
+        self.counters.clock_restarts += 1
+        return self.restart_odometry(_BREAKS[kind])
+
+    @property
+    def has_job(self) -> bool:
+        """As of :class:`Inputs`."""
+        return self._under_way is None and len(self._waiting) > 0
+
+    def take_job(self) -> OdometryJob | None:
+        """As of :class:`Inputs`; None while one is under way."""
+        if not self.has_job:
+            return None
+        self._under_way = self._waiting.popleft()
+        message = self._under_way.message
+        times = message.times if self.config.deskew else None
+        return OdometryJob(self.keys.robot, self._epoch, message.stamp_ns, message.points, times, self.lidar)
+
+    def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
+        """As of :class:`Inputs`; jobs from before a reset are ignored."""
+        if job.epoch < self._first_epoch:
+            return
+        frame, self._under_way = self._under_way, None
+        if frame is None or job.epoch != self._epoch:
+            self.counters.dropped += 1
+            return
+        if result.restarted and self.odometry.newest is not None:
+            self.odometry.clear()
+            yield Break("lidar odometry began anew")
+        if (interruption := self.add_odometry(OdometryMessage(job.stamp_ns, result.T_odom_body), now)) is not None:
+            yield interruption
+        points = frame.message.points if result.points is None else result.points
+        self._frames.add(replace(frame.message, points=points, times=None, rings=None), frame.received)
+
+    def job_failed(self, job: OdometryJob, reason: str, rejected: bool) -> Break | None:
+        """As of :class:`Inputs`."""
+        if job.epoch < self._first_epoch:
+            return None
+        self._under_way = None
+        self.counters.count("rejected" if rejected else "engine_errors")
+        how = "cannot place" if rejected else "failed at"
+        self.errors.add_first(f"{self.keys.robot}: frames that lidar odometry {how}", last_line(reason))
+        if rejected or job.epoch != self._epoch:
+            return None
+        return self.restart_odometry("lidar odometry failed on a frame")
+
+    def restart_odometry(self, reason: str) -> Break | None:
+        """As of :class:`Inputs`."""
+        self._epoch += 1
+        self.odometry.clear()
+        return Break(reason)
+
+    def silence_reason(self, now: float) -> str:
+        """As of :class:`Inputs`."""
+        timeout = self.config.odometry_timeout
+        if now - self._cloud_at > timeout:
+            return f"no clouds for {timeout:g} s"
+        return f"lidar odometry has placed no frame for {timeout:g} s; see errors and counters"

@@ -1,0 +1,384 @@
+"""Last place of a robot: its file, its message to another node, and the hints that the engine gets of it.
+
+Every place from before is a hypothesis: the engine verifies it like any other
+(:meth:`coview_stream.localization.localizer.Localizer.hint_pose`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import logging
+import math
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+import numpy as np
+
+from coview_stream.errors import ConfigError, InputError, MessageError
+from coview_stream.geometry.transforms import Pose, is_pose, yaw_of
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.search.place_guess import MAX_DISTANCE, PlaceGuess
+from coview_stream.messages import decode_pose
+from coview_stream.messages.types import Sample
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+
+_FORMAT = "coview_stream last pose"
+_MAX_BYTES = 65_536  # of a file; ours have 500
+_MAX_NAME = 60  # characters of a robot's name in that of its file
+_MAX_LEAN = float(np.radians(45.0))  # of a sensor against its mount
+_MAX_GUESS_BYTES = 4096
+_SIGMAS = 2.0  # of a covariance that are tried around its pose
+_GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
+
+
+@dataclass(frozen=True, eq=False)
+class LastPlace:
+    """Place of a robot on a map. A file has its ``T_map_body``; a message between nodes its ``T_map_odom``.
+
+    Attributes:
+        map_sha256: of the base map, 64 hexadecimal digits; of a site that of its state, common to all parts of it.
+        stamp_ns: sensor time of ``T_map_body``, nanoseconds.
+        T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
+        T_map_odom: (4, 4) map <- odometry; the robot's odometry goes on when its node changes.
+        calibration: of its sensor and odometry; None if not known.
+    """
+
+    map_sha256: str
+    stamp_ns: int | None = None
+    T_map_body: Pose | None = None
+    T_map_odom: Pose | None = None
+    calibration: Calibration | None = None
+
+    def to_message(self) -> dict[str, Any]:
+        """Return the plain data of a message to another node."""
+        plain: dict[str, Any] = {"map_sha256": self.map_sha256, "T_map_odom": np.asarray(self.T_map_odom).tolist()}
+        return plain if self.calibration is None else plain | {"calibration": asdict(self.calibration)}
+
+    @classmethod
+    def from_message(cls, plain: Any) -> LastPlace:
+        """Read :meth:`to_message`, from anyone; ValueError, TypeError or KeyError for something else."""
+        return cls(
+            map_sha256=str(plain["map_sha256"])[:64],
+            T_map_odom=_read_pose(plain, "T_map_odom"),
+            calibration=_read_calibration(plain.get("calibration")),
+        )
+
+
+# ---- files
+
+
+def save(folder: Path, robot: str, place: LastPlace) -> Path:
+    """Write a robot's place and return the file; the previous one stays whole until then.
+
+    Raises:
+        OSError: the directory cannot be made or written.
+    """
+    path = file_of(folder, robot, place.map_sha256)
+    document = {
+        "format": _FORMAT,
+        "version": VERSION,
+        "robot": robot,
+        "map_sha256": place.map_sha256,
+        "stamp_ns": int(place.stamp_ns or 0),
+        "T_map_body": np.asarray(place.T_map_body, dtype=np.float64).tolist(),
+    }
+    if place.calibration is not None:
+        document["calibration"] = asdict(place.calibration)  # radians and metres
+    _make(folder)
+    _write_whole(path, json.dumps(document, indent=1).encode())
+    return path
+
+
+def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
+    """Read the file of a robot on a map.
+
+    Returns:
+        None if there is none, and, after a warning that names the file, if it cannot be used: it is damaged, of another
+        version, or not of this robot and map.
+    """
+    path = file_of(folder, robot, map_sha256)
+    try:
+        with _open_regular(path) as file:
+            owner, place = _parsed(file.read(_MAX_BYTES + 1))
+        if (owner, place.map_sha256) != (robot, map_sha256):
+            raise ValueError("it is of another robot or map")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        log.warning("%s: the last pose cannot be read (%s); searching without", path, error.strerror or error)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        log.warning("%s: is no last pose to be used (%s); searching without", path, error)
+    else:
+        return place
+    return None
+
+
+def forget(folder: Path, robot: str, map_sha256: str) -> None:
+    """Delete the file of a robot on a map, if there is one; OSError if that cannot be done."""
+    file_of(folder, robot, map_sha256).unlink(missing_ok=True)
+
+
+def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
+    """Return the file of a robot on a map: the robot's name, safe for every file system, and 16 digits."""
+    name = quote(robot, safe="")
+    if name != robot.lower() or len(name) > _MAX_NAME:  # 'R1' and 'r1' are one file on some systems
+        name = f"{name[:_MAX_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
+    return folder / f"{name}-{map_sha256[:16]}.json"
+
+
+def remove_parts(folder: Path, robot: str, map_sha256: str) -> None:
+    """Delete the remains of interrupted writes for a robot on a map; not while a write may be under way."""
+    path = file_of(folder, robot, map_sha256)
+    with contextlib.suppress(OSError):
+        for part in path.parent.glob(f"{glob.escape(path.stem)}*.part"):
+            part.unlink(missing_ok=True)
+
+
+def try_out(folder: Path) -> None:
+    """Make a directory if it is not there, write a file into it and delete that; OSError where that fails."""
+    _make(folder)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".try-") as file:
+        file.write(b"x")
+
+
+def default_folder() -> Path:
+    """Return the directory of this user in which programs keep their state from one run to the next.
+
+    Raises:
+        ConfigError: the user has no home directory.
+    """
+    if sys.platform == "win32":
+        folder, below_home = os.environ.get("LOCALAPPDATA", ""), "AppData/Local"
+    else:
+        folder, below_home = os.environ.get("XDG_STATE_HOME", ""), ".local/state"
+    try:
+        # the specification says that a relative one is to be ignored
+        root = Path(folder) if folder and Path(folder).is_absolute() else Path.home() / below_home
+    except RuntimeError as error:
+        raise ConfigError(
+            f"cannot tell where to keep the last poses ({error}); use --state DIR or --no-state"
+        ) from error
+    return root / "coview-stream"
+
+
+def _make(folder: Path) -> None:
+    """Make a directory that only its owner may enter; an existing one keeps its mode."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write a file that only its owner may read: under a name that nobody can foresee, then renamed.
+
+    A robot's day usually ends with a power cut: the bytes are on the disk before the name changes. The remains of a cut
+    are for :func:`remove_parts`, at the next start.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)  # a link in its place is replaced, not followed
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _open_regular(path: Path) -> BinaryIO:
+    """Open a file to read; OSError for a link, and for a pipe or device, which could block."""
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    file = os.fdopen(os.open(path, flags), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError("it is no file")
+    return file
+
+
+def _parsed(data: bytes) -> tuple[str, LastPlace]:
+    """Return robot and place of a file; ValueError, TypeError, KeyError, OverflowError or RecursionError for none."""
+    if len(data) > _MAX_BYTES:
+        raise ValueError(f"longer than {_MAX_BYTES} bytes")
+    document: Any = json.loads(data.decode("utf-8"))
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise ValueError("it is something else")
+    if document.get("version") != VERSION:
+        raise ValueError(f"version {document.get('version')!r:.20}, this release reads {VERSION}")
+    place = LastPlace(
+        map_sha256=str(document["map_sha256"]),
+        stamp_ns=int(document["stamp_ns"]),
+        T_map_body=_read_pose(document, "T_map_body"),
+        calibration=_read_calibration(document.get("calibration")),
+    )
+    return str(document["robot"]), place
+
+
+def _read_pose(document: Any, name: str) -> Pose:
+    T = np.asarray(document[name], dtype=np.float64)
+    if not is_pose(T):
+        raise ValueError(f"{name} is not a finite rigid 4x4 transform")
+    return T
+
+
+def _read_calibration(plain: Any) -> Calibration | None:
+    if plain is None:
+        return None
+    if not isinstance(plain, dict):
+        raise ValueError("its calibration is something else")
+    names = {f.name for f in fields(Calibration)}
+    calibration = Calibration(**{name: float(value) for name, value in plain.items() if name in names})
+    sigmas = all(0 <= s < 1 for s in (calibration.sigma_tilt, calibration.sigma_scale, calibration.sigma_turn))
+    if not (
+        sigmas
+        and math.hypot(calibration.roll, calibration.pitch) < _MAX_LEAN
+        and abs(calibration.scale) + abs(calibration.turn) < 1
+        and abs(calibration.ground) < 10
+    ):
+        raise ValueError("its calibration is none of a robot")
+    return calibration
+
+
+# ---- guesses of people: parameters of a query, JSON, or RViz' pose
+
+
+def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
+    """Return the guess of named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
+
+    With ``map``, a name, they are in the frame of that one of several maps; ``within``: as of a :class:`PlaceGuess`.
+
+    Raises:
+        InputError: x or y is missing, a name is unknown, or a value is no number or out of its range.
+    """
+    unknown = sorted(set(given) - set(_GUESS_FIELDS))
+    if unknown or "x" not in given or "y" not in given:
+        problem = f"{unknown[0]!r} is unknown" if unknown else "x or y is missing"
+        raise InputError(
+            f"initial pose: {problem}; give x, y and perhaps yaw, distance, angle, within (metres, radians)"
+        )
+    map_name = given.get("map")
+    if not isinstance(map_name, str | None):
+        raise InputError(f"initial pose: map is {str(map_name)[:40]!r}, which is no name")
+    numbers: dict[str, float] = {}
+    for name, value in given.items():
+        if name == "map" or (value is None and name in ("yaw", "within")):
+            continue
+        try:
+            if isinstance(value, bool):
+                raise TypeError("it is a truth value")
+            numbers[name] = float(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"initial pose: {name} is {str(value)[:40]!r}, which is no number") from error
+    try:
+        return PlaceGuess(**numbers, map=map_name)
+    except ConfigError as error:
+        raise InputError(f"initial pose: {error}") from error
+
+
+def decode_guess(sample: Sample) -> PlaceGuess:
+    """Read a message: JSON with the fields of :func:`guess_of_fields`, or a PoseWithCovarianceStamped in CDR.
+
+    Raises:
+        InputError: it is neither, or names no place.
+    """
+    payload = bytes(sample.payload[: _MAX_GUESS_BYTES + 1])
+    if len(payload) > _MAX_GUESS_BYTES:
+        raise MessageError(f"{sample.key}: an initial pose of more than {_MAX_GUESS_BYTES} bytes")
+    if payload.lstrip().startswith(b"{"):
+        try:
+            given = json.loads(payload)
+        except (ValueError, RecursionError) as error:
+            raise MessageError(f"{sample.key}: no JSON ({str(error)[:80]})") from error
+        return guess_of_fields(given)
+    pose = decode_pose(sample, "cdr")
+    spread = math.sqrt(max(float(np.nanmax(np.diag(pose.covariance)[:2])), 0.0)) if pose.covariance.size else 0.0
+    turn = math.sqrt(max(float(np.nan_to_num(pose.covariance[5, 5])), 0.0)) if pose.covariance.size else 0.0
+    return guess_of_fields({
+        "x": pose.T_map_body[0, 3], "y": pose.T_map_body[1, 3], "yaw": yaw_of(pose.T_map_body),
+        "distance": min(max(_SIGMAS * spread, 3.0), MAX_DISTANCE), "angle": min(max(_SIGMAS * turn, 0.3), math.pi),
+        "map": None if pose.frame_id in ("", "map") else pose.frame_id,
+    })  # fmt: skip
+
+
+# ---- hints for the engine
+
+
+class PlaceHints:
+    """Hints for the engine: the last place and somebody's guess, each once in every odometry epoch.
+
+    The session holds the lock.
+
+    Attributes:
+        forgotten: number of times that a client has asked to forget the place.
+        T_map_body: (4, 4) of the last place, whether the engine has it or not; None for none.
+        calibration: of the sensor and odometry there; goes with the pose, as a prior.
+        guess: the newest one, until the place is known.
+        pending_guess: the same, until a frame has taken it to the engine.
+    """
+
+    def __init__(self) -> None:
+        self.forgotten = 0
+        self.guess: PlaceGuess | None = None
+        self.pending_guess: PlaceGuess | None = None
+        self.drop()
+
+    def drop(self) -> None:
+        """Never offer this pose again; only a new one."""
+        self.T_map_body: Pose | None = None
+        self.calibration: Calibration | None = None
+        self._pending = False
+
+    @property
+    def pending(self) -> Pose | None:
+        """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
+        return self.T_map_body if self._pending else None
+
+    def offer(self, T_map_body: Pose, calibration: Calibration | None) -> None:
+        """Take over a pose from before this session, which the engine does not know."""
+        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, True
+
+    def offer_guess(self, guess: PlaceGuess | None) -> None:
+        """Take over a guess in place of the one before."""
+        self.guess = self.pending_guess = guess
+
+    def verified(self, T_map_body: Pose, calibration: Calibration | None) -> None:
+        """Take over a pose that the engine itself has verified."""
+        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, False
+        self.guess = None
+
+    def begin_epoch(self) -> None:
+        """Offer all again: the engine forgets everything with an odometry frame, but the robot stands where it stood.
+
+        A guess loses its circle, for it is not known how far the robot has come.
+        """
+        self._pending = self.T_map_body is not None
+        self.offer_guess(without_circle(self.guess))
+
+    def delivered(self, hint: Pose | None, guess: PlaceGuess | None) -> None:
+        """Offer no more the pose and the guess that went with a frame."""
+        if hint is self.T_map_body:
+            self._pending = False
+        if guess is self.pending_guess:
+            self.pending_guess = None
+
+    def forget(self) -> None:
+        """Drop everything because a client asks; the file for the next start is to go as well."""
+        self.drop()
+        self.offer_guess(None)
+        self.forgotten += 1
+
+
+def without_circle(guess: PlaceGuess | None) -> PlaceGuess | None:
+    """Return a guess that holds anywhere, not only in a circle."""
+    return None if guess is None else replace(guess, within=None)

@@ -1,0 +1,237 @@
+"""Fleets: who serves a robot, which robots move when nodes come and go, and how a place is handed on."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from fake_node import Site
+from fake_robot import SHA, T_MAP_ODOM, Robot, pose
+from nightly import nightly
+from serving import FALSE, Service
+from sockets import until
+from zenoh_routers import Router
+
+from coview_stream.clouds.python_child import python_command, python_environment
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.fleet import Fleet, FleetMembers, owner
+from coview_stream.stream.node.last_place import LastPlace
+from coview_stream.stream.transport.memory_transport import MemoryTransport
+
+NODES = [f"node{k}" for k in range(5)]
+ROBOTS = [f"r{k}" for k in range(1000)]
+PREFIX = "coview/fleet/f"
+
+
+def test_robots_are_shared_evenly_and_only_those_of_a_node_that_goes_move():
+    before = {robot: owner(robot, NODES) for robot in ROBOTS}
+    counts = [list(before.values()).count(node) for node in NODES]
+    assert min(counts) > 150  # 200 each, with a deviation of 13
+    after = {robot: owner(robot, NODES[:-1]) for robot in ROBOTS}
+    moved = {robot for robot in ROBOTS if after[robot] != before[robot]}
+    assert moved == {robot for robot in ROBOTS if before[robot] == NODES[-1]}
+    gained = [sum(after[robot] == node for robot in moved) for node in NODES[:-1]]
+    assert min(gained) > 0.15 * len(moved)  # to all others alike
+    assert owner("r1", []) is None
+    assert {owner(r, reversed(NODES)) == before[r] for r in ROBOTS} == {True}
+
+
+def test_node_is_gone_after_two_looks_and_a_look_without_oneself_tells_nothing():
+    members = FleetMembers("a")
+    assert members.look(["a", "b"])
+    assert not members.look(["a"])
+    assert members.alive == {"a", "b"}
+    assert members.look(["a"])
+    assert members.alive == {"a"}
+    members.look(["a", "b"])
+    for _ in range(5):
+        assert not members.look([])  # cut off
+        assert not members.look(["b"])
+    assert members.alive == {"a", "b"}
+    assert not members.look(["a"])
+    assert not members.look(["a", "b"])  # it was slow
+    assert not members.look(["a"])
+
+
+class Member(Site):
+    """A node of a fleet on a network that all its nodes are on."""
+
+    def __init__(self, net, name, robots):
+        super().__init__(*robots, net=net, shared=True)
+        self.node.declare()
+        self.fleet = Fleet(PREFIX, name, self.node.endpoints, net)
+
+    @property
+    def serves(self):
+        return {name for name, robot in self.node.endpoints.items() if robot.serving}
+
+
+def test_each_robot_is_served_by_one_node_and_moves_with_its_place():
+    net, robots = MemoryTransport(), ROBOTS[:20]
+    nodes = {name: Member(net, name, robots) for name in ("a", "b")}
+    for node in nodes.values():
+        node.node.reporter.publish(time.monotonic())
+    assert net.samples("coview/r1/out/status") == []  # nobody serves anybody yet
+    for _ in range(3):
+        for node in nodes.values():
+            node.fleet.look()
+    a, b = nodes["a"], nodes["b"]
+    assert a.serves | b.serves == set(robots)
+    assert not a.serves & b.serves
+    assert a.serves
+    assert b.serves
+    for node in nodes.values():
+        node.node.reporter.publish(time.monotonic())
+    for robot in robots:
+        ids = [json.loads(sample.payload)["node"]["id"] for sample in net.samples(f"coview/{robot}/out/status")]
+        assert ids == [(a if robot in a.serves else b).node.identity.node]
+
+    mover = min(b.serves)
+    net.publish(Sample(f"{PREFIX}/places/b", b"\xff{", "application/json"))
+    told = {mover: LastPlace(SHA, T_map_odom=T_MAP_ODOM @ pose(3.0)).to_message(), "stranger": 3}
+    net.publish(Sample(f"{PREFIX}/places/b", json.dumps(told).encode(), "application/json"))
+    net.withdraw(f"{PREFIX}/nodes/b")
+    a.fleet.look()
+    assert mover not in a.serves
+    a.fleet.look()
+    assert a.serves == set(robots)
+    a.sees(mover, 1.0)
+    a.fleet.look()  # its odometry has come
+    hint = a.sessions[mover].take_job("track").hint
+    np.testing.assert_allclose(hint, T_MAP_ODOM @ pose(3.0) @ pose(2.0), atol=1e-9)
+
+
+def test_node_that_comes_takes_its_robots_with_their_places():
+    net, robots = MemoryTransport(), ROBOTS[:4]
+    first = Member(net, "a", robots)
+    first.fleet.look()
+    assert first.serves == set(robots)
+    for name in robots:
+        first.frame(name, 0.0)
+    second = Member(net, "b", robots)
+    first.fleet.tell()
+    for _ in range(2):
+        second.fleet.look()
+        first.fleet.look()
+    assert second.serves
+    assert first.serves == set(robots) - second.serves
+    for name in second.serves:
+        assert first.poses(name) == []  # given up and forgotten
+        second.moves(name, 1.0)
+        second.fleet.look()
+        second.sees(name, 1.1)
+        np.testing.assert_allclose(second.sessions[name].take_job("track").hint, T_MAP_ODOM @ pose(2.0), atol=1e-9)
+        assert second.poses(name) == []  # nothing is believed before it is verified
+
+
+def test_message_of_a_place_is_read_as_it_was_written():
+    giver, taker = Robot(), Robot()
+    assert giver.session.last_place() is None
+    giver.localized(0.0)
+    place = giver.session.last_place()
+    np.testing.assert_allclose(place.T_map_odom, T_MAP_ODOM)
+    again = LastPlace.from_message(json.loads(json.dumps(place.to_message())))
+    np.testing.assert_allclose(again.T_map_odom, place.T_map_odom)
+    assert (again.map_sha256, again.calibration) == (place.map_sha256, place.calibration)
+
+    assert not taker.session.offer(again)  # no odometry yet
+    taker.moved(1.0, x=2.0)
+    assert taker.session.offer(again)
+    giver.session.reset(forget=False)
+    assert giver.session.last_place() is None
+    giver.moved(5.0)
+    assert giver.session.offer(again)  # it may come back
+    twice = (2 * np.eye(4)).tolist()
+    for broken in ({}, {"T_map_odom": [1], "map_sha256": SHA}, {"T_map_odom": twice, "map_sha256": SHA}):
+        with pytest.raises((ValueError, KeyError)):
+            LastPlace.from_message(broken)
+
+
+class Other:
+    """Another process that serves the robot of a service."""
+
+    def __init__(self, service, router, *arguments):
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
+        command = ("serve", str(service.map), "--robot", "r1", "--connect", router, "--no-state")
+        self.process = subprocess.Popen(
+            python_command("coview_stream", *command, "--metrics", self.metrics, *arguments),
+            env=python_environment(),
+            stderr=subprocess.DEVNULL,
+        )
+
+    def health(self):
+        try:
+            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
+                return json.load(answer)
+        except urllib.error.HTTPError as error:  # not ready
+            return json.load(error)
+        except OSError:
+            return None
+
+    def robot(self):
+        document = self.health()
+        return None if document is None else document["robots"].get("r1")
+
+    def end(self):
+        self.process.kill()
+        self.process.wait()
+
+
+@nightly
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux" or os.name != "posix", reason="stops processes")
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_one_node_serves_and_another_goes_on_when_it_dies_or_hangs(world_file, slow_drive, tmp_path, end):
+    fleet = ("--fleet", "yard")
+    with Router() as router:
+        service = Service(
+            world_file, slow_drive, tmp_path, router=router.endpoint, robots_router=router.endpoint, arguments=fleet
+        )
+        other = Other(service, router.endpoint, *fleet)
+        try:
+            until(lambda: (document := other.health()) is not None and document["ready"]["ok"], 60.0)
+            service.tracks(60.0)
+            first = only_server(service, service, other)
+            victim = (service, other)[first].process
+            count = len(service.poses)
+            victim.send_signal(end)
+            until(lambda: len(service.poses) > count + 5, 20.0)
+            gap = max(b - a for (a, _), (b, _) in itertools.pairwise(service.poses[count - 5 :]))
+            assert gap < 6.0, "of a busy machine; 3 s on an idle one"
+            if end is signal.SIGSTOP:
+                victim.send_signal(signal.SIGCONT)  # it takes its robot back, and nobody else serves it
+                until(lambda: serving_now(service, other) == first, 30.0)
+                assert only_server(service, service, other) == first
+            assert max(service.errors()) < FALSE
+        finally:
+            service.process.send_signal(signal.SIGCONT)
+            other.process.send_signal(signal.SIGCONT)
+            other.end()
+            service.end()
+
+
+def only_server(service, *nodes):
+    """After some time to settle: which of the nodes of a fleet has the robot; its poses come once."""
+    time.sleep(3.0)
+    count = len(service.poses)
+    time.sleep(3.0)
+    assert 15 < len(service.poses) - count < 45  # ten a second, not twice as many
+    return serving_now(*nodes)
+
+
+def serving_now(*nodes):
+    """Which of the nodes has the robot, None unless it is one."""
+    has = [k for k, node in enumerate(nodes) if (told := node.robot()) is not None and told["serves"]]
+    return has[0] if len(has) == 1 else None
