@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.config import MapConfig
+from coview_stream.cli.options import add_progress
 
 HELP = "build a base map from one or many clouds of the same frame"
 
@@ -56,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
-    parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
+    add_progress(parser)
     tiles = parser.add_argument_group("directories of tiles")
     tiles.add_argument(
         "--workers", type=int, metavar="N", help="processes that build tiles (as many as cores, 8 at most)"

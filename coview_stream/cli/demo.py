@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from coview_stream.cli.options import add_world
 from coview_stream.cli.view import add_view
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, TransportError
@@ -43,11 +44,7 @@ _STEPS = 4
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; names and ranges are checked by SimulationConfig."""
     parser.add_argument("--out", type=Path, default=Path("coview-demo"), metavar="DIR", help="(coview-demo)")
-    parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
-    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
-    parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
-    parser.add_argument("--size", type=float, default=180.0, help="side of the map, metres (180)")
-    parser.add_argument("--length", type=float, default=40.0, help="distance driven, metres (40)")
+    add_world(parser, 180.0, 40.0)
     parser.add_argument("--offline", action="store_true", help="frames straight from file to localizer, no zenoh")
     add_view(parser)
     parser.epilog = (

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coview_stream.report.evaluation import ErrorStats, Evaluation
+from coview_stream.cli.options import add_json
 
 HELP = "compare a trajectory with the truth: errors, success, share localised, false frames"
 
@@ -17,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("estimate", type=Path, metavar="EST.tum", help="trajectory of `locate`, map <- body")
     parser.add_argument("truth", type=Path, metavar="TRUTH.tum", help="true trajectory, map <- body")
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the errors over the distance driven")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

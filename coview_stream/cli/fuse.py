@@ -7,7 +7,15 @@ import sys
 from pathlib import Path
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import add_gravity, add_mount, add_topics, add_verify_key, check_picture, lidar_config
+from coview_stream.cli.options import (
+    add_gravity,
+    add_mount,
+    add_progress,
+    add_topics,
+    add_verify_key,
+    check_picture,
+    lidar_config,
+)
 
 HELP = "merge localized runs with the base map: one cloud, tagged by source, and what has changed"
 
@@ -31,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mount(parser)
     add_topics(parser)
     add_verify_key(parser)
-    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+    add_progress(parser)
 
 
 def run(args: argparse.Namespace) -> int:

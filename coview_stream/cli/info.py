@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import acceptance_config, add_risk, add_verify_key, check_picture
+from coview_stream.cli.options import acceptance_config, add_json, add_risk, add_verify_key, check_picture
 from coview_stream.errors import naming_missing_libraries
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_risk(parser)
     add_verify_key(parser)
     parser.set_defaults(risk=None)
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from coview_stream.cli.options import (
     add_gravity,
     add_initial,
     add_mount,
+    add_progress,
     add_registration,
     add_reloc,
     add_risk,
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_risk(parser)
     add_verify_key(parser)
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
-    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+    add_progress(parser)
 
 
 def run(args: argparse.Namespace) -> int:

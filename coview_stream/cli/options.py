@@ -38,6 +38,35 @@ def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/1
     network.add_argument("--base", default="coview", metavar="KEY", help="first part of the keys (coview)")
 
 
+def add_preset(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--preset``, the convention of zenoh keys."""
+    parser.add_argument("--preset", default="native", help="keys: native, ros2dds, rmw_zenoh or keelson (native)")
+
+
+def add_progress(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--progress``."""
+    parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--json``."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def add_quiet(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--quiet``."""
+    parser.add_argument("--quiet", action="store_true", help="log errors only")
+
+
+def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> None:
+    """Declare the options of a simulated world that ``demo`` and ``simulate`` share, with their defaults in metres."""
+    parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
+    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
+    parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
+    parser.add_argument("--size", type=float, default=size, help=f"side of the map, metres ({size:g})")
+    parser.add_argument("--length", type=float, default=length, help=f"distance driven, metres ({length:g})")
+
+
 def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:
     """Refuse an encoding that no codec has; None is always right.
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 
-from coview_stream.cli.options import KISS_ICP, add_mount, add_network, add_run_path, add_topics, mount_of
+from coview_stream.cli.options import (
+    KISS_ICP,
+    add_mount,
+    add_network,
+    add_preset,
+    add_progress,
+    add_run_path,
+    add_topics,
+    mount_of,
+)
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
@@ -19,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_path(parser)
     parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
     add_network(parser)
-    parser.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
+    add_preset(parser)
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)")
     parser.add_argument("--loop", action="store_true", help="start over until interrupted; stamps go on")
@@ -37,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mount(parser)
     add_topics(parser)
     parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)")
-    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+    add_progress(parser)
     parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 
 

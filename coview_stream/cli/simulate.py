@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from coview_stream.cli.options import add_progress, add_world
 from coview_stream.errors import ConfigError, InputError, require_library
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
@@ -16,14 +17,10 @@ _UTM = (412_000.0, 5_318_000.0, 240.0)  # metres; an offset such as UTM coordina
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; names and ranges are checked by SimulationConfig."""
     parser.add_argument("out", type=Path, metavar="OUT", help="directory to write; new or empty")
-    parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
-    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
-    parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
+    add_world(parser, 240.0, 80.0)
     parser.add_argument(
         "--drive-seed", type=int, default=0, help="others give other runs through the same world, for `fuse` (0)"
     )
-    parser.add_argument("--size", type=float, default=240.0, help="side of the map, metres (240)")
-    parser.add_argument("--length", type=float, default=80.0, help="distance driven, metres (80)")
     parser.add_argument("--density", type=float, default=20.0, help="airborne pulses per square metre (20)")
     parser.add_argument("--speed", type=float, default=1.5, help="of the robot, metres per second (1.5)")
     parser.add_argument(
@@ -50,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="record survey, scans, truth and odometry for Foxglove or rerun as well (extra: foxglove)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a world simulated there before")
-    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+    add_progress(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from coview_stream.cli.map_argument import local_map
-from coview_stream.cli.options import add_network
+from coview_stream.cli.options import add_json, add_network, add_preset
 from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
 
@@ -36,10 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)")
     add_network(parser)
-    parser.add_argument(
-        "--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson; needs --robot (native)"
-    )
-    parser.add_argument("--json", action="store_true", help="print every pose and status as one line of JSON")
+    add_preset(parser)
+    add_json(parser)
     add_view(parser)
     parser.add_argument("--map", metavar="SITE", help="the map to show, path or address (the node is asked for one)")
     parser.add_argument(
