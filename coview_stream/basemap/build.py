@@ -1,4 +1,4 @@
-"""Building of a base map: clouds to arrays (paper, section 3.1, and the virtual reference scans of 3.2)."""
+"""Building of a map in memory: clouds to arrays (paper, section 3.1, and the virtual reference scans of 3.2)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxe
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
 
-_MIN_POINTS = 1000  # set by hand
+_MIN_POINTS = 1000  # fewer are no site
 
 
 def build_arrays(sources: list[Source], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
-    """Read ``sources`` and return a map's arrays and the parameters that say where it came from.
+    """Read ``sources``, and return a map's arrays and parameters.
 
     Raises:
         CloudError: a source cannot be read.
@@ -38,12 +38,12 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
         for view in VIEW_NAMES:  # before the clouds are read: they may be missing
             network(view)
     paths = [source.path for source in sources]
-    told = check_together([source.head() for source in sources])  # all heads before the first points
-    warn(told)
+    warning = check_together([source.head() for source in sources])  # all heads before the first points
+    warn(warning)
     with _progress_bar(progress, "reading") as step:
         clouds = [_read(source, k, len(sources), step) for k, source in enumerate(sources)]
     heads = [head_of(path, cloud) for path, cloud in zip(paths, clouds, strict=True)]
-    if told is None:  # some formats tell their extent with their points only
+    if warning is None:  # some formats have no extent in their heads
         warn(check_together(heads))
     whole = merge(clouds)
     extent = extent_in_words(whole)

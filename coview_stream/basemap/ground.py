@@ -22,13 +22,13 @@ from coview_stream.geometry.transforms import Points
 
 _TILE = 256.0
 _MARGIN = 24.0
-"""Metres, set by hand. A cloth per tile rests after fewer steps and stays in the cache: 1.5 km2 as one took 75 s."""
+"""Metres. A cloth per tile rests after fewer steps and fits the processor's cache: 1.5 km2 as one took 75 s."""
 
-_MIN_POINTS = 10  # for a cloth to rest on; set by hand
+_MIN_POINTS = 10  # for a cloth to rest on
 
 
 def cloth_available() -> bool:
-    """Tell whether the wheel is installed; there is none for Python 3.13 and for ARM."""
+    """Return whether the wheel is installed; there is none for Python 3.13 and for ARM."""
     return importlib.util.find_spec("CSF") is not None
 
 
@@ -84,12 +84,12 @@ def _one_cloth(
     cloth.params.rigidness = rigidness
     cloth.params.interations = iterations  # the wheel's spelling
     cloth.params.class_threshold = threshold
-    kept, rest = csf.VecInt(), csf.VecInt()
+    ground, rest = csf.VecInt(), csf.VecInt()
     with _silence():
         cloth.setPointCloud(points.astype(np.float64))
-        cloth.do_filtering(kept, rest, False)
+        cloth.do_filtering(ground, rest, False)
     mask = np.zeros(len(points), dtype=bool)
-    mask[np.array(kept, dtype=np.intp)] = True
+    mask[np.array(ground, dtype=np.intp)] = True
     return mask
 
 
@@ -106,7 +106,7 @@ def _one_thread() -> None:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Discard what the C library writes to standard output: the wheel reports every step there."""
+    """Discard the standard output of the C library: the wheel reports every step there."""
     libc = ctypes.CDLL(None) if os.name == "posix" else None
     sys.stdout.flush()
     try:
@@ -127,9 +127,9 @@ def _silence() -> Iterator[None]:
 
 
 _MIN_CELLS = 50
-"""Occupied cells below which all lowest points count as ground: a cloth has nothing to rest on; set by hand."""
+"""Occupied cells below which all lowest points count as ground: too few for a cloth to rest on."""
 
-_PORTION = 1_000_000  # points that are classified at a time; set by hand
+_PORTION = 1_000_000  # points classified at a time
 
 # of the morphological filter; scored by ``python -m bench ground``
 _MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
@@ -339,9 +339,9 @@ def _filtered(
             threshold=config.cloth_threshold,
         )
     else:
-        kept = np.full(z.shape, np.nan, dtype=np.float32)
-        kept.flat[occupied] = lowest[:, 2]
-        ground = morphological_ground(kept, cell).flat[occupied]
+        raster = np.full(z.shape, np.nan, dtype=np.float32)
+        raster.flat[occupied] = lowest[:, 2]
+        ground = morphological_ground(raster, cell).flat[occupied]
     return ground if bool(ground.any()) else np.ones(len(lowest), dtype=bool)
 
 
@@ -351,9 +351,9 @@ def _refined(z: Floats32, occupied: Ints, ground: Bools, config: GroundConfig, c
 
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):
-        kept = np.full(z.shape, np.nan, dtype=np.float32)
-        kept.flat[occupied[ground]] = heights[ground]
-        surface = filled(kept)
+        raster = np.full(z.shape, np.nan, dtype=np.float32)
+        raster.flat[occupied[ground]] = heights[ground]
+        surface = filled(raster)
         # a little smoothing: single low returns must not pull the surface down, and slopes need a scale
         smooth = ndimage.gaussian_filter(surface, 1.0 / cell, mode="nearest")
         away = np.abs(heights - smooth.flat[occupied])
@@ -382,7 +382,7 @@ def _slope(surface: GroundRaster) -> Floats32:
 def morphological_ground(z: Floats32, cell: float) -> Bools:
     """Mask the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
 
-    Openings with growing windows remove what is narrower than the window and stands out of the opened surface
+    Openings with growing windows remove objects that are narrower than the window and stand out of the opened surface
     by more than a slope of 0.3 explains.
     """
     from scipy import ndimage  # not part of the robot's side

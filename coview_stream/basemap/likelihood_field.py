@@ -2,14 +2,14 @@
 
 Square cells of half a metre, in tiles of 16 m that are stored only where the map has been surveyed:
 
-* occupied: one bit for each half metre of height, by which a cell's structure is known in three dimensions. Bit
-  ``floor(2 z) mod 64`` stands for heights z of the map's frame: what lies 32 m higher shares it.
+* occupied: one bit for each half metre of height. Bit ``floor(2 z) mod 64`` stands for height z in the map's frame, and
+  for heights 32 m above or below.
 * ground: height of the lowest surface at the cell's middle.
 * edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
 
-It is made with the map, memory-mapped with it, and takes 48 MB per km2. It is looked up in other rasters that are made
-of these when a map is opened (:class:`~coview_kernels.reference.field.FieldLayers`), and takes 88 MB per km2 in memory
-then; files that need not be small hold those as well, and nothing is in memory but what is looked up.
+A map file holds it: 48 MB per km2. It is looked up in rasters that are made of it when a map is opened
+(:class:`~coview_kernels.reference.field.FieldLayers`), 88 MB per km2 of memory; the working files of sites hold these
+as well, memory-mapped.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 
-# set by hand
+# the heights below are set by hand
 _BASE = 8  # metres: a tile's heights count from a multiple of it
 _GROUND_BAND = 0.4  # metres above the lowest point nearby: still the ground
 _STEEPEST = 0.7  # of a normal's vertical part: steeper surfaces are no ground
 _GROUND_GROWTH = 2  # cells by which the ground is continued into cells without points
-_DROP = 2.0  # metres: what falls less is no wall
+_DROP = 2.0  # metres: lower drops are no walls
 _REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
 _OVERHANG = 3  # cells, odd: a wall stands this close to the edge
 _NOTHING = np.float32(-1e6)
 FIELD_ARRAYS = ("field.tiles", "field.occupied", "field.ground", "field.edge")
 LAYERS = "field.layers."
-"""Names of a field's arrays in a map's file, and what the names of its layers begin with."""
+"""Names of a field's arrays in a map file, and prefix of the names of its layers."""
 
 _Number = TypeVar("_Number", bound=np.generic)
 
@@ -87,11 +87,11 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
 
 
 def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[], object] = lambda: None) -> Arrays:
-    """Return the rasters in which a field is looked up, for a file that need not be small.
+    """Return the rasters in which a field is looked up, for a working file.
 
     Args:
         arrays: of the map, with those of :func:`field_arrays`.
-        zeros: makes the arrays that they are written to; None makes them in memory.
+        zeros: makes the arrays; None makes them in memory.
         done: called after each batch.
     """
     field = field_of(arrays)
@@ -100,10 +100,10 @@ def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[],
 
 
 def field_of(arrays: Arrays) -> FieldMap:
-    """Return the field that a map's arrays hold, with its layers if these are there.
+    """Return the field in a map's arrays, with its layers if the arrays have them.
 
     Raises:
-        KeyError: an array is missing. ValueError: one is not what it should be.
+        KeyError: an array is missing. ValueError: one is invalid.
     """
     stored = None
     if f"{LAYERS}table" in arrays:
@@ -173,11 +173,11 @@ def _edges(points: Points, flat: Ints, shape: tuple[int, int]) -> Floats32:
 
 
 def roof_edges(top: Floats32) -> Floats32:
-    """Find the walls that a map seen from above must have: below the edges of what stands high.
+    """Find the edges of roofs, below which a map seen from above must have walls.
 
     Args:
-        top: (H, W) greatest height of half-metre cells, metres; -1e6 where there is nothing, which counts as low, for
-            below a roof's edge there often is nothing.
+        top: (H, W) greatest height of half-metre cells, metres; -1e6 in empty cells, which count as low: below a roof's
+            edge there are often no points.
 
     Returns:
         (H, W) height of the edges; -1e6 where there is none.

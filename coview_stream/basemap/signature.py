@@ -1,7 +1,7 @@
 """Signatures of map files: ed25519, with keys as PEM files, which ``openssl`` makes and reads as well.
 
-A signature says who made a file; a checksum only says that it arrived as it was sent. It stands inside the file: a map
-and its signature are copied, and replaced, as one.
+The signature is in the file's header, over the header and the hashes of all arrays: a map and its signature are copied
+and replaced as one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 from coview_stream.errors import InputError, MapError, require_library
 
 REQUIREMENT = "cryptography>=42"
-_DOMAIN = b"coview-map ed25519 1\n"  # so that no other use of a key signs what could be taken for a map
+_DOMAIN = b"coview-map ed25519 1\n"  # no other use of a key signs bytes that could pass for a map
 _PURPOSE = "signed maps"
 _MAX_KEY = 1 << 14  # bytes of a key's file; a PEM file of this kind has some 120
 

@@ -1,9 +1,7 @@
-"""Station index: the descriptors of all stations in two tiers of 512 bytes each, and z-scores of a query by them.
+"""Station index: codes of all stations' descriptors in two tiers of 512 bytes each, and z-scores of queries by them.
 
-The first tier, of what varies most, screens all stations; the second is added where single scores are asked for.
-
-It is made when a map is built, and kept in its file; a map without it makes it when it is first searched. Neither the
-query nor the memory of a search then needs the descriptors, which take five times as much.
+The first tier, of the largest components, screens all stations; the second is added for single scores. The index is in
+the map's file, and replaces the descriptors in a search, which take five times as much memory.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from coview_stream.geometry.arrays import Complexes, Floats32, Ints
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
-_SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
+_SAMPLE = 128  # stations whose scores at all shifts give the medians
 CODES = ("station_codes", "station_codes.rest")
 """Names of the tiers' codes in a map's file."""
 _SAMPLED = "station_codes.sample"
@@ -36,10 +34,10 @@ class ScoredQuery:
     """A query of :class:`StationIndex`.
 
     Attributes:
-        coded: the query, its channels weighted by how far they spread.
+        coded: the query, its channels weighted by the inverse of their spread.
         rest: the same, for the second tier; None without one.
-        screen_zero: z-score of no correlation at all by the first tier alone.
-        zero: that by both.
+        screen_zero: z-score of zero correlation by the first tier alone.
+        zero: the same by both tiers.
     """
 
     coded: CodedQuery
@@ -50,11 +48,11 @@ class ScoredQuery:
 
 @dataclass(frozen=True)
 class _Sample:
-    """Some stations by which queries are standardised.
+    """Sample of stations by which queries are standardised.
 
     Attributes:
-        codes, rest: of them, by tier.
-        spectra: of their descriptors, by channel.
+        codes, rest: codes by tier.
+        spectra: spectra of the descriptors by channel.
     """
 
     codes: StationCodes
@@ -63,24 +61,24 @@ class _Sample:
 
 
 class StationIndex:
-    """The stations' descriptors as :class:`coview_kernels.StationCodes`, and a sample of them as they are.
+    """Codes of the stations' descriptors (:class:`coview_kernels.StationCodes`), and a sample of the descriptors.
 
-    A z-score says by how many robust standard deviations (of all stations and shifts, from the sample) a distance
-    (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
+    A z-score is the distance (eqs 7-9) minus the median, in robust standard deviations of all stations and shifts (from
+    the sample), averaged over the channels; negative is better.
     """
 
     def __init__(self, codes: StationCodes, rest: StationCodes | None, sample: Descriptors) -> None:
-        """Keep the tiers of codes, of which the second may be missing, and the descriptors of a sample."""
+        """Take the tiers of codes, the second of which is optional, and the descriptors of a sample."""
         self.codes = codes
         self.rest = rest
         self._descriptors = sample
 
     @classmethod
     def of(cls, descriptors: Descriptors) -> StationIndex:
-        """Make the index of stations by their descriptors.
+        """Make the index of stations from their descriptors.
 
         Raises:
-            MapError: they are too many.
+            MapError: too many stations.
         """
         stations = len(next(iter(descriptors.values())))
         if stations > StationCodes.MAX_STATIONS:
@@ -93,14 +91,14 @@ class StationIndex:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
-        """Return the index of these channels that a map's file holds, None if it holds none that can be used."""
+        """Return the index in a map's arrays, None if there is none of these channels."""
         if any(name not in arrays for tier in CODES for name in _names(tier)) or _SAMPLED not in arrays:
             return None
         sample, stations = arrays[_SAMPLED], len(arrays[CODES[0]])
         if sample.ndim != 4 or sample.shape[:2] != (len(channels), len(sampled_stations(stations))):
             return None
         count, _, rings, sectors = sample.shape
-        # kernels look up what the shapes promise
+        # kernels rely on these shapes
         shapes = (stations, 16, 16), (16, 16, rings * count, 2), (16, 2, 16), (33,)
         tiers = []
         for tier in CODES:
@@ -112,26 +110,26 @@ class StationIndex:
         return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)))
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a map's file holds of it."""
-        found = {_SAMPLED: np.stack(list(self._descriptors.values()))}
+        """Return the arrays for a map's file."""
+        arrays = {_SAMPLED: np.stack(list(self._descriptors.values()))}
         for tier, codes in zip(CODES, self.tiers, strict=True):
             basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
-            found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
-        return found
+            arrays |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
+        return arrays
 
     def subset(self, stations: Ints, second: bool = True) -> StationIndex:
-        """Return the index of some stations (K,), copied into memory, with the second tier or without.
+        """Return the index of stations (K,), copied into memory, with or without the second tier.
 
-        Its z-scores are those by the stations of the whole index, but for what a second tier would add.
+        Queries are standardised by the sample of the whole index.
         """
         rest = self.tiers[1].subset(stations) if second else None
-        found = StationIndex(self.codes.subset(stations), rest, self._descriptors)
-        found._sample = self._sample
-        return found
+        index = StationIndex(self.codes.subset(stations), rest, self._descriptors)
+        index._sample = self._sample
+        return index
 
     @property
     def tiers(self) -> tuple[StationCodes, StationCodes]:
-        """Both tiers; ValueError without the second."""
+        """Both tiers; ValueError if there is no second."""
         if self.rest is None:
             raise ValueError("an index without its second tier")
         return self.codes, self.rest
@@ -153,7 +151,7 @@ class StationIndex:
         return _Sample(codes, rest, {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known})
 
     def prepare(self) -> None:
-        """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
+        """Do the one-time work of the first query, and compile its kernels."""
         if len(self):
             query = self.query({name: values[0].astype(np.float32) for name, values in self._descriptors.items()})
             _ = self.best(query), self.at(query, [0], [0])
@@ -172,7 +170,7 @@ class StationIndex:
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
         coded = self.codes.query(stacked)
-        # the codes leave parts out that no query lacks: what that adds on the mean is made up for here
+        # codes leave out components of every query; correct the mean
         mean += sample.codes.all_shifts(coded, every)
         screen_zero = float(np.median(mean))
         if self.rest is None:
@@ -194,20 +192,20 @@ class StationIndex:
         return self.at_all([(query, stations, shifts)])[0]
 
     def at_all(self, requests: Sequence[tuple[ScoredQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[Floats32]:
-        """Return what :meth:`at` does of each request."""
+        """Return the result of :meth:`at` for each request."""
         out = self.codes.at_all([(query.coded, stations, shifts) for query, stations, shifts in requests])
         out = [np.float32(query.zero) - one for (query, *_), one in zip(requests, out, strict=True)]
         if self.rest is not None:
-            asked = [(query.rest, stations, shifts) for query, stations, shifts in requests if query.rest is not None]
-            for found, other in zip(out, self.rest.at_all(asked), strict=True):
-                found -= other
-        for found, (_, stations, _) in zip(out, requests, strict=True):
-            found[np.asarray(stations) < 0] = 0.0
+            wanted = [(query.rest, stations, shifts) for query, stations, shifts in requests if query.rest is not None]
+            for scores, other in zip(out, self.rest.at_all(wanted), strict=True):
+                scores -= other
+        for scores, (_, stations, _) in zip(out, requests, strict=True):
+            scores[np.asarray(stations) < 0] = 0.0
         return out
 
 
 def sampled_stations(stations: int) -> Ints:
-    """Choose the numbers (K,) of the stations that an index keeps as they are, as evenly as they come."""
+    """Return the numbers (K,) of the stations whose descriptors an index stores exactly, evenly spaced."""
     return np.arange(0, stations, max(1, -(-stations // _SAMPLE)))
 
 

@@ -1,4 +1,4 @@
-"""Stations: where virtual reference scans are taken, and their descriptors (paper, sections 3.1 and 3.2)."""
+"""Stations: places of virtual reference scans, on ground and floors, and their descriptors (paper, 3.1 and 3.2)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Ints
 from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
-# set by hand
+# floors
 _SUBCELL = 0.5  # metres: airborne scans of 8 points/m2 still fill two
 _STEP = 0.1  # metres: height resolution of the columns
 _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
@@ -29,7 +29,7 @@ class LevelConfig:
 
     Attributes:
         headroom: free height above it, metres.
-        cover: something flat must lie above within this height, metres; a roof in the open has nothing.
+        cover: a flat surface must lie above within this height, metres: a roof in the open has none.
         area: minimal connected area, square metres.
         flatness: neighbouring half-metre cells differ by less than this, metres.
     """
@@ -49,10 +49,9 @@ class LevelConfig:
 def ground_levels(ground: Points, floors: Points, cell: float) -> Points:
     """Find the centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
 
-    The lowest level is the ground itself. A higher one counts only where it is a floor *indoors*: flat, extended, with
-    headroom, and covered by something flat. So an upper storey counts, while a roof (nothing above), a bridge deck in
-    the open, and a canopy (not flat) do not. The price: an open parking deck or roof terrace is no level. Heights of
-    upper levels are good to 0.1 m.
+    The lowest level is the ground. A higher one counts only if it is a floor *indoors*: flat, wide, with headroom and
+    a flat cover. So an upper storey counts; a roof or a bridge deck (no cover) and a canopy (not flat) do not, nor does
+    an open parking deck or roof terrace. Heights of upper levels are good to 0.1 m.
 
     Args:
         ground: (N, 3) float32 points on the ground, metres.
@@ -75,7 +74,7 @@ def below_another(stations: Points, cell: float) -> Bools:
 
 
 def indoor_floors(points: Points, config: LevelConfig) -> Points:
-    """Find the half-metre cells (K, 3) of all covered floors, the lowest storey included, metres."""
+    """Return the half-metre cells (K, 3) of all covered floors, also of the lowest storey, metres."""
     corner, shape, flat = cells(points, _SUBCELL)
     level = np.floor(points[:, 2] / np.float32(_STEP)).astype(np.int64)
     base = int(level.min())
@@ -160,7 +159,7 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     above = floors[:, 2] > base_height.flat[own] + _SAME_LEVEL
     remaining, own = floors[above], own[above]
     min_cells = max(1, int(0.25 * (cell / _SUBCELL) ** 2))
-    found = [np.zeros((0, 3), dtype=np.float32)]
+    levels = [np.zeros((0, 3), dtype=np.float32)]
     while len(remaining):  # one storey per round, from below
         lowest = lowest_per_cell(remaining, own)
         bottom = np.full(shape, np.inf, dtype=np.float32)
@@ -172,9 +171,9 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
         row, column = np.divmod(unique, shape[1])
         z = ndimage.median(remaining[enough, 2], own[enough], unique)
         xy = np.column_stack([corner[0] + (column + 0.5) * cell, corner[1] + (row + 0.5) * cell])
-        found.append(np.column_stack([xy, z]).astype(np.float32).reshape(-1, 3))
+        levels.append(np.column_stack([xy, z]).astype(np.float32).reshape(-1, 3))
         remaining, own = remaining[~now], own[~now]
-    return np.concatenate(found)
+    return np.concatenate(levels)
 
 
 Described = dict[Channel, npt.NDArray[np.float16]]
@@ -183,12 +182,12 @@ Described = dict[Channel, npt.NDArray[np.float16]]
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
-RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth; set by hand
-_PORTION = 512  # stations at a time: 7 MB of bins; set by hand
-_FLOORS = LevelConfig(area=25.0)  # square metres: smaller floors are overhangs more often than not; set by hand
-_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together; set by hand
-_BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey; set by hand
-_CEILING = 6.0  # metres: as LevelConfig.cover; set by hand
+RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
+_PORTION = 512  # stations at a time: 7 MB of bins
+_FLOORS = LevelConfig(area=25.0)  # square metres: most smaller floors are overhangs
+_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
+_BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
+_CEILING = 6.0  # metres: as LevelConfig.cover
 
 
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
@@ -215,16 +214,16 @@ def describe_storeys(
 ) -> Described:
     """Describe stations by channels (M, R, S), those with a storey above them storey by storey.
 
-    A robot below another floor sees up to it, not the roof: such stations of similar height share a raster of the
-    points from a metre below their floor up to the highest ceiling that counts as one.
+    A robot below another floor sees that floor, not the roof: such stations of similar height share a raster of the
+    points from a metre below their floor up to the highest possible ceiling.
 
     Args:
-        points: (N, 3) of the map, or of all that lies within the radius and two blocks of the stations.
-        stations: (M, 3) all stations of the blocks that any of them is in.
+        points: (N, 3) of the map, or at least those within the radius and two blocks of the stations.
+        stations: (M, 3), with all stations of their blocks.
         block: metres.
         config: of the descriptors.
         progress: called with stations done and all stations.
-        wanted: (K,) numbers of those that are to be described, in the order of the answer; None takes all.
+        wanted: (K,) numbers of the stations to describe, in the order of the result; None takes all.
     """
     indoors = below_another(stations, block)
     if wanted is not None:
@@ -260,8 +259,7 @@ def describe_stations(
 ) -> Described:
     """Describe the virtual reference scans at ``stations`` (M, 3) by channels (M, R, S), float16.
 
-    Stations are described in portions: the descriptors of all of them are in memory, their points never. float16 keeps
-    2 cm at 30 m height, far below the noise of a maximum over a bin.
+    float16 resolves 2 cm at 30 m height, far below the noise of a maximum over a bin.
     """
     shape = (len(stations), config.rings, config.sectors)
     described: Described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
@@ -346,7 +344,7 @@ def rasterise(
 
 
 LEVEL_GAP = 2.5
-"""Metres: stations farther apart in height are on different storeys; set by hand."""
+"""Metres: stations farther apart in height are on different storeys."""
 
 
 class StationGrid:
@@ -378,9 +376,9 @@ class StationGrid:
         return len(self.stations)
 
     def at(self, positions: Reals) -> Indices:
-        """Return the station (N,) in whose cell and on whose level each of (N, 3) positions is, -1 for none.
+        """Return the station (N,) at each of (N, 3) positions, -1 for none.
 
-        Where the map has several levels it is the nearest one, less than 2.5 m above or below.
+        On maps with several levels it is the nearest one, less than 2.5 m above or below.
         """
         cell = self.cell(positions)
         if len(self._levels) == 1:
@@ -389,19 +387,19 @@ class StationGrid:
         gap = np.abs(self.stations[levels, 2] - np.asarray(positions[:, 2], dtype=np.float32))
         gap[levels < 0] = np.inf
         best = gap.argmin(axis=0)
-        each = np.arange(levels.shape[1])
-        return np.where(gap[best, each] < LEVEL_GAP, levels[best, each], -1).astype(np.intp)
+        column = np.arange(levels.shape[1])
+        return np.where(gap[best, column] < LEVEL_GAP, levels[best, column], -1).astype(np.intp)
 
     def levels_at(self, positions: Reals) -> Indices:
-        """Return the stations (L, N), lowest first, in whose cells (N, 2 or 3) positions are; -1 for none."""
+        """Return the stations (L, N) of all levels, lowest first, at (N, 2 or 3) positions; -1 for none."""
         return np.asarray(self._levels[:, self.cell(positions)], dtype=np.intp)
 
     def cells_of(self, chosen: Indices | slice) -> Ints:
-        """Return column and row (N, 2) of the cells that stations stand in, counted from the map's zero."""
+        """Return column and row (N, 2) of the cells of stations, counted from the map's zero."""
         return np.asarray(np.floor(self.stations[chosen, :2].astype(np.float64) / self.block), dtype=np.int64)
 
     def storeys(self, station: int) -> list[int]:
-        """Return the stations of a station's cell, lowest first, itself among them."""
+        """Return the stations of a station's cell, lowest first, with itself."""
         if len(self._levels) == 1:
             return [station]
         return [k for k in self._levels[:, self.cell(self.stations[station][None])[0]].tolist() if k >= 0]

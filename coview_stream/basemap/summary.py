@@ -1,4 +1,4 @@
-"""What a map covers, in numbers that a person can check, and what about it will make robots fail."""
+"""Facts about a map for people: its extent with warnings, its plan as a picture, and thinned points for viewers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from coview_stream.geometry.rasters import cells
 from coview_stream.geometry.transforms import Points
 
 _CELL = 1.0  # metres: the area that a map covers is counted in such squares
-_SAMPLED = 100_000  # points, where a sample will do; set by hand
+_SAMPLED = 100_000  # points
 _STRAY = 0.1  # per cent of the points at either end of the heights that may be birds or pits
 
 # Limits of the warnings, set by hand; they decide nothing. docs/results.md has the table of densities.
@@ -45,7 +45,7 @@ class MapSummary:
         density: points of the source per m2 of that area; None if the file does not say how many there were.
         crs: name of the reference system; "unknown" if none is stated.
         bytes: of all arrays.
-        warnings: what will make robots fail, each a sentence.
+        warnings: one sentence for each feature of the map that will make robots fail.
     """
 
     width: float
@@ -87,7 +87,7 @@ class SummarizedMap(Protocol):
 
 
 def summary(base_map: SummarizedMap) -> MapSummary:
-    """Return what a map covers."""
+    """Return extent, area, density, heights and warnings of a map."""
     points = base_map.points
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     lowest, highest = np.percentile(points[:, 2], [_STRAY, 100.0 - _STRAY]) + base_map.origin[2]
@@ -145,7 +145,7 @@ def _upright(base_map: SummarizedMap) -> str | None:
 
 
 def _structured(points: Points, index: Ints, covered: Bools) -> str | None:
-    """Look for what stands: squares of a metre whose points differ by a metre in height and more."""
+    """Look for objects: squares of a metre whose points differ by a metre in height and more."""
     size = len(covered)
     low, high = np.full(size, np.inf, np.float32), np.full(size, -np.inf, np.float32)
     np.minimum.at(low, index, points[:, 2])
@@ -160,7 +160,7 @@ def _structured(points: Points, index: Ints, covered: Bools) -> str | None:
 
 
 def _covered(base_map: SummarizedMap) -> str | None:
-    """Look how much of the surroundings of stations has been surveyed."""
+    """Look at the surveyed share of the stations' surroundings."""
     radius, block = base_map.config.descriptor.radius, base_map.config.block
     survey = base_map.survey
     surveyed = np.asarray(survey.values, dtype=np.float64)
@@ -169,8 +169,8 @@ def _covered(base_map: SummarizedMap) -> str | None:
     x, y = np.floor((base_map.stations[:, :2] - survey.corner) / block).astype(int).T
     xs = np.clip([x - reach, x + reach + 1], 0, surveyed.shape[0])
     ys = np.clip([y - reach, y + reach + 1], 0, surveyed.shape[1])
-    seen = total[xs[1], ys[1]] - total[xs[0], ys[1]] - total[xs[1], ys[0]] + total[xs[0], ys[0]]
-    share = float(np.median(seen)) / (2 * reach + 1) ** 2
+    count = total[xs[1], ys[1]] - total[xs[0], ys[1]] - total[xs[1], ys[0]] + total[xs[0], ys[0]]
+    share = float(np.median(count)) / (2 * reach + 1) ** 2
     if share >= _HOLES:
         return None
     return (
@@ -180,7 +180,7 @@ def _covered(base_map: SummarizedMap) -> str | None:
 
 
 _DRAWN_POINTS = 2_000_000
-_PIXELS = 800  # along the longer side, set by hand as are the others
+_PIXELS = 800  # along the longer side
 _DARK, _LIGHT = 0.15, 0.9  # grey of the highest and of the lowest points
 _STRAY_HEIGHTS = 1.0  # per cent of the heights at either end that may be birds or pits
 
@@ -224,13 +224,12 @@ def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, ax
     return axes
 
 
-# set by hand
 POINTS_OF_FILE = 300_000
-"""Points of a view that is made of a file on this machine."""
+"""Points of a view of a map on this machine."""
 POINTS_ON_WIRE = 100_000
-"""Points of a view that a node hands out: 0.8 MB of JSON."""
+"""Points of a view from a node: 0.8 MB of JSON."""
 MAX_WIRE_BYTES = 4 * 1024 * 1024
-"""Bytes of a view's JSON that are read."""
+"""Largest JSON of a view, bytes."""
 _MAX_POINTS = 500_000  # that are read
 _OVERSAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
 _GROWTH = 1.2  # of the cells, until few enough are left
@@ -248,10 +247,10 @@ class MapView:
     Attributes:
         origin: (3,) float64 in the frame of the map's sources, metres.
         points: (N, 3) float32 relative to ``origin``, metres.
-        is_ground: (N,) whether a point is the ground, not what stands on it.
-        crs: coordinate reference system of the sources as text, None if it is not known.
+        is_ground: (N,) whether a point is on the ground.
+        crs: coordinate reference system of the sources as text, None if unknown.
         sha256: hash of the map.
-        parts: the maps of which it is joined, in whose frames poses are; None of one map.
+        parts: of a joined map, in whose frames poses are; None for one map.
     """
 
     origin: Floats
@@ -271,9 +270,9 @@ class MapView:
 
     @classmethod
     def of_cloud(cls, points: Points, origin: Floats, count: int = POINTS_OF_FILE) -> MapView:
-        """Thin a survey of which no map has been built: (N, 3) float32 about ``origin``, metres.
+        """Thin a survey without a map: (N, 3) float32 about ``origin``, metres.
 
-        The ground is taken for what lies near the lowest point of its cell.
+        Points near the lowest point of their cell count as ground.
         """
         chosen = points[_thinned(points[:: max(1, len(points) // (_OVERSAMPLED * count))], count)]
         cells = np.floor(chosen[:, :2] / _GROUND_CELL).astype(np.int64)
@@ -310,10 +309,10 @@ class MapView:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> MapView:
-        """Read what :meth:`to_json` wrote, from anyone.
+        """Read untrusted data of :meth:`to_json`.
 
         Raises:
-            MessageError: it is something else; the field is named.
+            MessageError: a field is missing or invalid; the message names it.
         """
         count, ground = (_whole(data, name) for name in ("count", "ground"))
         step: Any = data.get("step_m")
@@ -359,7 +358,7 @@ def _thinned(points: Points, count: int) -> np.ndarray:
 
 
 def _is_ground(base_map: SummarizedMap, points: Points) -> Bools:
-    """Tell which points (N, 3) lie on the ground: near the height of a station beside them."""
+    """Return which points (N, 3) lie on the ground: near the height of a station next to them."""
     stations, block = base_map.stations, base_map.config.block
     if not len(stations) or not len(points):
         return np.zeros(len(points), dtype=bool)

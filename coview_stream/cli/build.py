@@ -1,4 +1,4 @@
-"""``coview-stream build``: a base map file of one or many clouds."""
+"""``coview-stream build``: a base map from one or many clouds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
 Clouds: TypeAlias = "Sequence[str | os.PathLike[str]]"
 
 _FIELDS = {"block_size": "block"}
-_MAX_WORKERS = 8  # unless more are asked for: each may take 2 GB; set by hand
+_MAX_WORKERS = 8  # by default: each may take 2 GB
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -167,7 +167,7 @@ def _build_site(
 
 
 def _networks_available() -> bool:
-    """Return whether features can be made; if not, print why: the user may rely on them."""
+    """Return whether features can be made; if not, print the reason: the user may rely on them."""
     from coview_stream.descriptors.network import VIEW_NAMES, network
     from coview_stream.errors import CoViewError
 

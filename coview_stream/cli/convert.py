@@ -1,4 +1,4 @@
-"""``coview-stream convert``: a map in one file from a directory of tiles, the other way round, and a light copy."""
+"""``coview-stream convert``: a directory of tiles to one map file, the other way round, and light copies."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert, and print what became of it."""
+    """Convert, and print the sizes."""
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.signature import SigningKey

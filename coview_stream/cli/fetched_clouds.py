@@ -1,4 +1,4 @@
-"""Clouds of web servers, and windows of COPC files, in a folder of their own while a command runs."""
+"""Clouds of web servers, and windows of COPC files, as temporary local files."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str | os.PathLike[str]]]:
-    """Give the names of clouds with those of web servers, and windows of COPC files, as local files.
+    """Fetch clouds of web servers, and windows of COPC files, into a temporary folder, and yield the local files.
 
     Args:
         given: files, folders, patterns and web addresses, as the command was given them.
-        window: ``X0,Y0,X1,Y1``, of all of them; None: the files as they are.
+        window: ``X0,Y0,X1,Y1`` of all clouds; None takes whole files.
 
     Raises:
-        ConfigError: the window is none. CloudError: a file cannot be fetched, or is no COPC file and a window is given.
+        ConfigError: a malformed window. CloudError: a file cannot be fetched, or is no COPC file and has a window.
     """
     from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address
     from coview_stream.clouds.files import expand_cloud_paths
@@ -36,9 +36,11 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
                 if wanted is None and not is_web_address(each):
                     out.append(each)
                     continue
-                path, fetched = fetch_cloud(each, Path(folder), wanted)
+                path, cloud = fetch_cloud(each, Path(folder), wanted)
                 out.append(path)
-                came = f", {fetched.received / 1e6:.1f} MB in {fetched.requests} requests" if fetched.requests else ""
-                what = f"{fetched.points} points in the window{came}" if wanted else f"{fetched.received / 1e6:.1f} MB"
-                print(f"{each}: {what}", file=sys.stderr)
+                size = f"{cloud.received / 1e6:.1f} MB"
+                if wanted:
+                    received = f", {size} in {cloud.requests} requests" if cloud.requests else ""
+                    size = f"{cloud.points} points in the window{received}"
+                print(f"{each}: {size}", file=sys.stderr)
         yield out

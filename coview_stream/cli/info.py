@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import AcceptanceConfig
 
-HELP = "show what is inside a base map file"
+HELP = "show the contents of a base map file"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,7 @@ def _ambiguity(base_map: BaseMap, acceptance: AcceptanceConfig, args: argparse.N
 
 
 def describe(base_map: BaseMap) -> dict[str, object]:
-    """Return what ``info`` shows, by name; metres in the source's frame."""
+    """Return the facts that ``info`` prints, by name; metres in the source's frame."""
     from dataclasses import asdict
 
     from coview_stream.basemap.summary import summary

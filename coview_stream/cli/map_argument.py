@@ -51,7 +51,7 @@ def local_map(
     Args:
         name: path or address.
         around: ``X,Y,RADIUS``; None for all of it.
-        verify_key: has to have signed it, if it comes from elsewhere.
+        verify_key: must have signed a site elsewhere.
         base: first part of zenoh keys.
         connect: zenoh endpoints, for ``zenoh://SITE``.
         config: a zenoh configuration, likewise.

@@ -1,1 +1,1 @@
-"""Maps over the network: a server of sites on zenoh, sources that fetch them, and what follows their changes."""
+"""Maps over the network: a server of sites on zenoh, fetching of sites, and a follower of their changes."""

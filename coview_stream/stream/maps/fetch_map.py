@@ -1,4 +1,4 @@
-"""Fetching of a map: an address in, a path that :meth:`BaseMap.load` takes out."""
+"""Fetching of a map: from its address to a path that :meth:`BaseMap.load` takes; and its preparation for a node."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def source_of(
     listen: Sequence[str] = (),
     config: Path | None = None,
 ) -> SiteSource:
-    """Return the source that an address names.
+    """Return the source of an address.
 
     Args:
         address: of the site.
         base: first part of zenoh keys.
         connect: zenoh endpoints, for addresses without one.
-        listen: likewise.
+        listen: zenoh endpoints to listen on, likewise.
         config: a zenoh configuration.
 
     Raises:
-        ConfigError: it is no address of a site. DependencyError: a library is missing. TransportError: an object store
-            cannot be used.
+        ConfigError: no address of a site. DependencyError: a library is missing. TransportError: an object store cannot
+            be used.
     """
     parts = urlsplit(address)
     if parts.scheme in ("http", "https"):
@@ -57,7 +57,7 @@ def source_of(
 
 
 MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"
-"""Where ``serve-map`` listens, and where ``zenoh://SITE`` looks for it, unless told otherwise."""
+"""Default endpoint of ``serve-map``, and of ``zenoh://SITE``."""
 
 
 def fetch_map(
@@ -67,20 +67,20 @@ def fetch_map(
     verify_key: str | os.PathLike[str] | VerifyKey | None = None,
     connect: Sequence[str] = (),
 ) -> Path:
-    """Fetch a site, or bring what was fetched of it up to date, and return what to load.
+    """Fetch a site, or update its cached copy, and return the path to load.
 
-    Every layer is compared with its hash before it is used. Where the source cannot be reached, what was fetched before
-    is returned, with a warning.
+    Every layer is compared with its hash before it is used. If the source cannot be reached, the cached copy is used,
+    with a warning.
 
     Args:
         address: ``zenoh://SITE``, ``zenoh://HOST:PORT/SITE``, ``https://...`` or ``s3://...``.
-        around: x, y, radius in metres, in the map's coordinates: only the tiles that the circle meets; None for all.
-        verify_key: public key, or its PEM file, that the site has to be signed with.
+        around: x, y, radius in metres, in the map's coordinates: only the tiles in this circle; None for all.
+        verify_key: public key, or its PEM file, that must have signed the site.
         connect: zenoh endpoints of an address without one (``tcp/127.0.0.1:7448``).
 
     Raises:
-        ConfigError: a malformed address or circle. TransportError: it cannot be reached, and never was.
-        MapError: what came is not what it should be, not signed with the key, or nothing is in the circle.
+        ConfigError: a malformed address or circle. TransportError: the source cannot be reached, and nothing is in the cache.
+        MapError: the site is damaged or not signed with the key, or no tile is in the circle.
         InputError: the key cannot be read. DependencyError: a library is missing.
     """
     key = read_verify_key(verify_key) if isinstance(verify_key, str | os.PathLike) else verify_key
@@ -99,12 +99,12 @@ def open_mirror(
     connect: Sequence[str] = (),
     config: Path | None = None,
 ) -> Mirror:
-    """Return the mirror of a site, fetched if that can be done; the caller closes its source.
+    """Open the mirror of a site, up to date if the source can be reached; the caller closes its source.
 
     Args:
-        address: as :func:`fetch_map` takes it.
-        around: only the tiles that it meets.
-        verify_key: has to have signed it.
+        address: as for :func:`fetch_map`.
+        around: circle of the tiles; None for all.
+        verify_key: must have signed the site.
         base: first part of zenoh keys.
         connect: zenoh endpoints of an address without one.
         config: a zenoh configuration.
@@ -139,18 +139,18 @@ def _bar(name: str) -> Iterator[Progress]:
 log = logging.getLogger("coview_stream.maps")
 
 _NAMES = (PART_SUFFIX, JOINED_SUFFIX)
-_NICE = 10  # set by hand
+_NICE = 10
 _LOOK = 0.1  # seconds
 
 
 def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
-    """Have made what a map is opened from, if that is made of something else: a site, a part of one, several maps.
+    """Write the working file of a site, of a part of one, or of several maps, in a low-priority process.
 
-    An error here is not raised: opening the map afterwards meets the same one and says it.
+    The node itself would miss poses meanwhile. Errors are not raised: opening the map afterwards raises the same.
 
     Args:
-        place: of a map.
-        cancelled: asked now and then; True ends it.
+        place: path of the map.
+        cancelled: polled; True ends the process.
     """
     if not (place.is_dir() or place.suffix in _NAMES):
         return
@@ -160,13 +160,13 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
     ) as child:  # fmt: skip
         while True:
             try:
-                _, said = child.communicate(timeout=_LOOK)
+                _, output = child.communicate(timeout=_LOOK)
                 break
             except subprocess.TimeoutExpired:
                 if cancelled():
                     child.kill()
         if child.returncode and not cancelled():
-            log.debug("%s: preparing it failed: %s", place, said.decode(errors="replace").strip()[-500:])
+            log.debug("%s: preparing it failed: %s", place, output.decode(errors="replace").strip()[-500:])
 
 
 def main() -> None:

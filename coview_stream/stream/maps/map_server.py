@@ -17,14 +17,14 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.maps")
 
-_LOOK = 1.0  # seconds between two looks at the manifest's file; set by hand
-_QUEUE = 64  # queries that wait, more are dropped and asked again; set by hand
+_LOOK = 1.0  # seconds between two looks at the manifest's file
+_QUEUE = 64  # waiting queries; more are dropped, and clients repeat them
 
 
 class MapServer:
-    """Serves one site; of its directory only the manifest and the layers that it names, or named before.
+    """Serves one site: its manifest, and the layers in the present and the last manifest; no other file.
 
-    One thread answers, one query after the other; another looks whether the manifest has changed.
+    One thread answers the queries; another looks for changes of the manifest.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class MapServer:
         listen: Sequence[str] = (),
         config: Path | None = None,
     ) -> None:
-        """Open a session and begin to answer.
+        """Open a session and start to answer.
 
         Raises:
             MapError: the directory is no site. TransportError: the network cannot be used.
@@ -44,7 +44,7 @@ class MapServer:
 
         self.manifest = Manifest.load(directory)
         self.answered = 0
-        """Queries that were answered with bytes."""
+        """Number of queries answered with bytes."""
         self.sent = 0
         """Bytes of these answers."""
         self._directory, self._keys = directory, keys
@@ -67,7 +67,7 @@ class MapServer:
             thread.start()
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop."""
         self._stopping.set()
         with self._guard.catch("closing"):
             self._session.close()  # and all that was declared on it
@@ -84,10 +84,10 @@ class MapServer:
                 self._answer(query)
 
     def _answer(self, query: Any) -> None:
-        asked = query.key_expr
-        if asked.intersects(self._keys.manifest):
+        expression = query.key_expr
+        if expression.intersects(self._keys.manifest):
             self._reply(query, self._keys.manifest, self._raw)
-        key = str(asked)  # a wildcard would ask for the whole site at once: layers are given by their names alone
+        key = str(expression)  # no wildcards for layers: one query would ask for the whole site
         prefix = self._keys.layer("")
         sha256 = key.removeprefix(prefix)
         if key.startswith(prefix) and sha256 in self._layers:
@@ -109,19 +109,19 @@ class MapServer:
         while not self._stopping.wait(_LOOK):
             with self._guard.catch("looking at the manifest"):
                 try:
-                    found = Manifest.load(self._directory)
+                    manifest = Manifest.load(self._directory)
                 except MapError as error:
                     if str(error) != refused:
                         log.error("%s; going on with manifest %s", error, self.manifest.sha256[:12])
                     refused = str(error)
                     continue
                 refused = ""
-                if found == self.manifest:
+                if manifest == self.manifest:
                     continue
-                self._layers = _sizes(self.manifest) | _sizes(found)  # who has the last manifest still asks for its
-                self.manifest, self._raw = found, found.to_bytes()
-                log.info("manifest %s is served now", found.sha256[:12])
-                self._publisher.put(found.sha256)
+                self._layers = _sizes(self.manifest) | _sizes(manifest)  # clients may still fetch by the last one
+                self.manifest, self._raw = manifest, manifest.to_bytes()
+                log.info("manifest %s is served now", manifest.sha256[:12])
+                self._publisher.put(manifest.sha256)
 
 
 def _sizes(manifest: Manifest) -> dict[str, int]:

@@ -25,7 +25,7 @@ class MapKeys:
 
     @classmethod
     def of(cls, site: str, base: str = "coview") -> MapKeys:
-        """Return those of a site by its name; ConfigError where that is no chunk of a key."""
+        """Return the keys of a site; ConfigError if its name cannot be part of a key."""
         return cls(f"{check_prefix(base, '--base')}/maps/{check_chunk(site, 'the name of a site')}")
 
     @property
@@ -49,11 +49,11 @@ class MapKeys:
 
 
 _NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
-_TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s; set by hand
+_TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 
 
 class ZenohSource:
-    """A site by its name; the session is opened when something is asked for, and kept."""
+    """A site on a map server; the zenoh session is opened with the first query."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class ZenohSource:
         listen: Sequence[str] = (),
         config: Path | None = None,
     ) -> None:
-        """Take the site's name and where the network is; ConfigError where the name is no part of a key."""
+        """Use a site's name and zenoh endpoints; ConfigError if the name cannot be part of a key."""
         where = ",".join(connect) or ("" if config is None else str(config))
         self.name = f"zenoh://{site}" + (f" ({where})" if where else "")
         self._keys = MapKeys.of(site, base)
@@ -90,15 +90,15 @@ class ZenohSource:
 
         self._open()
         with zenoh_config.zenoh_errors(self.name):
-            told = ""
+            refusal = ""
             for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
                 if reply.ok is None:
-                    told = reply.err.payload.to_string()[:300].replace(_NO_ANSWER, "")
+                    refusal = reply.err.payload.to_string()[:300].replace(_NO_ANSWER, "")
                     continue
                 if len(reply.ok.payload) > limit:
                     raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")
                 return bytes(reply.ok.payload)
-        raise TransportError(f"{self.name}: {told or self._silence()}")
+        raise TransportError(f"{self.name}: {refusal or self._silence()}")
 
     def _open(self) -> None:
         import zenoh
@@ -115,7 +115,7 @@ class ZenohSource:
             raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
 
     def _silence(self) -> str:
-        """Return why there was no answer: the sites that are served there, or that none is."""
+        """Return the reason for a missing answer: other sites are served there, or none."""
         import zenoh
 
         begin, end = self._keys.prefix.rpartition("/")[0] + "/", "/manifest"
