@@ -1,4 +1,4 @@
-"""The ``.coview`` file: what was saved comes back, and nothing else is taken for it."""
+"""The ``.coview`` file: saved content comes back, and damaged or foreign files are refused."""
 
 from __future__ import annotations
 
@@ -173,33 +173,26 @@ def test_file_that_is_not_a_map_is_refused(tmp_path, content):
         file_format.load(path)
 
 
-def test_missing_file_and_directory_are_refused(tmp_path):
+def test_missing_files_and_directories_are_refused(tmp_path):
     for path in (tmp_path / "none.coview", tmp_path):
         with pytest.raises(MapError, match="cannot read the map"):
             file_format.load(path)
+    with pytest.raises(MapError, match=r"a directory that exists"):
+        file_format.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
 
 
-def test_failed_save_keeps_old_map_and_leaves_no_temporary_files(path, monkeypatch):
+@pytest.mark.parametrize(
+    ("failure", "raised"),
+    [(OSError(28, "No space left on device"), MapError), (KeyboardInterrupt(), KeyboardInterrupt)],
+)
+def test_failed_save_keeps_old_map_and_leaves_no_temporary_files(path, monkeypatch, failure, raised):
     before = path.read_bytes()
 
-    def no_space(handle):
-        raise OSError(28, "No space left on device")
+    def fail(handle):
+        raise failure
 
-    monkeypatch.setattr(os, "fsync", no_space)
-    with pytest.raises(MapError, match="No space left on device"):
-        file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
-    assert path.read_bytes() == before
-    assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
-
-
-def test_interrupted_save_keeps_old_map_and_leaves_no_temporary_files(path, monkeypatch):
-    before = path.read_bytes()
-
-    def interrupted(handle):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(raised, match=str(failure.args[-1]) if failure.args else None):
         file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
@@ -212,29 +205,16 @@ def test_saving_over_a_loaded_map_keeps_it_readable(path):
     assert file_format.load(path)[0]["points"].shape == (5, 3)
 
 
-def test_saving_into_missing_directory_is_refused(tmp_path):
-    with pytest.raises(MapError, match=r"a directory that exists"):
-        file_format.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
-
-
-def test_the_file_is_valid_safetensors(tmp_path):
+def test_the_file_is_valid_safetensors(path):
     from safetensors.numpy import load_file
 
-    arrays = {
-        "a": np.arange(5, dtype=np.int8),
-        "b": np.arange(6, dtype=np.float64).reshape(2, 3),
-        "c": np.zeros((0, 3), dtype=np.float32),
-    }
-    path = tmp_path / "site.coview"
-    file_format.save(path, arrays, {"answer": 42})
     loaded = load_file(path)
-    assert sorted(loaded) == sorted(arrays)
-    for name, array in arrays.items():
+    assert sorted(loaded) == sorted(arrays())
+    for name, array in arrays().items():
         np.testing.assert_array_equal(loaded[name], array)
 
 
-def test_map_that_is_not_checked_says_what_its_header_does(shared):
-    """Another process has read all of it a moment ago; the header is looked at all the same."""
+def test_without_check_only_the_header_is_read(shared):
     content, path = shared
     damaged = bytearray(content)
     damaged[-1] ^= 1

@@ -1,4 +1,4 @@
-"""Signed maps: any byte that is not as it was signed is one MapError, whenever the file is changed."""
+"""Signed maps: any changed byte is one MapError, whenever the file is changed; and the files of keys."""
 
 from __future__ import annotations
 
@@ -78,35 +78,28 @@ def test_every_flipped_byte_is_refused(path, key):
             damaged = bytearray(whole)
             damaged[place] ^= bit
             path.write_bytes(damaged)
-            with pytest.raises(MapError) as told:
+            with pytest.raises(MapError) as error:
                 opened(path, key)
-            assert str(path) in str(told.value)
-            assert "\n" not in str(told.value)
+            assert str(path) in str(error.value)
+            assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("length", [0, 7, 100, -1])
-def test_truncated_map_is_refused(path, key, length):
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(MapError):
-        opened(path, key)
-
-
-def test_appended_bytes_are_refused(path, key):
-    path.write_bytes(path.read_bytes() + b"x")
-    with pytest.raises(MapError, match="are not signed"):
-        opened(path, key)
-
-
-def test_another_key_is_told_from_a_changed_file(path, keys):
+def test_truncated_longer_and_unsigned_files_and_other_keys_are_refused(path, key, keys):
     theirs = read_verify_key(f"{keys[1]}.pub")
     with pytest.raises(MapError, match=f"signed with another key .*{theirs.fingerprint}"):
         opened(path, theirs)
-
-
-def test_unsigned_map_is_refused(tmp_path, key):
-    file_format.save(tmp_path / "site.coview", arrays(), PARAMETERS)
+    content = path.read_bytes()
+    for length in (0, 7, 100, -1):
+        path.write_bytes(content[:length])
+        with pytest.raises(MapError):
+            opened(path, key)
+    path.write_bytes(content + b"x")
+    with pytest.raises(MapError, match="are not signed"):
+        opened(path, key)
+    path.unlink()
+    file_format.save(path, arrays(), PARAMETERS)
     with pytest.raises(MapError, match=r"not signed.*--sign"):
-        opened(tmp_path / "site.coview", key)
+        opened(path, key)
 
 
 def test_signature_of_another_map_does_not_fit(path, keys, key, tmp_path):
@@ -217,16 +210,13 @@ def test_keys_are_never_overwritten_and_private_ones_are_private(keys, tmp_path)
         make_keys(tmp_path / "none" / "key")
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff" * 40, b"-----BEGIN PUBLIC KEY-----\n-----END PUBLIC KEY-----\n"])
-def test_what_is_no_key_is_refused(tmp_path, content):
+def test_files_that_are_no_keys_and_wrong_halves_of_pairs_are_refused(keys, tmp_path):
     path = tmp_path / "a.pub"
-    path.write_bytes(content)
-    for read in (read_verify_key, SigningKey):
-        with pytest.raises(InputError, match=r"a\.pub: holds no"):
-            read(path)
-
-
-def test_the_wrong_half_of_a_pair_is_told(keys):
+    for content in (b"", b"\xff" * 40, b"-----BEGIN PUBLIC KEY-----\n-----END PUBLIC KEY-----\n"):
+        path.write_bytes(content)
+        for read in (read_verify_key, SigningKey):
+            with pytest.raises(InputError, match=r"a\.pub: holds no"):
+                read(path)
     with pytest.raises(InputError, match="is a private key"):
         read_verify_key(f"{keys[0]}.key")
     with pytest.raises(InputError, match="holds no private key"):
@@ -266,7 +256,7 @@ def test_missing_library_is_one_line_with_the_remedy(path, key, monkeypatch):
         opened(path, key)
 
 
-def test_keys_are_both_there_or_none(tmp_path, monkeypatch):
+def test_failed_writing_leaves_no_key(tmp_path, monkeypatch):
     opened = os.fdopen
 
     def full(descriptor, mode):

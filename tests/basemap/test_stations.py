@@ -1,11 +1,20 @@
-"""Rasters and stations: every number in its cell, every station at its cell's centre."""
+"""Stations: on ground and floors, their descriptors against brute force, and their look-up by position."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from coview_stream.basemap.stations import aligned_corner, describe_stations, find_stations, rasterise
+from bench.speed.map_build import baseline, ours, site
+from coview_stream.basemap.stations import (
+    StationGrid,
+    aligned_corner,
+    below_another,
+    describe_stations,
+    describe_storeys,
+    find_stations,
+    rasterise,
+)
 from coview_stream.config import DescriptorConfig
 
 
@@ -109,3 +118,91 @@ def test_tower_appears_in_its_ring_and_sector():
     # from (7, -5) it stands 6 m to the north
     assert np.argwhere(found[1] > 1).tolist() in ([[3, 2]], [[3, 1]])
     assert found[0].max() == 8.0
+
+
+def test_only_lower_station_of_a_cell_is_below_another():
+    stations = np.array([[1, 1, 0], [3, 1, 0], [1, 1, 3.2], [1, 1, 6.4]], dtype=np.float32)
+    assert below_another(stations, 2.0).tolist() == [True, False, True, False]
+    assert below_another(stations[:0], 2.0).tolist() == []
+
+
+def test_lower_storey_descriptor_excludes_tower_on_the_roof():
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-12, 12, 0.4), np.arange(-12, 12, 0.4)))
+    floors = [np.column_stack([x, y, np.full(len(x), z)]) for z in (0.0, 3.0)]
+    tower = np.column_stack([np.full(60, 7.0), np.full(60, 0.2), np.linspace(3.0, 20.0, 60)])
+    points = np.concatenate([*floors, tower]).astype(np.float32)
+    stations = np.array([[1, 1, 0], [1, 1, 3]], dtype=np.float32)
+    config = DescriptorConfig(radius=10.0, channels=("scan_context",))
+    described = describe_storeys(points, stations, 2.0, config)["scan_context"].astype(float)
+    assert described[0].max() < 6.0  # up to the ceiling that counts as one
+    assert described[1].max() > 15.0  # the upper storey stands beside the tower
+
+
+@pytest.fixture(scope="module")
+def both():
+    cloud, stations = site(400_000, 1_000)
+    chosen = np.arange(0, 1_000, 50)
+    _, described = ours(cloud, stations)
+    _, _, exact = baseline(cloud, stations, chosen)
+    return {name: (described[name][chosen].astype(np.float32), exact[name]) for name in exact}
+
+
+@pytest.mark.parametrize(("channel", "share", "distance"), [("scan_context", 0.05, 0.06), ("coview", 0.07, 0.1)])
+def test_raster_descriptor_bins_are_close_to_exact_bins(both, channel, share, distance):
+    found, exact = both[channel]
+    assert (np.abs(found - exact) > 0.5).mean() < share
+    found, exact = found.reshape(len(found), -1), exact.reshape(len(exact), -1)
+    cosine = (found * exact).sum(axis=1) / np.linalg.norm(found, axis=1) / np.linalg.norm(exact, axis=1)
+    assert (1 - cosine).mean() < distance
+
+
+def test_every_station_matches_itself_best(both):
+    """The map's descriptors pick their own station out of the exact ones, and the other way round."""
+    found, exact = (a.reshape(len(a), -1) for a in both["scan_context"])
+    score = found @ exact.T / np.linalg.norm(found, axis=1)[:, None] / np.linalg.norm(exact, axis=1)
+    np.testing.assert_array_equal(score.argmax(axis=0), np.arange(len(found)))
+    np.testing.assert_array_equal(score.argmax(axis=1), np.arange(len(found)))
+
+
+BLOCK = 2.0
+
+
+def stations_of(side=6, z=0.0):
+    axis = (np.arange(side) - 2 + 0.5) * BLOCK
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), np.full(side * side, z)]).astype(np.float32)
+
+
+@pytest.mark.parametrize("step", [[3, 0], [0, 3], [-4, 0], [0, -5], [2, -1], [-50, 0], [0, 1000], [0, 0], [1, -6]])
+def test_stations_a_step_apart_are_found_and_none_beyond_the_edges(step):
+    stations = stations_of()
+    goal = stations + np.array([*np.array(step) * BLOCK, 0.0])
+    found = StationGrid(stations, BLOCK).at(goal)
+    for m in range(len(stations)):
+        there = np.flatnonzero(np.abs(stations[:, :2] - goal[m, :2]).max(axis=1) < 0.1)
+        assert found[m] == (there[0] if len(there) else -1)
+
+
+def test_a_cell_reaches_to_its_edges_and_belongs_to_one_station():
+    grid = StationGrid(stations_of()[::5], BLOCK)
+    places = np.random.default_rng(0).uniform(-9, 14, (500, 3))
+    for position, found in zip(places, grid.at(places), strict=True):
+        near = np.flatnonzero((np.abs(grid.stations[:, :2] - position[:2]) < 0.5 * BLOCK).all(axis=1))
+        assert found == (near[0] if len(near) else -1)
+
+
+def test_storeys_are_distinguished_by_height():
+    stations = np.concatenate([stations_of(4), stations_of(4, z=4.0)[:8]])
+    grid = StationGrid(stations, BLOCK)
+    np.testing.assert_array_equal(grid.at(stations), np.arange(24))
+    up = grid.at(stations + np.array([0.0, 0.0, 4.0]))
+    np.testing.assert_array_equal(up[:8], np.arange(16, 24))
+    assert (up[8:] == -1).all()  # no upper storey there, and above it nothing
+    down = grid.at(stations - np.array([0.0, 0.0, 4.0]))
+    np.testing.assert_array_equal(down[16:], np.arange(8))
+    assert (down[:16] == -1).all()
+
+
+def test_a_map_without_storeys_has_its_stations_at_any_height():
+    stations = stations_of()
+    np.testing.assert_array_equal(StationGrid(stations, BLOCK).at(stations + np.array([0.0, 0.0, 7.0])), np.arange(36))

@@ -79,7 +79,7 @@ def fetch_map(
         connect: zenoh endpoints of an address without one (``tcp/127.0.0.1:7448``).
 
     Raises:
-        ConfigError: a malformed address or circle. TransportError: the source cannot be reached, and nothing is in the cache.
+        ConfigError: a malformed address or circle. TransportError: no source, and nothing in the cache.
         MapError: the site is damaged or not signed with the key, or no tile is in the circle.
         InputError: the key cannot be read. DependencyError: a library is missing.
     """

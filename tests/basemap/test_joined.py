@@ -1,4 +1,4 @@
-"""Maps joined: the robot is found on the right one, in its frame, and on none where two are alike."""
+"""Several maps as one: placed side by side, searched together, and loaded under their names."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from small_world import pose_error
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import check_arrays
-from coview_stream.basemap.joined import join_maps, joined_file
-from coview_stream.basemap.joined import join_maps as joining
+from coview_stream.basemap.joined import join_maps, joined_file, load_map, read_names, write_names
 from coview_stream.basemap.map_parts import MapPart, MapParts
+from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
 from coview_stream.basemap.summary import MapView
 from coview_stream.clouds.files import write_cloud
 from coview_stream.errors import InputError, MapError
@@ -100,21 +100,20 @@ def test_maps_that_do_not_go_together_are_named(world_map):
         join_maps({})
 
 
-def test_file_of_joined_maps_is_made_once(world_file, tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path))
+def test_file_of_joined_maps_is_made_once(world_file, monkeypatch):
     path = joined_file([("a", world_file), ("b", world_file)])
-    monkeypatch.setattr(joining, "join_maps", None)
+    monkeypatch.setattr("coview_stream.basemap.joined.join_maps", None)
     assert joined_file([("a", world_file), ("b", world_file)]) == path
 
 
 def test_parts_are_read_strictly():
     part = MapPart("a", "0" * 64, None, (1.0, 2.0, 3.0), -5.0, 5.0)
-    told = MapParts([part]).to_json()
-    assert list(MapParts.of({"parts": told})) == [part]
+    rows = MapParts([part]).to_json()
+    assert list(MapParts.of({"parts": rows})) == [part]
     assert MapParts.of({}) is None
     for broken in (
-        [], [*told, *told], [{}], "x", [{**told[0], "shift": [0.0, 0.0]}], [{**told[0], "shift": [float("nan"), 0, 0]}],
-        [{**told[0], "name": ""}], [{**told[0], "crs": 3}],
+        [], [*rows, *rows], [{}], "x", [{**rows[0], "shift": [0.0, 0.0]}], [{**rows[0], "shift": [float("nan"), 0, 0]}],
+        [{**rows[0], "name": ""}], [{**rows[0], "crs": 3}],
     ):  # fmt: skip
         with pytest.raises(MapError, match="parts cannot be read"):
             MapParts.of({"parts": broken})
@@ -122,3 +121,39 @@ def test_parts_are_read_strictly():
         MapParts([part]).named("b")
     with pytest.raises(InputError, match="no map is named"):
         MapParts([part]).named(None)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_names_are_loaded_as_one_map(world_file):
+    names = write_names([("ground", world_file), ("upper", world_file)])
+    assert read_names(names) == [("ground", world_file), ("upper", world_file)]
+    base_map = load_map(names)
+    parts = MapParts.of(base_map.parameters)
+    assert [part.name for part in parts] == ["ground", "upper"]
+    assert BaseMap.load(base_map.path, check=False).sha256 == base_map.sha256
+    assert load_map(names).path == base_map.path
+
+
+def test_with_a_key_all_maps_must_be_signed(world_file, tmp_path):
+    keys = make_keys(tmp_path / "mine")
+    signed = tmp_path / "signed.coview"
+    BaseMap.load(world_file).save(signed, SigningKey(keys[0]))
+    key = read_verify_key(keys[1])
+    load_map(write_names([("a", signed), ("b", signed)]), key)
+    with pytest.raises(MapError, match="not signed"):
+        load_map(write_names([("a", signed), ("b", world_file)]), key)
+
+
+def test_two_maps_of_one_name_and_other_files_are_refused(world_file, tmp_path):
+    with pytest.raises(MapError, match="two maps are called a"):
+        write_names([("a", world_file), ("a", world_file)])
+    other = tmp_path / "other.joined"
+    for content in ("", "[]", '{"format": "x"}', '{"format": "coview-joined", "maps": [1]}'):
+        other.write_text(content)
+        with pytest.raises(MapError, match="names no maps"):
+            load_map(other)

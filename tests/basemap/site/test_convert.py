@@ -1,4 +1,4 @@
-"""Light copies of sites: fewer points where they were, the same cells occupied, no features."""
+"""Conversion of sites: light copies."""
 
 from __future__ import annotations
 
