@@ -40,6 +40,7 @@ FOLDERS = (
 
 INNER = {
     "basemap": (
+        "progress",
         "signature",
         "file_format",
         "tiles",

@@ -41,9 +41,7 @@ def require_cloth() -> None:
         )
 
 
-def cloth_ground(
-    points: Points, *, resolution: float, rigidness: int, slope_smooth: bool, iterations: int, threshold: float
-) -> Bools:
+def cloth_ground(points: Points, config: GroundConfig) -> Bools:
     """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud.
 
     Raises:
@@ -64,7 +62,7 @@ def cloth_ground(
                 continue
             inside = own
             if len(index) >= _MIN_POINTS:
-                inside = _one_cloth(points[index], resolution, rigidness, slope_smooth, iterations, threshold)
+                inside = _one_cloth(points[index], config)
             ground[index[inside & own]] = True
     return ground
 
@@ -73,17 +71,15 @@ def _between(values: Floats32, start: float, length: float) -> Bools:
     return np.asarray((values > start - _MARGIN) & (values < start + length + _MARGIN))
 
 
-def _one_cloth(
-    points: Points, resolution: float, rigidness: int, slope_smooth: bool, iterations: int, threshold: float
-) -> Bools:
+def _one_cloth(points: Points, config: GroundConfig) -> Bools:
     csf = importlib.import_module("CSF")
     _one_thread()
     cloth = csf.CSF()
-    cloth.params.bSloopSmooth = slope_smooth
-    cloth.params.cloth_resolution = resolution
-    cloth.params.rigidness = rigidness
-    cloth.params.interations = iterations  # the wheel's spelling
-    cloth.params.class_threshold = threshold
+    cloth.params.bSloopSmooth = config.slope_smooth
+    cloth.params.cloth_resolution = config.cloth_resolution
+    cloth.params.rigidness = config.rigidness
+    cloth.params.interations = config.iterations  # the wheel's spelling
+    cloth.params.class_threshold = config.cloth_threshold
     ground, rest = csf.VecInt(), csf.VecInt()
     with _silence():
         cloth.setPointCloud(points.astype(np.float64))
@@ -330,14 +326,7 @@ def _filtered(
     if len(lowest) < _MIN_CELLS:
         return np.ones(len(lowest), dtype=bool)
     if method == "cloth":
-        ground = cloth_ground(
-            lowest,
-            resolution=config.cloth_resolution,
-            rigidness=config.rigidness,
-            slope_smooth=config.slope_smooth,
-            iterations=config.iterations,
-            threshold=config.cloth_threshold,
-        )
+        ground = cloth_ground(lowest, config)
     else:
         raster = np.full(z.shape, np.nan, dtype=np.float32)
         raster.flat[occupied] = lowest[:, 2]

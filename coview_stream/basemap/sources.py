@@ -108,6 +108,12 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     return sources
 
 
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Return the file names of paths; of files with the same name the whole paths."""
+    names = [path.name for path in paths]
+    return [path.name if names.count(path.name) == 1 else str(path) for path in paths]
+
+
 def _rows(values: Any, name: str) -> Reals:
     array = np.asarray(values) if hasattr(values, "__array__") else None  # tables of pandas and tensors have it, too
     if array is None or array.ndim != 2 or array.shape[1] < 3:

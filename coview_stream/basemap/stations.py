@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap.ground import ground_mask
+from coview_stream.basemap.progress import Progress
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
 from coview_stream.errors import ConfigError
@@ -178,9 +178,6 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
 
 Described = dict[Channel, npt.NDArray[np.float16]]
 """(M, R, S) of each channel."""
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
 
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 _PORTION = 512  # stations at a time: 7 MB of bins

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,9 +28,10 @@ def run(args: argparse.Namespace) -> int:
     """Convert, and print the sizes."""
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.progress import progress_bar
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.basemap.site.convert import join, lighten, split
-    from coview_stream.errors import ConfigError
+    from coview_stream.errors import ConfigError, naming_missing_libraries
 
     key = None if args.sign is None else SigningKey(args.sign)
     output, directory = Path(args.output), args.output.endswith("/")
@@ -46,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError(
                 f"{output}: a light copy is a directory, {output.stem}/; only a file is called NAME.coview"
             )
-        with _bar() as step:
+        with naming_missing_libraries("coview-stream convert", "node"), progress_bar("converting", unit="step") as step:
             site = lighten(args.map, output, key, step)
         _tell(output, site)
     elif args.map.is_dir():
@@ -55,28 +53,13 @@ def run(args: argparse.Namespace) -> int:
                 f"{args.output}: {args.map} is a directory already; name a file, NAME.coview, or add --light"
             )
         file_format.check_target(output)
-        with _bar() as step:
+        with naming_missing_libraries("coview-stream convert", "node"), progress_bar("converting", unit="step") as step:
             sha256 = join(args.map, output, key, step)
         print(f"{output}: {output.stat().st_size} bytes, sha256 {sha256[:12]}")
     else:
         base_map = BaseMap.load(args.map)
         _tell(output, split(base_map.arrays, base_map.parameters, output, key))
     return 0
-
-
-@contextmanager
-def _bar() -> Iterator[Callable[[int, int], None]]:
-    from coview_stream.errors import naming_missing_libraries
-
-    with naming_missing_libraries("coview-stream convert", "node"):
-        from tqdm import tqdm
-    with tqdm(desc="converting", unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield step
 
 
 def _tell(output: Path, site: Manifest) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, layers_arrays
 from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, map_arrays
+from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.layers import decode, read_cloud_layer, read_stations_layer
 from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEntry
@@ -28,8 +29,6 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 log = logging.getLogger("coview_stream.maps")
-
-Progress = Callable[[int, int], None]
 
 VERSION = 3
 """Version of the arrays that are made of the same layers."""

@@ -7,7 +7,6 @@ likelihood field and of the voxels that descriptors count, for which the same ce
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.file_format import Arrays, check_target, save
+from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.assemble import PARAMETER, Progress, assemble, layer_of
+from coview_stream.basemap.site.assemble import PARAMETER, assemble, layer_of
 from coview_stream.basemap.site.layers import STEPS, cloud_layer, read_cloud_layer
 from coview_stream.basemap.site.manifest import TILE, VERSION, Manifest, SiteGrid, TileEntry, in_order, is_site
 from coview_stream.basemap.site.site_build import check_directory
@@ -89,9 +89,7 @@ def join(directory: Path, path: Path, key: SigningKey | None = None, progress: P
         return save(path, arrays, parameters, key)
 
 
-def lighten(
-    source: Path, target: Path, key: SigningKey | None = None, progress: Callable[[int, int], None] | None = None
-) -> Manifest:
+def lighten(source: Path, target: Path, key: SigningKey | None = None, progress: Progress | None = None) -> Manifest:
     """Write a light copy of a site, and return its manifest.
 
     Args:

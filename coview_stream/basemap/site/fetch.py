@@ -9,11 +9,11 @@ import logging
 import os
 import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
+from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.manifest import (
     FILE,
@@ -175,9 +175,6 @@ def _short(error: BaseException) -> str:
 log = logging.getLogger("coview_stream.maps")
 
 _TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
-
-Progress = Callable[[int, int], None]
-"""Called with bytes fetched, and bytes to fetch."""
 
 
 class Mirror:

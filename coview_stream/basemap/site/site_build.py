@@ -6,22 +6,21 @@ The result is the same, byte for byte, with any number of workers and in any ord
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from coview_stream.basemap.ground import ground_filter
+from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.executors import Executor, SerialExecutor
 from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
-from coview_stream.basemap.sources import Given, Source, sources_of
+from coview_stream.basemap.sources import Given, Source, short_names, sources_of
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.cloud_head import CloudHead, check_together
 from coview_stream.config import MapConfig
@@ -145,9 +144,7 @@ def _named(sources: list[Source]) -> dict[str, Source]:
     """Return the sources by their names in the manifest, sorted: the order of the arguments changes nothing."""
     if any(source.rows is not None for source in sources):
         raise InputError("a site is built of files; save the arrays as .npy first, or build one .coview file")
-    paths = [source.path for source in sources]
-    short = [path.name for path in paths]
-    names = [path.name if short.count(path.name) == 1 else str(path) for path in paths]
+    names = short_names([source.path for source in sources])
     return dict(sorted(zip(names, sources, strict=True)))
 
 
@@ -212,9 +209,9 @@ class _Run:
         """Return the results in the order of the items, without those that failed if that is allowed."""
         results: dict[int, Result] = {}
         failed: dict[int, Exception] = {}
-        with _bar(self.progress, title, len(items)) as advance:
-            for number, result in self.executor.run(function, items):
-                advance()
+        with progress_bar(title, self.progress and bool(items)) as step:
+            for done, (number, result) in enumerate(self.executor.run(function, items), start=1):
+                step(done, len(items))
                 if not isinstance(result, Exception):
                     results[number] = result
                     continue
@@ -236,11 +233,3 @@ def _naming(name: str, error: Exception) -> Exception:
     reason = error.strerror if isinstance(error, OSError) else str(error)
     kind = type(error) if isinstance(error, CoViewError) else MapError
     return kind(f"{name}: {reason}")
-
-
-@contextmanager
-def _bar(show: bool, title: str, total: int) -> Iterator[Callable[[], None]]:
-    from tqdm import tqdm
-
-    with tqdm(total=total, desc=title, unit="", disable=not show or not total, leave=False) as bar:
-        yield partial(bar.update, 1)

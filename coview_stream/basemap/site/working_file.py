@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from coview_stream.basemap.file_format import Loaded, open_file, save
 from coview_stream.basemap.map_arrays import EarlierMap
+from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, VERSION, assemble, field_layers
@@ -106,7 +105,10 @@ def working_file(
             channels = config_of_map(manifest.parameters["config"]).descriptor.channels
             return _open_earlier(earlier_file(directory), states, channels)
 
-        with _bar(f"{directory}: made ready for this machine", progress) as step, ArrayFiles(folder) as into:
+        with (
+            progress_bar(f"{directory}: made ready for this machine", progress, "step") as step,
+            ArrayFiles(folder) as into,
+        ):
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
             save(path, arrays | field_layers(arrays, into), parameters)
         remember_written(path)
@@ -153,17 +155,3 @@ def _record_name(directory: Path) -> str:
 def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
     part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
     return cache_folder() / f"{manifest.sha256[:40]}{part}.{VERSION}.coview"
-
-
-@contextmanager
-def _bar(title: str, show: bool | None) -> Iterator[Callable[[int, int], None]]:
-    from tqdm import tqdm
-
-    shown = sys.stderr.isatty() if show is None else show
-    with tqdm(desc=title, unit="step", disable=not shown, leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield step

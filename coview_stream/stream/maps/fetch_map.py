@@ -7,18 +7,26 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from coview_stream.basemap.joined import JOINED_SUFFIX
+from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey, read_verify_key
-from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, Progress, SiteSource, WebSource
+from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, SiteSource, WebSource
 from coview_stream.basemap.site.manifest import PART_SUFFIX, Around
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError
 from coview_stream.stream.maps.zenoh_source import ZenohSource
+
+log = logging.getLogger("coview_stream.maps")
+
+MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"
+"""Default endpoint of ``serve-map``, and of ``zenoh://SITE``."""
+
+_NICE = 10
+_LOOK = 0.1  # seconds
 
 
 def source_of(
@@ -54,10 +62,6 @@ def source_of(
     if ":" not in parts.netloc:
         raise ConfigError(f"{address}: write zenoh://HOST:PORT/SITE, or zenoh://SITE with --connect")
     return ZenohSource(site, base, [f"tcp/{parts.netloc}"], (), config)
-
-
-MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"
-"""Default endpoint of ``serve-map``, and of ``zenoh://SITE``."""
 
 
 def fetch_map(
@@ -115,32 +119,12 @@ def open_mirror(
     endpoints = list(connect) or ([] if config is not None else [MAP_SERVER_ENDPOINT])
     mirror = Mirror(source_of(address, base, endpoints, (), config), verify_key, around)
     try:
-        with _bar(address) as progress:
+        with progress_bar(address, unit="B", scale=True) as progress:
             mirror.open(progress)
     except BaseException:
         mirror.source.close()
         raise
     return mirror
-
-
-@contextmanager
-def _bar(name: str) -> Iterator[Progress]:
-    from tqdm import tqdm
-
-    with tqdm(desc=name, unit="B", unit_scale=True, disable=not sys.stderr.isatty(), leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield step
-
-
-log = logging.getLogger("coview_stream.maps")
-
-_NAMES = (PART_SUFFIX, JOINED_SUFFIX)
-_NICE = 10
-_LOOK = 0.1  # seconds
 
 
 def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
@@ -152,7 +136,7 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
         place: path of the map.
         cancelled: polled; True ends the process.
     """
-    if not (place.is_dir() or place.suffix in _NAMES):
+    if not (place.is_dir() or place.suffix in (PART_SUFFIX, JOINED_SUFFIX)):
         return
     with subprocess.Popen(
         python_command(__name__, str(place)), env=python_environment(),
