@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import replace
 from typing import NoReturn
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import Channel, LocalizerConfig
-from coview_stream.descriptors.coview import Descriptor
+from coview_stream.config import LocalizerConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.evidence.observation import RangeImage
 from coview_stream.localization.frame import Frame, FramePreparation
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer, OdometryCheck
 from coview_stream.localization.search.place_guess import PlaceGuess, has_ground
-from coview_stream.localization.search.pose_hints import PoseHints, robot_position
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.localization.search.request import Epoch, SearchRequest
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search_requests import NoSearch, SearchRequests
 from coview_stream.localization.state import Event, State, next_state
 from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
@@ -42,6 +39,7 @@ class Localizer:
         base_map: the map; may be shared by many localizers.
         config: how decisions are made.
         state: the newest fix's state.
+        search: names its recognizers (``search.names``) and has the newest descriptors (``search.last_query``).
     """
 
     def __init__(
@@ -76,48 +74,39 @@ class Localizer:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
-        self._search = GlobalSearch(base_map, self.config, self._local_maps, index)
-        self._epoch = Epoch()
+        self.search = GlobalSearch(base_map, self.config, self._local_maps, index)
+        self._restarts = itertools.count(1)  # of the search, numbered through
         self.reset()
 
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
         self._frames = FramePreparation(self.config)
-        self._begin(epoch)
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
+        self.relocalize(epoch)
 
-    def restart(self, epoch: int = 0) -> None:
-        """Search from nothing for the same robot, in another odometry frame, which ``epoch`` numbers.
+    def relocalize(self, epoch: int | None = None) -> None:
+        """Forget the place and search the whole map again: the next fixes have no pose until a place is accepted.
 
-        What is known of its sensor, its odometry and the site's ground stays.
+        The calibration of sensor and odometry and the site's ground offset stay.
+
+        Args:
+            epoch: number of the odometry frame that follows; None if it is the same one.
         """
+        odometry = self._requests.epoch.odometry if epoch is None else epoch
         ground = self._tracker.ground.metres
         self._frames.restart()
-        self._begin(epoch)
+        self.search.reset()
+        self._requests: SearchRequests = SearchRequests(
+            self.base_map, self.config, self.search.spec, self._frames, odometry, self._restarts
+        )
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
         self._tracker.ground.restore(ground)
-
-    def relocalize(self) -> None:
-        """Forget the place and search the whole map again, in the same odometry frame.
-
-        What is known of sensor, odometry and ground stays, as in :meth:`restart`; the next fixes have no pose until a
-        place is found.
-        """
-        self.restart(self._epoch.odometry)
-
-    def _begin(self, epoch: int) -> None:
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
-        self._epoch = Epoch(epoch, self._epoch.restart + 1)
-        spec = self._search.spec
-        radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
-        self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
-        self._search.reset()
-        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
-        self._hints = PoseHints()
-        self._odometry_check = OdometryCheck()
         self._newest: Frame | None = None
         self._evidence: KeyframeEvidence | None = None
-        self._confidence = 0.0  # of the search that found the place
+        self._confidence = 0.0  # of the search's acceptance
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -133,19 +122,9 @@ class Localizer:
         )
 
     @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the recognizers that propose places: "coview", "learned" or both."""
-        return self._search.names
-
-    @property
     def calibration(self) -> Calibration:
-        """What is corrected now of the sensor's tilt and of odometry, and of the site's ground."""
+        """The present calibration of sensor and odometry, and the site's ground offset."""
         return replace(self._frames.calibration, ground=self._tracker.ground.metres)
-
-    @property
-    def last_query(self) -> dict[Channel, Descriptor]:
-        """Descriptors (R, S) of the newest keyframe that searched, by channel; empty before the first."""
-        return self._search.last_query
 
     def prepare(self) -> None:
         """Compile and load now what the first search would: some seconds on a large map, once.
@@ -154,7 +133,7 @@ class Localizer:
             InputError, DependencyError: the network of the learned features cannot be loaded.
         """
         kernels.warm_up(*GlobalSearch.KERNELS)
-        self._search.prepare()
+        self.search.prepare()
 
     # ---- one frame
 
@@ -174,15 +153,14 @@ class Localizer:
             CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
                 finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
         """
-        frame, keyframe = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
-        match = None
+        frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
         if self.state.has_place:
             match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
-        elif (request := self._search_request(frame, keyframe)) is not None:
-            match = self._begin_tracking(self._search.update(request))  # eqs 1-13, over the whole map
-        if match is not None:
-            ruling = self._verify(match)  # what its verdict and those before mean for the place
-            self._update(match, ruling)  # the graph of poses and the state
+            if match is not None:
+                ruling = self._monitor.verify(match.verdict, stamp, self._tracker.odometry.travelled)
+                self._update(match, ruling)  # the graph of poses and the state
+        elif request is not None:
+            self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
         return self.fix()
 
     def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
@@ -202,22 +180,43 @@ class Localizer:
         Raises:
             CloudError, RunError: as for :meth:`step`.
         """
-        frame, keyframe = self._predict(cloud, T_odom_body, stamp)
-        if not self.state.has_place:
-            return self._search_request(frame, keyframe)
-        match = self._match_to_map(frame, defer)
+        frame, request = self._predict(cloud, T_odom_body, stamp)
+        match = self._match_to_map(frame, defer) if self.state.has_place else None
         if match is not None:
-            self._update(match, self._verify(match))
-        return None
+            self._update(match, self._monitor.verify(match.verdict, stamp, self._tracker.odometry.travelled))
+        return request
 
     def apply_search_result(self, result: SearchResult) -> None:
         """Start tracking where a search has accepted a place, or keep its reason for not doing so.
 
         A result from before a loss or a :meth:`reset` is ignored, and so is one that comes while a place is known.
         """
-        match = self._begin_tracking(result)
-        if match is not None:
-            self._update(match, self._verify(match))
+        newest = self._newest
+        if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
+            return
+        self._evidence = result.evidence
+        if result.accepted is None:
+            if result.T_map_cloud is not None and result.evidence.evidence is not None:  # it has been registered
+                probability = result.evidence.confidence or 0.0
+                leader = self._frames.learn_place(result.T_map_cloud, result.T_odom_body, probability)
+                if self._frames.anchor is not None:
+                    self._requests.hints.place_leads(leader, self._frames.anchor)
+            proposed = result.evidence.state is State.AMBIGUOUS
+            self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
+            return
+        self._handle(Event.PLACE_ACCEPTED)
+        self._confidence = result.evidence.confidence or 0.0
+        assert result.T_map_cloud is not None  # the accepted place leads
+        T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
+        registration = replace(result.accepted.registration, T_map_source=T_map_odom)
+        self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
+        self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
+        self._requests.place_accepted()
+        self._frames.forget_keyframe()
+        # the robot may have driven on or been carried since the keyframe
+        match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
+        ruling = self._monitor.verify(match.verdict, newest.stamp, self._tracker.odometry.travelled)
+        self._update(replace(match, confirms_search=True), ruling)
 
     def fix(self) -> Fix:
         """Return what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
@@ -238,7 +237,7 @@ class Localizer:
             self._tracker.reported_covariance(),
             min(self._confidence, 1.0 - self._wrong),
             evidence,
-            self._tracker.drift,
+            self._tracker.odometry.drift,
             self._tracker.protection_level(),
             calibration,
         )
@@ -264,14 +263,14 @@ class Localizer:
         """
         local = validate_pose(T_map_body, self.base_map.origin)
         if not self.state.has_place:
-            self._hints.robot_at(local)
+            self._requests.hints.robot_at(local)
 
     def guess_place(self, guess: PlaceGuess, check: bool = True) -> None:
         """Have the search try, from the next frame on, where somebody says that the robot is.
 
         Never trusted: what is tried there is judged like what the descriptors name; but with ``guess.within`` nothing
         outside of that circle, and of what is driven meanwhile, is searched, until a place is accepted, another guess
-        comes or the search begins anew (:meth:`restart`, :meth:`relocalize`). Ignored while a place is known.
+        comes or the search begins anew (:meth:`relocalize`). Ignored while a place is known.
 
         Args:
             guess: of the place.
@@ -295,9 +294,7 @@ class Localizer:
                 "give coordinates of the frame of the map's sources (coview-stream info)"
             )
         if not self.state.has_place:
-            if guess.within is not None or self._hints.circle is not None:
-                self._next_epoch()  # what is being searched is not what is asked for now
-            self._hints.guess(guess)
+            self._requests.guess(guess)
 
     def hint_calibration(self, known: Calibration) -> None:
         """Begin with what was known of this robot before, less well; it goes on being measured.
@@ -318,74 +315,27 @@ class Localizer:
 
     # ---- the steps
 
-    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Frame, Keyframe | None]:
-        """Check a frame, and move the predicted pose on by its odometry; return it with the keyframe it completes.
+    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Frame, SearchRequest | None]:
+        """Check a frame and move the predicted pose on by its odometry; return it and what to search for, if anything.
 
-        Keyframes are for searching: none while a place is known, and a loss starts from nothing.
+        Nothing is searched for while a place is known.
         """
         searching = not self.state.has_place
-        frame = self._frames.prepare(cloud, T_odom_body, stamp, self._tracker.drift.variances if searching else None)
-        keyframe = None
-        if searching:
-            keyframe = self._buffer.add(frame.scan, stamp, self._frames.calibration.R_body_cloud)
-            if keyframe is not None and keyframe.begins_anew:
-                self._next_epoch()
-                self._hints.search_begins_anew()
+        drift = self._tracker.odometry.drift.variances if searching else None
+        frame = self._newest = self._frames.prepare(cloud, T_odom_body, stamp, drift)
         self._tracker.add_scan(frame.scan)
-        self._newest = frame
-        return frame, keyframe
-
-    def _search_request(self, frame: Frame, keyframe: Keyframe | None) -> SearchRequest | None:
-        """Return what has to be searched for: the keyframe that a frame completes, if any."""
-        assert self._frames.anchor is not None  # there is a frame
-        hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
-        guesses = self._hints.guessed(self.base_map.origin, self._frames.anchor, frame.T_odom_body)
-        area = self._hints.area(self._frames.anchor, frame.T_odom_body)
-        if area is not None:
-            hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
-        if self._odometry_check.contradicts(frame.scan.levelled(self._buffer.R_body_cloud), frame.scan.position):
-            self._restart_search(frame.stamp)
-            return None
-        if keyframe is None:
-            return None
-        if area is not None and not area.holds(self.base_map.stations).any():
-            reason = "nothing is searched: the map has no ground in the circle that the robot is said to be in"
-            self._evidence = KeyframeEvidence(frame.stamp, self.state, reason)
-            return None
-        spec, travelled = self._search.spec, self._tracker.travelled
-        rays = RangeImage.rays(self._frames.calibration.level(frame.cloud))
-        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints, guesses, area)
-        # what the search would begin with: a tenth of the points remains, and requests travel through pipes
-        return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
-
-    def _begin_tracking(self, result: SearchResult) -> MapMatch | None:
-        """Begin at the place that a search has accepted, if any, with a registration of the newest frame there."""
-        newest = self._newest
-        if result.epoch != self._epoch or self.state.has_place or newest is None:
-            return None
-        self._evidence = result.evidence
-        if result.accepted is None:
-            if result.T_map_cloud is not None and result.evidence.evidence is not None:  # it has been registered
-                probability = result.evidence.confidence or 0.0
-                leader = self._frames.learn_place(result.T_map_cloud, result.T_odom_body, probability)
-                if self._frames.anchor is not None:
-                    self._hints.place_leads(leader, self._frames.anchor)
-            proposed = result.evidence.state is State.AMBIGUOUS
-            self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
-            return None
-        self._handle(Event.PLACE_ACCEPTED)
-        self._confidence = result.evidence.confidence or 0.0
-        assert result.T_map_cloud is not None  # the accepted place leads
-        T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
-        registration = replace(result.accepted.registration, T_map_source=T_map_odom)
-        self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
-        self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
-        self._hints.clear()
-        self._buffer.clear()
-        self._frames.forget_keyframe()
-        # the robot may have driven on or been carried since the keyframe
-        match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
-        return replace(match, confirms_search=True)
+        if not searching:
+            return frame, None
+        request = self._requests.add(frame, self._tracker.odometry.travelled)
+        if not isinstance(request, NoSearch):
+            return frame, request
+        if request.cause is RejectionReason.ODOMETRY:
+            self._frames.estimator.forget_leader()
+            self._frames.forget_keyframe()
+            self._tracker.forget_scans()
+            self._handle(Event.SCANS_CONTRADICT)
+        self._evidence = KeyframeEvidence(stamp, self.state, request.reason, cause=request.cause)
+        return frame, None
 
     def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
@@ -398,14 +348,13 @@ class Localizer:
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
-    def _verify(self, match: MapMatch) -> Ruling:
-        """Return what a registration's verdict means for the place, after those before it.
+    def _update(self, match: MapMatch, ruling: Ruling) -> None:
+        """Correct the pose by a registration that is believed, and move on to the state that follows.
 
-        Its evidence is the next fix's, where it adds any.
+        Its evidence is the next fix's, unless it only confirms the search's.
         """
-        assert self._newest is not None  # it is of the newest frame
-        stamp, verdict = self._newest.stamp, match.verdict
-        ruling = self._monitor.verify(verdict, stamp, self._tracker.travelled)
+        assert self._newest is not None  # the match is of the newest frame
+        verdict, stamp = match.verdict, self._newest.stamp
         self._wrong = ruling.wrong
         self._registered_at = stamp
         after = self.state if ruling.event is None else next_state(self.state, ruling.event)
@@ -414,11 +363,6 @@ class Localizer:
                 stamp, after, ruling.reason, verdict.score, 0.0, verdict.evidence,
                 cause=verdict.cause, innovation=verdict.innovation, confidence=1.0 - ruling.wrong,
             )  # fmt: skip
-        return ruling
-
-    def _update(self, match: MapMatch, ruling: Ruling) -> None:
-        """Correct the pose by a registration that is believed, and move on to the state that follows."""
-        assert self._newest is not None  # as in _verify
         self._tracker.update(match, self._newest.T_odom_body, ruling.believed)
         if ruling.event is not None:
             self._handle(ruling.event)
@@ -432,34 +376,8 @@ class Localizer:
             return
         self._events.append(event)
         if self.state is State.LOST:
-            self._forget_place()
-
-    def _forget_place(self) -> None:
-        """Search again from nothing: what lost the place may be an odometry that jumped or began anew.
-
-        It may also be the sensor or the map, so where odometry says that the robot is now is worth a try.
-        """
-        if self._frames.anchor is not None:
-            self._hints.odometry_continues(self._tracker.T_map_odom, self._frames.anchor)
-        self._frames.forget_odometry()
-        self._tracker.ground.restore(self._tracker.ground.metres)
-        self._buffer.clear()
-        self._odometry_check.clear()
-        self._tracker.forget_odometry()
-        self._next_epoch()
-
-    def _restart_search(self, stamp: float) -> None:
-        """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
-        self._buffer.clear()
-        self._hints.forget_leader()
-        self._frames.estimator.forget_leader()
-        self._frames.forget_keyframe()
-        self._tracker.forget_scans()
-        self._next_epoch()
-        self._handle(Event.SCANS_CONTRADICT)
-        reason = "searching anew: frames do not fit together where odometry puts them"
-        self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=RejectionReason.ODOMETRY)
-
-    def _next_epoch(self) -> None:
-        """Begin another epoch: requests on their way belong to what has been forgotten."""
-        self._epoch = self._epoch._replace(restart=self._epoch.restart + 1)
+            # odometry may have jumped; or the sensor or the map is to blame, and where odometry leads is worth a try
+            self._requests.place_lost(self._tracker.T_map_odom)
+            self._frames.forget_odometry()
+            self._tracker.ground.restore(self._tracker.ground.metres)
+            self._tracker.forget_odometry()

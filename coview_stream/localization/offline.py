@@ -171,7 +171,7 @@ def locate(
     if guess is not None:
         localizer.guess_place(guess)
     localizer.prepare()
-    located = RunResult(len(run), sources=localizer.sources, mount=run.mount)
+    located = RunResult(len(run), sources=localizer.search.names, mount=run.mount)
     driven, before = 0.0, None
     for index in range(len(run)):
         try:
@@ -259,7 +259,7 @@ def _note(located: RunResult, localizer: Localizer, fix: Fix) -> None:
         located.keyframes.append(fix.evidence)
     if fix.T_map_body is not None and located.winner is None:
         located.winner = fix.evidence
-        located.query = localizer.last_query
+        located.query = localizer.search.last_query
     located.fixes.append(fix)
 
 

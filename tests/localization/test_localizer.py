@@ -166,10 +166,10 @@ def test_input_arrays_are_not_modified(world_map, world_drive):
 def test_reset_clears_all_but_the_map(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     follow(localizer, world_drive, 2)
-    assert localizer.last_query
+    assert localizer.search.last_query
     localizer.reset()
     assert localizer.state is State.SEARCHING
-    assert not localizer.last_query
+    assert not localizer.search.last_query
     # another odometry frame after the reset must not matter: the old one is forgotten
     T_other = pose_from(rot_z(-0.4), [1e5, -2e5, 3.0])
     again = follow(localizer, world_drive.seen_from(T_other), 6)
@@ -184,7 +184,7 @@ def results(world_map, world_drive):
     """Results of the drive's searches, up to the one that accepts a place; good for every fresh localizer."""
     localizer, results = Localizer(world_map), []
     for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
-        results.append(localizer._search.update(localizer.add_frame(cloud, T, 0.5 * k)))
+        results.append(localizer.search.update(localizer.add_frame(cloud, T, 0.5 * k)))
         if results[-1].accepted is not None:
             return results
         localizer.apply_search_result(results[-1])

@@ -104,11 +104,11 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
         assert (fix.T_map_body is not None) == (fix.state is State.TRACKING)
         states.append(fix.state)
 
-    usual = localizer._search.config
-    localizer._search.config = replace(usual, acceptance=NEVER)
+    usual = localizer.search.config
+    localizer.search.config = replace(usual, acceptance=NEVER)
     for k in range(2):
         step(k)
-    localizer._search.config = usual
+    localizer.search.config = usual
     for k in range(2, 5):
         step(k)
     localizer.require_verification()

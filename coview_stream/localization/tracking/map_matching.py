@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc, chdtri
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig, RegistrationConfig
@@ -20,7 +21,7 @@ from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
-from coview_stream.localization.tracking.slip import matters, off_by
+from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
 # set by hand
 _RINGS = ((0.9, 6), (1.7, 10), (2.5, 14), (3.3, 18))  # metres, poses; each is moved to the best within 0.4 m
@@ -144,6 +145,7 @@ class MapMatcher:
         base_map: knows where it has been surveyed.
         config: of registration and acceptance.
         place: what a scan says of the place, against chance.
+        dispute: which place is right while odometry is contradicted.
         baseline: usual shares, by which people are told what is missing.
     """
 
@@ -151,6 +153,7 @@ class MapMatcher:
         self.base_map = base_map
         self.config = config
         self.place = PlaceEvidence(base_map)
+        self.dispute = Dispute(self.place, config.tracking.distance)
         self.baseline = EvidenceBaseline()
 
     def clear(self) -> None:
@@ -231,6 +234,52 @@ class MapMatcher:
                 tries.append(self.match(scan, start, target, scales, predicted, 0))
                 break
         return [self._against(each, tries) for each in tries]
+
+    def against_odometry(
+        self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], led: Pose, belief: Estimate, travelled: float
+    ) -> MapMatch:
+        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
+
+        Where the two places are so near that either is good enough, the lidar's is believed, without a pose until the
+        next frame agrees. Where odometry is known to drift so far, it contradicts nothing: the other place is the one
+        that registration from there converges to. Where the headings alone differ, odometry is wrong: moved objects do
+        not turn about the robot. Where the heights differ by more than odometry drifts, it is not: no wheel slips
+        upwards.
+
+        Args:
+            match: the best of ``tries``.
+            scan: what was registered.
+            tries: all matches of the scan.
+            led: (4, 4) where odometry leads, or a match that did not contradict it.
+            belief: pose and covariance that odometry leads to.
+            travelled: metres driven.
+        """
+        rule = self.config.acceptance
+        plausible = match.innovation <= rule.max_innovation
+        metres, degrees = off_by(match.T_map_body, led)
+        if plausible and not matters(metres, degrees):
+            return match
+        gap, spread = match.T_map_body[:3, 3] - led[:3, 3], belief.covariance[3:, 3:] + match.covariance[3:, 3:]
+        rare = chdtrc(6, rule.max_innovation)  # probability beyond which nothing is plausible
+        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
+        if here and not matters(0.0, degrees):
+            return replace(match, moves_place=True)
+        level = gap[2] ** 2 <= chdtri(1, rare) * spread[2, 2]
+        moves = here or (level and not matters(metres, degrees))  # here, but turned; or so near that it does not matter
+        if not moves:
+            places = [other.T_map_body for other in tries if other.scan is not None]
+            places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]
+            right = self.dispute.settle(scan, led, places, travelled, rule.risk)
+            if right is not None:
+                verified = [other for other in tries if other.verdict.verified]
+                match = min(verified, key=lambda other: off_by(right, other.T_map_body)[0], default=match)
+                moves = not matters(*off_by(right, match.T_map_body))
+                metres, degrees = off_by(match.T_map_body, led)
+        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
+        if not moves:
+            reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
+        verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
+        return replace(match, verdict=verdict, moves_place=moves)
 
     def _against(self, match: MapMatch, others: list[MapMatch]) -> MapMatch:
         """Hold a match against those of the same scan that ended elsewhere."""

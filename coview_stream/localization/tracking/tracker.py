@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
@@ -27,10 +25,10 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
-from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
+from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
-from coview_stream.localization.tracking.slip import DisplacementCheck, Dispute, matters, off_by
+from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register; set by hand
 _STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand
@@ -46,6 +44,7 @@ class Tracker:
     Attributes:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
         ground: by how much the robot's ground lies above the survey's, metres.
+        odometry: metres driven, and drift.
     """
 
     def __init__(
@@ -58,9 +57,8 @@ class Tracker:
         self.ground = GroundOffset()
         self._graph = PoseGraph(config.graph)  # of clouds in the sensor's own axes: independent of the calibration
         self._calibration = calibration
-        self._odometry = OdometryTracker(config.tracking, calibration)
+        self.odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
-        self._dispute = Dispute(self._matcher.place, config.tracking.distance)
         self._displacement = DisplacementCheck()
         self._scans = ScanBuffer(config.tracking, calibration)
         self._unregistered = 0  # frames since the newest registration
@@ -69,28 +67,18 @@ class Tracker:
         self._disputed = False  # whether what fits has been off from where odometry leads, and may be wrong
         self._doubt = 1.0  # by how much the newest evidence that was believed has fallen below what is usual
 
-    @property
-    def travelled(self) -> float:
-        """Metres that odometry has driven."""
-        return self._odometry.travelled
-
-    @property
-    def drift(self) -> Drift:
-        """How fast odometry seems to drift."""
-        return self._odometry.drift
-
     # ---- scans
 
     def add_scan(self, scan: RawScan) -> None:
         """Add a frame: its points, one per voxel, and its odometry."""
-        self._odometry.add_pose(scan.T_odom_body)
-        self._scans.add(scan, self.travelled)
+        self.odometry.add_pose(scan.T_odom_body)
+        self._scans.add(scan, self.odometry.travelled)
         self._unregistered += 1
 
     def forget_odometry(self) -> None:
         """Drop the scans and the newest odometry: what lost the place may be an odometry that jumped."""
         self.forget_scans()
-        self._odometry.forget_pose()
+        self.odometry.forget_pose()
 
     def forget_scans(self) -> None:
         """Drop the points that the next registration would use beside the next frame's."""
@@ -105,13 +93,13 @@ class Tracker:
 
     def needs_registration(self, patience: float = 1.0) -> bool:
         """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
-        driven, turned = self._odometry.since_keyframe()
+        driven, turned = self.odometry.since_keyframe()
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
             return True
         if driven < patience * settings.min_distance:
             return False
-        variances = self.drift.variances(driven, turned)
+        variances = self.odometry.drift.variances(driven, turned)
         yaw, position = patience * settings.max_yaw_sigma, patience * settings.max_position_sigma
         return bool(variances[2] > yaw**2 or variances[3] > position**2)
 
@@ -137,14 +125,16 @@ class Tracker:
         """
         self._matcher.clear()
         self.ground.clear()
-        self._odometry.forget_registration()
+        self.odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
         found = T_odom_body if T_odom_found is None else T_odom_found
         step = registration.T_map_source[:3, :3] @ (T_odom_body[:3, 3] - found[:3, 3])
-        drifted = self.drift.covariance(self.travelled - travelled, abs(yaw_of(inverse(found) @ T_odom_body)))
+        drifted = self.odometry.drift.covariance(
+            self.odometry.travelled - travelled, abs(yaw_of(inverse(found) @ T_odom_body))
+        )
         drifted += self._calibration.motion_covariance(step)
         covariance = propagate(own + _START, step) + drifted
         self._restart(registration.T_map_source @ T_odom_body, covariance, T_odom_body)
@@ -184,7 +174,8 @@ class Tracker:
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
             match = max(tries, key=_rank)
         if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
-            return self._against_odometry(match, belief, scan, tries)
+            led = tries[0] if match.innovation <= limit and not self._disputed else belief
+            return self._matcher.against_odometry(match, scan, tries, led.T_map_body, belief, self.odometry.travelled)
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
@@ -194,10 +185,10 @@ class Tracker:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as it has done before; go on where the lidar says
-            self._odometry.learn_once_confirmed(self._of_cloud(match.T_map_body), match.covariance)
+            self.odometry.learn_once_confirmed(self._of_cloud(match.T_map_body), match.covariance)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
-            self._dispute.clear()
+            self._matcher.dispute.clear()
             self._graph.correct(self._of_cloud(match.T_map_body), match.covariance)
             self._set_belief(T_odom_body)
             self._learn(match, T_odom_body[:3, 3])
@@ -207,13 +198,13 @@ class Tracker:
 
     def predicted_covariance(self) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
-        last = self._odometry.pose
+        last = self.odometry.pose
         if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
         belief = self._belief()
         here = self.T_map_odom @ last
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
-        return np.asarray(carried + self.drift.covariance(*self._odometry.since_keyframe()))
+        return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
 
     def reported_covariance(self) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
@@ -225,64 +216,25 @@ class Tracker:
 
     # ---- inside
 
-    def _against_odometry(
-        self, match: MapMatch, belief: Estimate, scan: ObservedScan, tries: list[MapMatch]
-    ) -> MapMatch:
-        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
-
-        Where the two places are so near that either is good enough, what the lidar sees is believed, without a pose
-        until the next frame agrees. Where odometry is known to drift so far, it contradicts nothing: the other place is
-        what registration from there comes to. Where the headings alone differ, it is odometry's that is wrong: what has
-        been moved does not turn about the robot. Where the heights differ by more than odometry drifts, it is not: no
-        wheel slips upwards.
-        """
-        plausible = match.innovation <= self.config.acceptance.max_innovation
-        led = tries[0].T_map_body if plausible and not self._disputed else belief.T_map_body
-        metres, degrees = off_by(match.T_map_body, led)
-        if plausible and not matters(metres, degrees):
-            return match
-        gap, spread = match.T_map_body[:3, 3] - led[:3, 3], belief.covariance[3:, 3:] + match.covariance[3:, 3:]
-        rare = chdtrc(6, self.config.acceptance.max_innovation)  # probability of what is not plausible any more
-        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
-        if here and not matters(0.0, degrees):
-            return replace(match, moves_place=True)
-        level = gap[2] ** 2 <= chdtri(1, rare) * spread[2, 2]
-        moves = here or (level and not matters(metres, degrees))  # here, but turned; or so near that it does not matter
-        if not moves:
-            places = [each.T_map_body for each in tries if each.scan is not None]
-            places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
-            risk = self.config.acceptance.risk
-            right = self._dispute.settle(scan, led, places, self.travelled, risk)
-            if right is not None:
-                found = [each for each in tries if each.verdict.verified]
-                match = min(found, key=lambda each: off_by(right, each.T_map_body)[0], default=match)
-                moves = not matters(*off_by(right, match.T_map_body))
-                metres, degrees = off_by(match.T_map_body, led)
-        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
-        if not moves:
-            reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
-        verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
-        return replace(match, verdict=verdict, moves_place=moves)
-
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
-        self._dispute.clear()
+        self._matcher.dispute.clear()
         self._graph.start(self._of_cloud(T_map_body), covariance)
-        self._odometry.set_keyframe(T_odom_body)
+        self.odometry.set_keyframe(T_odom_body)
         self._set_belief(T_odom_body)
 
     def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
         """Add a keyframe where odometry leads, and return what is believed of it."""
-        driven, turned = self._odometry.since_keyframe()
-        spread = self.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
-        motion = self._odometry.motion(T_odom_body)
+        driven, turned = self.odometry.since_keyframe()
+        spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
+        motion = self.odometry.motion(T_odom_body)
         spread += self._calibration.motion_covariance(self._belief().T_map_body[:3, :3] @ motion[:3, 3])
         level = self._calibration.calibration.T_body_cloud
         self._graph.move(inverse(level) @ motion @ level, spread)
-        self._odometry.set_keyframe(T_odom_body)
+        self.odometry.set_keyframe(T_odom_body)
         return self._belief()
 
     def _belief(self) -> Estimate:
@@ -306,13 +258,13 @@ class Tracker:
             raise ValueError("nothing can be learned from a match without a registration")
         self._doubt = self._matcher.baseline.fallen(evidence)
         self._matcher.baseline.learn(evidence)
-        if self.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
-            self._learned_at = self.travelled
+        if self.odometry.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
+            self._learned_at = self.odometry.travelled
             self._matcher.place.learn(seen)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        self._odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
+        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
 
 
 def _rank(match: MapMatch) -> tuple[bool, float]:

@@ -131,7 +131,7 @@ class TrackEngine:
         if first != job.first_epoch:
             localizer.reset(job.epoch)
         elif epoch != job.epoch:
-            localizer.restart(job.epoch)
+            localizer.relocalize(job.epoch)
         self._robots[job.robot] = job.first_epoch, job.epoch, localizer
         return localizer
 

@@ -28,7 +28,7 @@ def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, worl
     localizer, waiting, errors = Localizer(world_map), [], []
     for k, cloud in enumerate(leaning):
         if len(waiting) == 2:
-            localizer.apply_search_result(localizer._search.update(waiting.pop(0)))
+            localizer.apply_search_result(localizer.search.update(waiting.pop(0)))
         request = localizer.add_frame(cloud, world_drive.T_odom_body[k], 0.5 * k)
         if request is not None:
             waiting.append(request)
@@ -47,7 +47,7 @@ def test_calibration_outlives_the_odometry_frame_but_no_reset(world_map, world_d
     for k, cloud in enumerate(leaning):
         fix = localizer.step(cloud, world_drive.T_odom_body[k], 0.5 * k)
     assert fix.state is State.TRACKING
-    localizer.restart(1)
+    localizer.relocalize(1)
     T_other = pose_from(exp_so3(np.array([0.0, 0.0, 1.0])), [40.0, -3.0, 1.0])
     localizer.add_frame(leaning[0], T_other @ world_drive.T_odom_body[0], 60.0)
     begun = localizer.fix()

@@ -100,13 +100,13 @@ def test_mixture_has_the_sigma_of_each_axis():
 def test_leaders_that_alternate_do_not_begin_the_search_anew_at_every_frame(world_map, world_drive):
     """A robot that stands still sees nothing new: what it has seen is levelled once, and evidence adds up."""
     localizer = Localizer(world_map)
-    localizer._search.update = lambda request: SearchResult(None, KeyframeEvidence(request.stamp, State.SEARCHING, ""))
+    localizer.search.update = lambda request: SearchResult(None, KeyframeEvidence(request.stamp, State.SEARCHING, ""))
     straight, leaning = np.eye(4), np.eye(4)
     leaning[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
     epochs = set()
     for k in range(20):
         localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.1 * k)
-        epochs.add(localizer._epoch)
+        epochs.add(localizer._requests.epoch)
         T = leaning if k % 2 else straight
         localizer._frames.estimator.suppose_attitude(T, np.eye(4), 1e-5, 0.9)
     assert len(epochs) <= 2

@@ -22,13 +22,13 @@ def first_fix(fixes):
 
 def voteless(localizer, monkeypatch):
     """The keyframes vote, but nothing comes of it."""
-    monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
+    monkeypatch.setattr(localizer.search.coview.consensus, "hypotheses", list)
     return localizer
 
 
 def misled(localizer, drive, monkeypatch):
     """The votes name some places, but never the right one, nor any near it."""
-    consensus = localizer._search.coview.consensus
+    consensus = localizer.search.coview.consensus
     found = consensus.hypotheses
 
     def wrong():

@@ -34,7 +34,7 @@ def test_a_search_brings_the_right_place_along(world_map, world_drive):
     for k, (cloud, T) in enumerate(zip(world_drive.clouds[:3], world_drive.T_odom_body[:3], strict=True)):
         request = localizer.add_frame(cloud, T, 0.5 * k)
         if request is not None:
-            results.append((k, localizer._search.update(request)))
+            results.append((k, localizer.search.update(request)))
     number, result = results[0]
     distance = np.linalg.norm(result.considered.places[:, :2] - world_drive.T_map_body[number][:2, 3], axis=1)
     assert distance.min() < 1.0

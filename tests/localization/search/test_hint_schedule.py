@@ -27,9 +27,9 @@ def test_hint_is_kept_until_accepted_or_reset(world_map, world_drive):
     assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).hints == ()
     localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     assert follow(localizer, world_drive, 4, 1)[-1].state is State.TRACKING
-    assert localizer._hints.about(np.zeros(3), np.eye(4)) == ()
+    assert localizer._requests.hints.about(np.zeros(3), np.eye(4)) == ()
     localizer.hint_pose(world_drive.T_map_body[0])  # now it knows better
-    assert localizer._hints.about(np.zeros(3), np.eye(4)) == ()
+    assert localizer._requests.hints.about(np.zeros(3), np.eye(4)) == ()
 
 
 def lost(world_map, world_drive):
@@ -115,13 +115,13 @@ def test_new_hint_is_tried_at_once():
 def counted(localizer, monkeypatch):
     """Hinted places that were scored, keyframe by keyframe."""
     made = []
-    whole = localizer._search._register
+    whole = localizer.search._register
 
     def register(scored, *others):
         made.append(sum(place.hinted for place in scored.places))
         return whole(scored, *others)
 
-    monkeypatch.setattr(localizer._search, "_register", register)
+    monkeypatch.setattr(localizer.search, "_register", register)
     return made
 
 
@@ -155,7 +155,7 @@ def test_followed_hint_is_one_place(world_map, world_drive, monkeypatch):
 def test_hint_waits_for_places_that_votes_name(world_map, world_drive, monkeypatch):
     """Whatever fits at the hint may fit elsewhere as well: without a rival there is nothing to compare it with."""
     localizer = Localizer(world_map)
-    consensus = localizer._search.coview.consensus
+    consensus = localizer.search.coview.consensus
     found = consensus.hypotheses
     monkeypatch.setattr(consensus, "hypotheses", lambda: found()[1:] if len(consensus) > 2 else [])
     localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)

@@ -72,7 +72,7 @@ def test_right_guess_finds_a_place_that_no_vote_has_named(world_map, world_drive
     T, place = true.T_map_body, (true.T_map_body[:3, 3] - world_map.origin)[:2]
 
     def without_the_right_one(localizer):
-        search, asked = localizer._search, []
+        search, asked = localizer.search, []
         vote, propose = search._vote, search._propose
 
         def far_away():

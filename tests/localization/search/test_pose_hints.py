@@ -142,7 +142,7 @@ def test_hint_of_lookalike_place_is_never_accepted(lookalike_map, world_drive):
 def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_drive, monkeypatch):
     """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
     localizer = Localizer(lookalike_map)
-    consensus = localizer._search.coview.consensus
+    consensus = localizer.search.coview.consensus
     found = consensus.hypotheses
     monkeypatch.setattr(consensus, "hypotheses", lambda: found() if len(consensus) > 3 else [])
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])

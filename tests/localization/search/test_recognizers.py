@@ -98,13 +98,13 @@ def test_learned_recognizer_alone_localizes(learned_map, world_drive, knowing):
     assert first.evidence.reason.endswith(BY_FEATURES)
     assert first.evidence.station is not None
     assert first.evidence.shift is None  # which would be one of the co-view descriptors
-    assert localizer.last_query == {}
+    assert localizer.search.last_query == {}
 
 
 @pytest.mark.slow
 def test_learned_recognizer_finds_what_coview_misses(learned_map, world_drive, knowing, monkeypatch):
     localizer = Localizer(learned_map)
-    monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
+    monkeypatch.setattr(localizer.search.coview.consensus, "hypotheses", list)
     assert right(follow(localizer, world_drive), world_drive)
 
 
@@ -133,7 +133,7 @@ def test_too_few_points_cast_no_vote(learned_map, world_drive):
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
     fix = localizer.step(world_drive.clouds[0][:40], world_drive.T_odom_body[0], 0.0)
     assert fix.evidence.reason == "too few points to search with"
-    assert len(localizer._search.learned) == 0
+    assert len(localizer.search.learned) == 0
 
 
 def test_search_request_holds_only_needed_clouds(world_map, learned_map, world_drive):

@@ -9,10 +9,9 @@ import pytest
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.tracking.map_matching import MapMatch
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate
-from coview_stream.localization.tracking.tracker import Tracker
 
 
 def judged(shift, degrees, sigma, innovation, disputed=False):
@@ -23,12 +22,12 @@ def judged(shift, degrees, sigma, innovation, disputed=False):
     fits = MatchVerdict(RejectionReason.VERIFIED, "")
     there = MapMatch(fits, pose_from(rot_z(np.radians(degrees)), shift), 1e-4 * np.eye(6), innovation)
     near = MapMatch(fits, np.eye(4), 1e-4 * np.eye(6), 1.0)
-    tracker = SimpleNamespace(
-        config=LocalizerConfig(), _disputed=disputed, travelled=10.0,
-        _dispute=SimpleNamespace(settle=lambda *_: asked.append(1)),
+    matcher = SimpleNamespace(
+        config=LocalizerConfig(), dispute=SimpleNamespace(settle=lambda *_: asked.append(1))
     )  # fmt: skip
     scan = SimpleNamespace(T_odom_body=np.eye(4))
-    found = Tracker._against_odometry(tracker, there, belief, scan, [near, there])
+    led = near if innovation <= LocalizerConfig().acceptance.max_innovation and not disputed else belief
+    found = MapMatcher.against_odometry(matcher, there, scan, [near, there], led.T_map_body, belief, 10.0)
     return found.moves_place, len(asked)
 
 

@@ -124,7 +124,7 @@ def test_what_is_learned_at_one_registration_is_presumed_at_the_next(world_map, 
     first, second = ride.update(cloud, truth), ride.update(cloud, truth)
     assert second.ratio > first.ratio + 0.5
     T = ride.odometry(truth)
-    ride.tracker.start(registration(truth @ inverse(T)), T, ride.tracker.travelled)
+    ride.tracker.start(registration(truth @ inverse(T)), T, ride.tracker.odometry.travelled)
     assert ride.update(cloud, truth).ratio == pytest.approx(first.ratio, abs=1.0)
 
 
@@ -236,7 +236,7 @@ def test_restart_carries_nothing_over(world_map, slow_drive, world_drive):
     ride = on_the_way(world_map, slow_drive)
     usual = ride.tracker.predicted_covariance()
     T = ride.odometry(world_drive.T_map_body[8])
-    ride.tracker.start(registration(world_drive.T_map_body[8] @ OFF @ inverse(T)), T, ride.tracker.travelled)
+    ride.tracker.start(registration(world_drive.T_map_body[8] @ OFF @ inverse(T)), T, ride.tracker.odometry.travelled)
     assert (np.diag(ride.tracker.predicted_covariance()) > 10 * np.diag(usual)).all()
     verdict = ride.update(world_drive.clouds[8], world_drive.T_map_body[8])
     assert verdict.verified

@@ -157,7 +157,7 @@ def test_covariance_grows_with_metres_and_radians(started):
     tracker, covariance = started
     before = np.diag(covariance())
     turned = np.diag(covariance(pose_from(rot_z(0.5), np.zeros(3))))
-    drift = tracker.drift
+    drift = tracker.odometry.drift
     np.testing.assert_allclose(turned - before, drift.variances(0.0, 0.5), rtol=1e-3, atol=1e-6)
     assert turned[2] > before[2]
     driven = np.diag(covariance(pose_from(rot_z(0.5), [5.0, 0.0, 0.0])))
@@ -169,7 +169,7 @@ def test_heading_uncertainty_becomes_lateral_uncertainty(started):
     tracker, covariance = started
     before = covariance()
     there = covariance(pose_from(np.eye(3), [8.0, 0.0, 0.0]))
-    gathered = tracker.drift.variances(8.0, 0.0)[4]
+    gathered = tracker.odometry.drift.variances(8.0, 0.0)[4]
     assert there[4, 4] - before[4, 4] == pytest.approx(64.0 * before[2, 2] + gathered, rel=1e-3)
     assert there[2, 4] == pytest.approx(8.0 * before[2, 2], rel=1e-3)
 
@@ -182,7 +182,7 @@ def test_late_fix_has_larger_covariance(world_map):
             tracker.add_scan(RawScan(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0])))
         tracker.start(registration(np.eye(4)), pose_from(np.eye(3), [3.0, 0.0, 0.0]), found_at)
         sigmas.append(np.diag(tracker.predicted_covariance()))
-    expected = tracker.drift.variances(3.0, 0.0)
+    expected = tracker.odometry.drift.variances(3.0, 0.0)
     np.testing.assert_allclose(sigmas[1] - sigmas[0], expected, rtol=0.01)
 
 

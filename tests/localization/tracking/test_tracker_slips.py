@@ -33,7 +33,7 @@ SIDEWAYS = pose_from(np.eye(3), [0.0, 0.6, 0.0])
 def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     ride, k = on_the_way(world_map, slow_drive), 8
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
-    drift = ride.tracker.drift
+    drift = ride.tracker.odometry.drift
     metres, degrees = pose_error(slip, np.eye(4))
     ride.slips(slip, truth[k - 1])
     verdict = ride.update(clouds[k], truth[k])
@@ -47,9 +47,9 @@ def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     assert verdict.score > 0.8
     assert ride.error(truth[k])[0] < 0.03
     # it was hardly drift: far outside what drift allows, it counts as a step at the edge of that
-    assert ride.tracker.drift.position < 2.5 * drift.position
+    assert ride.tracker.odometry.drift.position < 2.5 * drift.position
     assert ride.update(clouds[k + 1], truth[k + 1]).cause is RejectionReason.VERIFIED
-    assert ride.tracker.drift.position < 2.5 * drift.position  # nor does the step across it tell of any
+    assert ride.tracker.odometry.drift.position < 2.5 * drift.position  # nor does the step across it tell of any
     metres, degrees = ride.error(truth[k + 1])
     assert metres < 0.03
     assert degrees < 0.2

@@ -1,0 +1,116 @@
+"""Search requests: keyframes, hints and the check of odometry, while no place is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.evidence.observation import RangeImage
+from coview_stream.localization.frame import Frame, FramePreparation
+from coview_stream.localization.registration.prepare_scan import thinned
+from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
+from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.pose_hints import PoseHints, robot_position
+from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
+from coview_stream.localization.tracking.monitor import RejectionReason
+
+
+class NoSearch(NamedTuple):
+    """Reason why a frame begins no search; ``cause`` is ODOMETRY if the frames contradict odometry."""
+
+    reason: str
+    cause: RejectionReason | None = None
+
+
+class SearchRequests:
+    """Maker of one robot's search requests.
+
+    Attributes:
+        epoch: of the next request; results of another epoch are out of date.
+        hints: poses that the search is to try.
+    """
+
+    def __init__(
+        self,
+        base_map: BaseMap,
+        config: LocalizerConfig,
+        spec: RequestSpec,
+        frames: FramePreparation,
+        odometry: int,
+        restarts: Iterator[int],
+    ) -> None:
+        """Begin without a keyframe, in odometry frame number ``odometry``; ``restarts`` numbers the epochs."""
+        self.epoch = Epoch(odometry, next(restarts))
+        self._restarts = restarts
+        self.hints = PoseHints()
+        self._base_map = base_map
+        self._config = config
+        self._spec = spec
+        self._frames = frames
+        radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
+        self._buffer = KeyframeBuffer(config.keyframe, max(radius, spec.reach or 0.0))
+        self._odometry_check = OdometryCheck()
+
+    def add(self, frame: Frame, travelled: float) -> SearchRequest | NoSearch | None:
+        """Add a frame; return the request of the keyframe that it completes, or why there is none.
+
+        Args:
+            frame: prepared.
+            travelled: metres that odometry has driven.
+        """
+        anchor, calibration = self._frames.anchor, self._frames.calibration
+        assert anchor is not None  # a frame has been prepared
+        keyframe = self._buffer.add(frame.scan, frame.stamp, calibration.R_body_cloud)
+        if keyframe is not None and keyframe.begins_anew:
+            self.next_epoch()
+            self.hints.search_begins_anew()
+        hints = self.hints.about(anchor, frame.T_odom_body)
+        guesses = self.hints.guessed(self._base_map.origin, anchor, frame.T_odom_body)
+        area = self.hints.area(anchor, frame.T_odom_body)
+        if area is not None:
+            hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
+        if self._odometry_check.contradicts(frame.scan.levelled(calibration.R_body_cloud), frame.scan.position):
+            self._begin_anew()
+            reason = "searching anew: frames do not fit together where odometry puts them"
+            return NoSearch(reason, RejectionReason.ODOMETRY)
+        if keyframe is None:
+            return None
+        if area is not None and not area.holds(self._base_map.stations).any():
+            return NoSearch("nothing is searched: the map has no ground in the circle that the robot is said to be in")
+        rays = RangeImage.rays(calibration.level(frame.cloud))
+        request = SearchRequest.of(
+            self._buffer, keyframe, rays, self._spec, travelled, self.epoch, hints, guesses, area
+        )  # fmt: skip
+        # thinned as the search would: a tenth of the points remains, and requests travel through pipes
+        return replace(request, submap=thinned(request.submap, request.position, self._config.registration))
+
+    def guess(self, guess: PlaceGuess) -> None:
+        """Have a guess of the place tried; one with a circle, or in place of one, begins an epoch."""
+        if guess.within is not None or self.hints.circle is not None:
+            self.next_epoch()
+        self.hints.guess(guess)
+
+    def place_accepted(self) -> None:
+        """Forget keyframes and hints."""
+        self.hints.clear()
+        self._buffer.clear()
+
+    def place_lost(self, T_map_odom: Pose) -> None:
+        """Begin anew, for odometry may have jumped; that it goes on from ``T_map_odom`` (4, 4) is a hint."""
+        if self._frames.anchor is not None:
+            self.hints.odometry_continues(T_map_odom, self._frames.anchor)
+        self._odometry_check.clear()
+        self._begin_anew()
+
+    def next_epoch(self) -> None:
+        """Begin another epoch: requests under way are out of date."""
+        self.epoch = self.epoch._replace(restart=next(self._restarts))
+
+    def _begin_anew(self) -> None:
+        self._buffer.clear()
+        self.hints.forget_leader()
+        self.next_epoch()
