@@ -97,7 +97,7 @@ def test_prefetch_map_crops_before_registration(world_map, world_drive, monkeypa
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
     ride = ride_of(world_map, world_drive)
     ride.tracker.prefetch_map(ride.odometry(truth))
-    monkeypatch.setattr(type(world_map), "cut", None)
+    monkeypatch.setattr("coview_stream.localization.registration.local_map.cut_points", None)
     assert ride.update(cloud, truth).verified
 
 
