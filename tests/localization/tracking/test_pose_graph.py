@@ -149,7 +149,7 @@ def test_invalid_input_is_refused_and_changes_nothing(graph):
     before = graph.estimate
     broken = START.copy()
     broken[0, 0] = np.nan
-    for call in (graph.start, graph.move, graph.correct, graph.innovation):
+    for call in (graph.start, graph.move, graph.correct, before.innovation):
         with pytest.raises(InputError, match="rigid"):
             call(broken, REGISTRATION)
         with pytest.raises(InputError, match="positive definite"):
