@@ -1,4 +1,4 @@
-"""Every format round trip, and the variants that other programs write."""
+"""Files of every format, in the variants that other programs write; folders and patterns of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filters against what they must keep, drop and compute."""
+"""Filters: outliers, voxels, normals; and machines without Open3D or its system libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference systems that files state: units, heights, scales, and which are the same."""
+"""Reference systems: units, heights, scales, equality; and places on Earth, against pyproj and geometry."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from bag_files import LATE, cloud, odometry, write_bag
 
 from coview_stream.cli import main
 from coview_stream.clouds import write_tum
+from coview_stream.config.mount import parse_mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.recordings.bag_reader import BagReader
@@ -306,3 +307,26 @@ def test_topic_without_a_name_in_a_database_is_refused(tmp_path):
         connection.commit()
     with pytest.raises(RunError, match=r"b\.db3"):
         open_run(single)
+
+
+def test_sweeps_of_a_recording_are_turned_before_they_are_deskewed(tmp_path):
+    mount = parse_mount("180,10,90,0.3,-0.2,0.5")
+    points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
+    times = np.linspace(-0.1, 0.0, 200).astype(np.float32)
+    turned = transform(inverse(mount.T_body_sensor), points.astype(np.float64)).astype(np.float32)
+    poses = [pose_from(np.eye(3), [k, 0.0, 0.0]) for k in range(4)]
+
+    def bag(name, cloud_points):
+        return write_bag(
+            tmp_path / name,
+            {
+                "/points": [cloud(START + k * 100_000_000, cloud_points, times) for k in (1, 2)],
+                "/odom": [odometry(START + k * 100_000_000, poses[k]) for k in range(4)],
+            },
+        )
+
+    body = open_run(bag("body", points))
+    sensor = open_run(bag("sensor", turned), mount=mount)
+    assert np.abs(body.read(0).points - points).max() > 0.5  # there is something to deskew
+    for expected, frame in zip(body, sensor, strict=True):
+        assert np.allclose(expected.points, frame.points, atol=1e-4)

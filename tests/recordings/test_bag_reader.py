@@ -1,4 +1,4 @@
-"""What recordings unpack to is limited, whatever they claim."""
+"""Recordings unpack to a limited size, whatever they claim."""
 
 from __future__ import annotations
 
@@ -73,6 +73,6 @@ def test_readers_are_bounded_once_opened(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"nothing")
     with pytest.raises(RunError):
         BagReader(tmp_path / "a.mcap")
-    found = [storage_mcap.DECOMPRESSORS[name] for name in ("zstd", "lz4")]
-    found += [reader.decompressors[name] for name in ("bz2", "lz4")]
-    assert all(each.__module__ == bag_reader.__name__ for each in found)
+    replaced = [storage_mcap.DECOMPRESSORS[name] for name in ("zstd", "lz4")]
+    replaced += [reader.decompressors[name] for name in ("bz2", "lz4")]
+    assert all(function.__module__ == bag_reader.__name__ for function in replaced)
