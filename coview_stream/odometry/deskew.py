@@ -30,7 +30,7 @@ def deskew(
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
         R_body_cloud: (3, 3) rotation that levels a cloud whose sensor leans against the body; None for none.
-        scale: what odometry's distances have to be multiplied with, less one.
+        scale: factor that corrects odometry's distances, less one.
     """
     if len(segment.stamps) < 2 or not len(points):
         return points

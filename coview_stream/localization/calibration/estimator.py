@@ -1,9 +1,9 @@
-"""Estimation of the calibration: a Kalman filter over what is constant about a robot, or nearly so.
+"""Estimation of the calibration: a Kalman filter over a robot's constants, or nearly so.
 
 The state is x = (roll, pitch, s, w, g): the tilt of the sensor against odometry's gravity, the scale of odometry's
-distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2). It is what is
-left of the pose graph's errors when those that are independent from step to step
-(:class:`coview_stream.localization.tracking.motion.Drift`) are taken away. Each registration to the map that is
+distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2): the errors
+of the pose graph but for those that are independent from step to step
+(:class:`coview_stream.localization.tracking.motion.Drift`). Each registration to the map that is
 believed measures two things:
 
 * its attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the tilt
@@ -32,7 +32,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 
 
 class _Prior(NamedTuple):
-    """What is known of a group of components before anything is seen; all set by hand.
+    """Prior of a group of components; all set by hand.
 
     Attributes:
         axes: of the state.
@@ -63,6 +63,10 @@ _FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
 class Belief:
     """Gaussian over the state x = (roll, pitch, s, w, g), heavy-tailed where measurements contradict it.
 
+    Most sensors stand straight and most odometry has the right scale. So each group of the state is a mixture: zero but
+    for a small spread, or anything up to a large one; the mean of both is applied, weighed by their probabilities
+    (Savage and Dickey's ratio, eq. C3).
+
     Attributes:
         x: (6,) mean.
         P: (6, 6) covariance.
@@ -82,7 +86,7 @@ class Belief:
         return other
 
     def restore(self, known: Calibration) -> None:
-        """Begin with what was known of this robot before."""
+        """Begin with an earlier calibration."""
         self.x = np.array([known.roll, known.pitch, known.scale, known.turn, 0.0, 0.0])
         self.P = np.diag(_WIDE**2)
         sigmas = [known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]
@@ -90,7 +94,7 @@ class Belief:
         self._stand_straight()
 
     def learn(self, known: Calibration) -> None:
-        """Take over what was known of this robot before, as far as it is known better than here."""
+        """Take over an earlier calibration as far as it is better known than the present one."""
         own = self.applied()
         values = np.array([known.roll, known.pitch, known.scale, known.turn])
         sigmas = (known.sigma_tilt, known.sigma_scale, known.sigma_turn)
@@ -103,7 +107,7 @@ class Belief:
         self._stand_straight()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
+        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
         self.x[GRAVITY.axes] = 0.0
         self.P[GRAVITY.axes], self.P[:, GRAVITY.axes] = 0.0, 0.0
         self.P[GRAVITY.axes, GRAVITY.axes] = np.eye(2) * GRAVITY.wide**2
@@ -116,7 +120,7 @@ class Belief:
         self._stand_straight()
 
     def doubt_tilt(self, seen: Floats, H: Floats, R: Floats) -> None:
-        """Widen a tilt that a measurement contradicts by far: it is as probably right as what the state came from."""
+        """Widen a tilt that a measurement contradicts by far: it is as probably right as the measurements before."""
         gap, spread = seen - H @ self.x, H @ self.P @ H.T + R
         factor = heavier(float(gap @ np.linalg.solve(spread, gap)), len(gap))
         widest = _TILT.wide**2 / max(float(self.P[0, 0]), float(self.P[1, 1]), 1e-30)
@@ -152,7 +156,7 @@ class Belief:
         return Calibration(*means.tolist(), *sigmas)
 
     def _stand_straight(self) -> None:
-        """Know for sure that the sensor does not lean, if it cannot: then what leans is odometry's gravity."""
+        """Know for sure that the sensor does not lean, if it cannot: then odometry's gravity leans."""
         if not self._sensor_leans:
             self.x[:2] = 0.0
             self.P[:2], self.P[:, :2] = 0.0, 0.0
@@ -180,11 +184,11 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
 
 
 def heavier(distance: float, size: int) -> float:
-    """Return what a variance is to be multiplied with under Student's t distribution.
+    """Return the factor on a variance under Student's t distribution.
 
     Args:
-        distance: squared Mahalanobis distance of what was measured.
-        size: how many numbers that were.
+        distance: squared Mahalanobis distance of the measurement.
+        size: its number of components.
     """
     return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
@@ -198,7 +202,7 @@ class CalibrationEstimator:
     """Estimate of the calibration, and the correction of clouds and odometry by it.
 
     Attributes:
-        calibration: what is applied.
+        calibration: the applied one.
     """
 
     def __init__(self, sensor_leans: bool = True) -> None:
@@ -209,24 +213,24 @@ class CalibrationEstimator:
         self._apply()
 
     def restore(self, known: Calibration) -> None:
-        """Begin with what was known of this robot before; it goes on being measured."""
+        """Begin with an earlier calibration; it goes on being measured."""
         self._supposed = None
         self._known.restore(known)
         self._apply()
 
     def learn(self, known: Calibration) -> None:
-        """Take over what was known of this robot before, as far as it is known better than here."""
+        """Take over an earlier calibration as far as it is better known than the present one."""
         self._supposed = None
         self._known.learn(known)
         self._apply()
 
     def forget_leader(self) -> None:
-        """Forget what was supposed of a place that led a search."""
+        """Forget the supposition by a place that led a search."""
         self._supposed = None
         self._apply()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
+        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
         self._supposed = None
         self._known.begin_odometry()
         self._apply()
@@ -336,7 +340,7 @@ def _measure_attitude(belief: Belief, T_map_cloud: Pose, T_odom_body: Pose, vari
     left[2] = 0.0
     seen = log_so3(exp_so3(left) @ R_body_cloud)[:2]
     H = np.eye(2, SIZE)
-    H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # what leans with odometry's frame turns as the body does
+    H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # the lean of odometry's frame turns with the body
     R = np.eye(2) * (variance + _ATTITUDE**2)
     belief.doubt_tilt(seen, H, R)
     belief.update(seen, H, R)
