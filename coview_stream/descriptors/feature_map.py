@@ -1,7 +1,8 @@
 """Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points.
 
 It is built by the aerial network over bird's-eye views of the map, in windows that overlap by more than the network's
-reach: the result does not depend on where they lie."""
+reach: the result does not depend on where they lie.
+"""
 
 from __future__ import annotations
 
