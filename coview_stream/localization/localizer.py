@@ -29,7 +29,7 @@ from coview_stream.localization.tracking.monitor import LossMonitor, RejectionRe
 from coview_stream.localization.tracking.tracker import Tracker
 
 _BY_INDEX = ("exhaustive", "consensus")  # modes of retrieval and consensus
-_DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
+_DEFERRED = 3.0  # times as far apart are registrations that are deferred
 
 
 class Localizer:

@@ -8,8 +8,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, interpolate, inverse
 from coview_stream.odometry.buffer import Segment
 
-_STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s; set by hand
-_INSTANT = 1e-4  # seconds: times that differ by less are one; set by hand
+_STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s
+_INSTANT = 1e-4  # seconds: times that differ by less are one
 
 
 def deskew(

@@ -12,11 +12,11 @@ from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from
 
-_WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next three
+_WORTH_TELLING = math.radians(0.5)  # lean of a sensor beyond which a clause says so; the next three likewise
 _SCALE = 0.01
 _TURN = math.radians(0.05)  # per metre
 _GROUND = 0.1  # metres
-_MOVED_TILT = math.radians(1.0)  # sigmas of a calibration from before the robot was out of sight; set by hand
+_MOVED_TILT = math.radians(1.0)  # sigmas of a calibration from before the robot was out of sight
 _MOVED_SCALE = 0.02
 _MOVED_TURN = math.radians(0.02)  # per metre
 

@@ -57,10 +57,10 @@ _GROUPS = (_TILT, _SCALE, _TURN)  # that are corrected
 _WIDE = np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide) for g in (*_GROUPS, GRAVITY)])
 SIZE = len(_WIDE)
 """Components of the state."""
-_FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
+_FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
 
-class Belief:
+class CalibrationBelief:
     """Gaussian over the state x = (roll, pitch, s, w, g), heavy-tailed where measurements contradict it.
 
     Most sensors stand straight and most odometry has the right scale. So each group of the state is a mixture: zero but
@@ -79,9 +79,9 @@ class Belief:
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
-    def copy(self) -> Belief:
+    def copy(self) -> CalibrationBelief:
         """Return the same belief, to be changed on its own."""
-        other = Belief(self._sensor_leans)
+        other = CalibrationBelief(self._sensor_leans)
         other.x, other.P = self.x.copy(), self.P.copy()
         return other
 
@@ -193,9 +193,9 @@ def heavier(distance: float, size: int) -> float:
     return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
 
-_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own; set by hand
-_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch; set by hand
-_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else; set by hand
+_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own
+_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch
+_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else
 
 
 class CalibrationEstimator:
@@ -207,8 +207,8 @@ class CalibrationEstimator:
 
     def __init__(self, sensor_leans: bool = True) -> None:
         """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
-        self._known = Belief(sensor_leans)
-        self._supposed: Belief | None = None  # the same if a place that leads a search is the right one
+        self._known = CalibrationBelief(sensor_leans)
+        self._supposed: CalibrationBelief | None = None  # the same if a place that leads a search is the right one
         self._probability = 0.0  # that it is
         self._apply()
 
@@ -334,7 +334,7 @@ class CalibrationEstimator:
             self.calibration = mixed(self.calibration, self._supposed.applied(), self._probability)
 
 
-def _measure_attitude(belief: Belief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
+def _measure_attitude(belief: CalibrationBelief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
     R_body_cloud = belief.applied().R_body_cloud
     left = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
     left[2] = 0.0

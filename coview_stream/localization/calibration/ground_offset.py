@@ -42,7 +42,7 @@ _FOLLOWED = 0.25  # of a change, at each registration but the first ones: the he
 _STILL, _CHANGED = 0.6, 0.1  # probability that an offset known before is still there; metres by which it may be another
 
 
-# growth since the survey looks as if the ground had sunk: a nuisance, summed over; set by hand
+# growth since the survey looks as if the ground had sunk: a nuisance, summed over
 _HEIGHTS, _PARTS = 0.1 * np.arange(1, 7), (0.5, 1.0)  # metres of growth, share of the patches
 _GROWTHS = np.array([(0.0, 0.0), *((height, part) for height in _HEIGHTS for part in _PARTS)])
 _GROWN = 0.5  # prior probability of any growth

@@ -12,8 +12,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rotation_angle
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
-SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
+_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift
+SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
 SAME_ANGLE = float(np.radians(5.0))  # likewise
 
 

@@ -107,7 +107,7 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
     return np.asarray(pose + np.concatenate([around + np.array([0.0, 0.0, 0.0, turn]) for turn in turns]))
 
 
-_MAX_RIVALS = 2  # that are looked for where something is wrong; set by hand
+_MAX_RIVALS = 2  # that are looked for where something is wrong
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from coview_stream.localization.calibration.estimator import CalibrationEstimato
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 MAX_FRAMES = 40
-"""Frames whose points are held; set by hand."""
+"""Frames whose points are held."""
 _OWN_NOISE = 0.4
 """Share of two neighbouring registrations' variances that is in their difference; the rest they have in common.
 

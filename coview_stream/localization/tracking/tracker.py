@@ -30,12 +30,12 @@ from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
-_MIN_POINTS = 100  # to register; set by hand
-_STANDING_DRIVE = 0.2  # metres that standing still until the next registration counts as; set by hand
+_MIN_POINTS = 100  # to register
+_STANDING_DRIVE = 0.2  # metres that standing still until the next registration counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
-"""Covariance of a place that the search has accepted and that may not have converged yet; set by hand."""
+"""Covariance of a place that the search has accepted and that may not have converged yet."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
-"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried; set by hand."""
+"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried."""
 
 
 class Tracker:
