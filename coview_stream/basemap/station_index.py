@@ -145,7 +145,7 @@ class StationIndex:
 
     @cached_property
     def _sample(self) -> _Sample:
-        """Every so many stations."""
+        """Evenly spaced stations."""
         codes, rest = (tier.subset(sampled_stations(len(self))) for tier in self.tiers)
         known = self._descriptors.items()
         return _Sample(codes, rest, {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known})
@@ -159,8 +159,8 @@ class StationIndex:
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
         sample = self._sample
-        every = np.arange(len(sample.codes))
-        mean = np.zeros((len(every), self.sectors), dtype=np.float32)
+        stations = np.arange(len(sample.codes))
+        mean = np.zeros((len(stations), self.sectors), dtype=np.float32)
         columns = []
         for name, spectra in sample.spectra.items():
             distance = kernels.all_shift_distance(descriptors[name], spectra, self.sectors)
@@ -171,12 +171,12 @@ class StationIndex:
         stacked = np.concatenate(columns)
         coded = self.codes.query(stacked)
         # codes leave out components of every query; correct the mean
-        mean += sample.codes.all_shifts(coded, every)
+        mean += sample.codes.all_shifts(coded, stations)
         screen_zero = float(np.median(mean))
         if self.rest is None:
             return ScoredQuery(coded, None, screen_zero, screen_zero)
         rest = self.rest.query(stacked)
-        mean += sample.rest.all_shifts(rest, every)
+        mean += sample.rest.all_shifts(rest, stations)
         return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:

@@ -96,15 +96,15 @@ def indoor_floors(points: Points, config: LevelConfig) -> Points:
     covered = (gap >= config.headroom) & (gap <= config.cover)
     column, floor = column[:-1][covered], z[:-1][covered]
     ceiling = floor + np.round(gap[covered] / _STEP).astype(np.int64)
-    kept = _flat_and_wide(column, floor, ceiling, shape, config)
-    row, col = np.divmod(column[kept], shape[1])
+    wide = _flat_and_wide(column, floor, ceiling, shape, config)
+    row, col = np.divmod(column[wide], shape[1])
     x, y = corner[0] + (col + 0.5) * _SUBCELL, corner[1] + (row + 0.5) * _SUBCELL
-    return np.column_stack([x, y, (floor[kept] + base + 0.5) * _STEP]).astype(np.float32)
+    return np.column_stack([x, y, (floor[wide] + base + 0.5) * _STEP]).astype(np.float32)
 
 
 def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], config: LevelConfig) -> Bools:
     """Mask the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
-    kept = np.zeros(len(column), dtype=bool)
+    wide = np.zeros(len(column), dtype=bool)
     steps = max(1, round(config.flatness / _STEP))
     # candidates of one column differ by the headroom at least, so each slab holds one of a column
     slab_height = max(steps + 1, int(config.headroom / _STEP))
@@ -116,8 +116,8 @@ def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, i
             if len(index) * _SUBCELL**2 < config.area:
                 continue
             inside = _one_slab(column[index], floor[index], ceiling[index], shape, steps, config.area)
-            kept[index[inside]] = True
-    return kept
+            wide[index[inside]] = True
+    return wide
 
 
 def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], steps: int, area: float) -> Bools:

@@ -32,15 +32,15 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
         out: list[str | os.PathLike[str]] = []
         for name in given:
             several = [name] if is_web_address(name) or wanted is None else expand_cloud_paths([name])
-            for each in several:
-                if wanted is None and not is_web_address(each):
-                    out.append(each)
+            for cloud_name in several:
+                if wanted is None and not is_web_address(cloud_name):
+                    out.append(cloud_name)
                     continue
-                path, cloud = fetch_cloud(each, Path(folder), wanted)
+                path, cloud = fetch_cloud(cloud_name, Path(folder), wanted)
                 out.append(path)
                 size = f"{cloud.received / 1e6:.1f} MB"
                 if wanted:
                     received = f", {size} in {cloud.requests} requests" if cloud.requests else ""
                     size = f"{cloud.points} points in the window{received}"
-                print(f"{each}: {size}", file=sys.stderr)
+                print(f"{cloud_name}: {size}", file=sys.stderr)
         yield out
