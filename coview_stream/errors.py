@@ -24,7 +24,7 @@ from typing import Any
 
 
 class CoViewWarning(UserWarning):
-    """What goes on, and may not be what was meant; the message is one sentence. The command prints it as one line."""
+    """Input that is used but may not be meant. The message is one sentence, which the command prints as one line."""
 
 
 class CoViewError(Exception):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from coview_stream.doctor.finding import Finding
     from coview_stream.stream.transport.keys import RobotKeys
 
-HELP = "check this machine, a map, the network and what robots send, and say what to do"
+HELP = "check this machine, a map, the network and the robots' messages, with a remedy for each finding"
 
 _MAX_SECONDS = 600.0  # to listen, set by hand
 

@@ -17,19 +17,21 @@ from coview_stream.cli.options import (
     lidar_config,
 )
 
-HELP = "merge localized runs with the base map: one cloud, tagged by source, and what has changed"
+HELP = "merge localized runs with the base map: one cloud, tagged by source and change"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by FuseConfig."""
     add_map(parser)
-    parser.add_argument("pairs", nargs="+", metavar="RUN:OUT", help="a run, and what `locate` wrote for it on this map")
+    parser.add_argument(
+        "pairs", nargs="+", metavar="RUN:OUT", help="a run, and the output of `locate` for it on this map"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FUSED.laz", help="las, laz, ply, pcd, npy")
     parser.add_argument("--voxel", type=float, metavar="M", help="metres from point to point, at least (the map's)")
     parser.add_argument("--min-range", type=float, default=1.5, metavar="M", help="nearer is the robot itself (1.5)")
     parser.add_argument("--max-range", type=float, default=50.0, metavar="M", help="farther is left out (50)")
     parser.add_argument("--keep-moving", action="store_true", help="keep people and cars that drove")
-    parser.add_argument("--changes", action="store_true", help="tag what is new and what is gone")
+    parser.add_argument("--changes", action="store_true", help="tag new and gone points")
     parser.add_argument(
         "--joint", action="store_true", help="adjust the runs' poses to each other and to the map first"
     )

@@ -93,8 +93,8 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
         "--within",
         type=float,
         metavar="METRES",
-        help="around --initial, 50 or more, where the robot surely is: nothing farther than that, a quarter and what "
-        "it drives meanwhile is searched until it is found (all of the map)",
+        help="radius of a circle around --initial, 50 or more, that surely holds the robot: nothing outside is "
+        "searched until it is found; it is taken a quarter wider and grows with the drive (all of the map)",
     )
 
 
@@ -168,7 +168,7 @@ def add_reloc(parser: argparse.ArgumentParser) -> None:
         "--reloc",
         choices=("auto", "coview", "learned"),
         default="auto",
-        help="what names places to look at: co-view descriptors, learned features, or both on maps that have "
+        help="source of the places to look at: co-view descriptors, learned features, or both on maps that have "
         "features (auto)",
     )
 

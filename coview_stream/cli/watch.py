@@ -40,9 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     add_view(parser)
     parser.add_argument("--map", metavar="SITE", help="the map to show, path or address (the node is asked for one)")
-    parser.add_argument(
-        "--no-clouds", action="store_true", help="show no scans: clouds are most of what a slow link has to carry"
-    )
+    parser.add_argument("--no-clouds", action="store_true", help="show no scans: clouds are most of the traffic")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this long (at a signal)")
 
 

@@ -67,7 +67,7 @@ class RegistrationConfig:
         source_range: metres from the sensor within which the scan's points are used.
         residual_scale: width of the Cauchy weights on the last scale, metres; of trimmed ICP alone.
         inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
-        sigma_floor: metres, added to what registration claims of each position.
+        sigma_floor: metres, added to the sigma that registration claims of each position.
         sigma_floor_angle: radians, likewise of each angle.
         shared: times the clustered sigma of the error that neighbouring registrations have in common, as a scanned
             map's points lie off its surfaces
@@ -77,7 +77,7 @@ class RegistrationConfig:
         shared_tilt: radians of roll and of pitch, likewise.
         shared_yaw: radians of the heading, likewise.
         gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
-        weak_lever: metres; an angle is compared with a shift by what it moves at this distance.
+        weak_lever: metres; an angle counts like the shift that it makes at this distance.
         weak_from: metres; a direction that is known less well is one that the map hardly shows, and its sigma is
             widened (:func:`coview_stream.localization.registration.covariance.registration_covariance`).
         weak_sigma: metres, the largest sigma that this gives.

@@ -24,10 +24,10 @@ class DescriptorConfig:
         rings: bins along it.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together. ``scan_context`` is the maximum height of every bin, ``coview`` keeps
-            what both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only what is
-            horizontally visible. Seen once, no command prints it: unlike views (an airborne map) favour co-visibility,
-            like views Scan Context, and the two together are right on both. ``python -m bench ablation`` compares them
-            on simulated worlds.
+            the parts that both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only the
+            horizontally visible ones. Seen once, no command prints it: unlike views (an airborne map) favour
+            co-visibility, like views Scan Context, and the two together are right on both. ``python -m bench
+            ablation`` compares them on simulated worlds.
         voxel: metres; one point is kept in each cube of this size first.
         ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
             the sensor. ``python -m bench ablation`` compares the two.
