@@ -29,7 +29,7 @@ _LOCALIZATION = "coview_stream.localization"
 
 TRACKING = (
     ("step, the rest of it", "localizer:Localizer.step"),
-    ("check of the cloud", "localizer:validate_cloud"),
+    ("check of the cloud", "frame:validate_cloud"),
     ("match to map, the rest of it", "tracking.tracker:Tracker.match_to_map"),
     ("crop of the map", "registration.local_map:LocalMaps.around"),
     ("points to register", "tracking.tracker:prepare_scan"),
@@ -55,6 +55,16 @@ SEARCH = (
 Record = dict[str, float]  # milliseconds by stage of one step
 
 
+def looked_up(where: str) -> tuple[Any, str]:
+    """Return the module or class of a stage's function, and its name there."""
+    module, _, names = where.partition(":")
+    owner: Any = importlib.import_module(f"{_LOCALIZATION}.{module}")
+    *outer, name = names.split(".")
+    for part in outer:
+        owner = getattr(owner, part)
+    return owner, name
+
+
 class Recorder:
     """Milliseconds of the stages of each step."""
 
@@ -67,11 +77,7 @@ class Recorder:
         """Record the stages until the block ends."""
         with ExitStack() as stack:
             for label, where in stages:
-                module, _, names = where.partition(":")
-                owner: Any = importlib.import_module(f"{_LOCALIZATION}.{module}")
-                *outer, name = names.split(".")
-                for part in outer:
-                    owner = getattr(owner, part)
+                owner, name = looked_up(where)
                 timed: Any = self._recorded(label, getattr(owner, name))
                 if isinstance(vars(owner)[name], classmethod):
                     timed = staticmethod(timed)

@@ -197,7 +197,7 @@ Reloc = Literal["auto", "coview", "learned"]
 class LearnedConfig:
     """Search of a scan's learned features among the map's (:mod:`coview_stream.localization.search.learned`).
 
-    Set by hand; ``python -m bench forest`` prints what comes of it, ``bench learned_match`` what it costs.
+    Set by hand; ``python -m bench forest`` prints what comes of it, ``bench forest_scale`` what it costs.
 
     Attributes:
         reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
@@ -296,7 +296,7 @@ class GraphConfig:
         huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
             once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
             kernel that lets go altogether would, with an optimistic covariance, lock the map out for good
-            (``tests/localization/tracking/test_pose_graph.py``).
+            (``tests/localization/tracking/test_pose_graph_robust_kernel.py``).
     """
 
     window: int = 40

@@ -31,7 +31,7 @@ from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
-"""Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
+"""Points of the coarse level, of a fine one, and for the height; fine levels. docs/results.md has how
 often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
 
 _MAX_TABLE = 1 << 21  # tiles of the rectangle that holds a map, 537 km2: kernels count in int32

@@ -1,4 +1,4 @@
-"""Recordings as runs: every storage, stamps of headers, deskewing, topics, mounts, and unreadable files."""
+"""Recordings as runs: every storage, stamps of headers, deskewing, topics, and what cannot be read."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ map has there (:mod:`coview_stream.localization.evidence.observation`). The best
 keyframe observes the map from them as well, and where a place is new, the keyframes before are asked as well, so that
 places are compared on the same observations. The evidence of a place is the log-likelihood ratio of the mean of its
 observations (:mod:`coview_stream.localization.evidence.likelihood`), against the background of all others.
-``python -m bench field`` prints how often the right place comes first.
+docs/results.md has how often the right place comes first.
 """
 
 from __future__ import annotations
