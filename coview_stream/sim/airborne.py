@@ -12,8 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from coview_stream.clouds.filters import voxel_grid
-from coview_stream.errors import ConfigError, InputError
+from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Reals
+from coview_stream.sim.ranges import within
 from coview_stream.sim.sensors import MeshCaster
 
 ALTITUDE = 250.0
@@ -161,13 +162,16 @@ class Survey:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        ranges = {
-            "density": (0.5, 200.0), "swath": (1.0, 45.0), "altitude": (20.0, 5000.0), "noise": (0.0, 1.0),
-            "porosity": (0.0, 1.0), "misaligned": (0.0, 1.0), "seed": (0, 2**31 - 1),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            if not low <= (value := getattr(self, name)) <= high:
-                raise ConfigError(f"{name}: {value!r} is out of range; use {low:g} to {high:g}")
+        within(
+            self,
+            density=(0.5, 200.0),
+            swath=(1.0, 45.0),
+            altitude=(20.0, 5000.0),
+            noise=(0.0, 1.0),
+            porosity=(0.0, 1.0),
+            misaligned=(0.0, 1.0),
+            seed=(0, 2**31 - 1),
+        )
 
 
 _DEFAULT = Survey()
@@ -251,19 +255,19 @@ def _survey_lines(size: Floats, survey: Survey, rng: np.random.Generator) -> Ite
 def _met(flown: Floats, surface: Surface, density: float, survey: Survey, rng: np.random.Generator) -> Indices:
     """Return which points (N, 3), metres along, across and below the aircraft's line, give a return in its strip."""
     swath, side = np.tan(np.radians(survey.swath)), 1.0 / np.sqrt(density)
-    within = np.flatnonzero(np.abs(flown[:, 1]) <= swath * flown[:, 2])
-    depth = np.linalg.norm(flown[within, 1:], axis=1)
+    swept = np.flatnonzero(np.abs(flown[:, 1]) <= swath * flown[:, 2])
+    depth = np.linalg.norm(flown[swept, 1:], axis=1)
     # where the ray meets a plane below; points on one ray have one place there
-    place = np.column_stack([flown[within, 0], flown[within, 1] / flown[within, 2] * survey.altitude])
+    place = np.column_stack([flown[swept, 0], flown[swept, 1] / flown[swept, 2] * survey.altitude])
     opaque = max(_OPAQUE * surface.spacing, side)
     cell, count = _cells(place, opaque)
-    solid, first = ~surface.foliage[within], np.full(count, np.inf)
+    solid, first = ~surface.foliage[swept], np.full(count, np.inf)
     np.minimum.at(first, cell[solid], depth[solid])
     # a slope of 45 degrees is not hidden by its own upper end
-    visible = np.flatnonzero(~surface.wall[within] & (depth <= first[cell] + opaque + _RETURN_DEPTH))
+    visible = np.flatnonzero(~surface.wall[swept] & (depth <= first[cell] + opaque + _RETURN_DEPTH))
     pulse, _ = _cells(place[visible], side)
-    answering = _answers(pulse, depth[visible], surface.foliage[within[visible]], survey.porosity, rng)
-    return np.asarray(within[visible[answering]])
+    answering = _answers(pulse, depth[visible], surface.foliage[swept[visible]], survey.porosity, rng)
+    return np.asarray(swept[visible[answering]])
 
 
 def _answers(pulse: Indices, depth: Floats, foliage: Bools, porosity: float, rng: np.random.Generator) -> Indices:

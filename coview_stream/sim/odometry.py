@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import rot_z
 from coview_stream.sim.layout import arc_lengths, directions
+from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 
@@ -46,10 +46,7 @@ class OdometryConfig:
     offset: float = 400.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            limit = 1e5 if field.name == "offset" else 1.0
-            if not 0.0 <= getattr(self, field.name) <= limit:
-                raise ConfigError(f"{field.name}: {getattr(self, field.name)!r} is not within 0 and {limit:g}")
+        within(self, **{field.name: (0.0, 1e5 if field.name == "offset" else 1.0) for field in fields(self)})
 
 
 def drive(scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator) -> Floats:

@@ -1,4 +1,4 @@
-"""Range checks of the settings of dirt."""
+"""Range checks of the simulator's settings."""
 
 from __future__ import annotations
 

@@ -34,19 +34,9 @@ from coview_stream.sim.dirt.scene import aged, drawn_parts
 from coview_stream.sim.dirt.survey import Thinning, spoilt_strips
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry, drive
+from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, MeshCaster
-
-_RANGES: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**31 - 1),
-    "drive_seed": (0, 2**31 - 1),
-    "size": (80.0, 2000.0),
-    "length": (0.0, 10_000.0),
-    "density": (0.5, 200.0),
-    "changed": (0.0, 1.0),
-    "speed": (0.1, 30.0),
-    "height": (0.3, 5.0),
-}
 
 
 @dataclass(frozen=True)
@@ -91,10 +81,17 @@ class SimulationConfig:
             value = getattr(self, name)
             if value not in choices:
                 raise ConfigError(f"{name}: {value!r} is unknown; use one of {', '.join(choices)}")
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"{name}: {value!r} is out of range; use {low:g} to {high:g}")
+        within(
+            self,
+            seed=(0, 2**31 - 1),
+            drive_seed=(0, 2**31 - 1),
+            size=(80.0, 2000.0),
+            length=(0.0, 10_000.0),
+            density=(0.5, 200.0),
+            changed=(0.0, 1.0),
+            speed=(0.1, 30.0),
+            height=(0.3, 5.0),
+        )
         if len(self.origin) != 3 or not all(abs(value) <= 1e7 for value in self.origin):
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 

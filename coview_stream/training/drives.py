@@ -1,4 +1,4 @@
-"""Submaps: frames along a short drive, put together by a drifting odometry."""
+"""Drives through training worlds: a path, the frames along it, and their submap by a drifting odometry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coview_stream.sim.sensors import FRAME_PERIOD, Caster
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import DriveDirt, trained_sensor
 
-# all set by hand
+# chosen by hand
 
 CLEARANCE = 0.6
 """Metres between the robot's middle and a stem."""
@@ -85,8 +85,6 @@ def along_streets(rng: np.random.Generator, layout: Layout, extent: float, lengt
     y = np.interp(at, arc, line[:, 1]) + sideways * np.cos(heading)
     return np.column_stack([x, y])
 
-
-# all set by hand
 
 RADIUS = 30.0
 """Metres about the newest position within which points are kept."""
@@ -170,7 +168,7 @@ def scanned(
 
 
 def gathered(frames: Frames) -> Submap:
-    """Put a drive's frames together by their odometry."""
+    """Return the submap of a drive's frames, joined by their odometry."""
     newest = frames.odometry[-1, :3, 3]
     parts = []
     for T_odom_sensor, cloud in zip(frames.odometry, frames.clouds, strict=True):
@@ -189,7 +187,7 @@ def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str
     spacing = recipe.draw(rng, "frame_step") * _STEP_SHARE.get(sensor, 1.0)
     last = len(path) - 1
     along = last - (np.arange(0, last + 1, spacing / STEP)[::-1]).astype(np.int64)
-    # a robot that has hardly moved has scanned for longer
+    # a robot that has hardly moved has scanned longer
     stood = max(0, int(rng.integers(*_MIN_FRAMES.get(sensor, (2, 6)))) - len(along))
     frames = np.round((along - along[0]) * STEP / _SPEED / FRAME_PERIOD).astype(np.int64) + _PAUSE * stood
     along = np.concatenate([np.full(stood, along[0]), along])

@@ -1,4 +1,4 @@
-"""The two encoders, of the map seen from above and of a robot's scans, in PyTorch; and their export to ONNX."""
+"""The two encoders in PyTorch, of the map from above and of a robot's scans; their export to ONNX, quantisation."""
 
 from __future__ import annotations
 

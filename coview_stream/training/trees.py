@@ -1,4 +1,4 @@
-"""Trees of a stand: where they stand, and their species and sizes, drawn at random."""
+"""Ground of a forest and its trees: places, species and sizes, drawn at random."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training worlds: a place at two times, the map's scan of it, and the robot's submaps."""
+"""Training worlds: a place at two times, the map's scan, the robot's submaps, and their bird's-eye views on disk."""
 
 from __future__ import annotations
 
