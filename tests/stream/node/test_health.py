@@ -163,7 +163,7 @@ def test_telling_goes_on_after_something_could_not_be_told(site, monkeypatch):
             raise RuntimeError("the session is being renewed")
         return Connection(routers=("r",))
 
-    monkeypatch.setattr(site.net, "connection", connection)
+    site.net.connection = connection
     monkeypatch.setattr("coview_stream.stream.node.health._INTERVAL", 0.01)
     stopping = threading.Event()
     health = NodeHealth(site.node, needs_connection=True)

@@ -119,7 +119,7 @@ class Chaos:
             return
         assert state is State.TRACKING
         assert counters.fixes > 0
-        assert self.session.age() is not None
+        assert self.session.robot_state.age(self.session.inputs.odometry) is not None
         newest = self.session.inputs.odometry.newest
         assert sent.stamp_ns == newest.stamp_ns
         restarts = counters.clock_restarts
