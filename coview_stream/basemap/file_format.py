@@ -40,6 +40,47 @@ VERSION = 1
 
 Arrays = dict[str, npt.NDArray[Any]]
 
+_DAMAGE = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, MemoryError, OSError)
+_MAX_ARRAYS = 256  # ten times as many as a map has
+_CHUNK = 1 << 22  # bytes written or hashed at a time
+_CACHE_LINE = 64  # bytes
+_TYPES = {
+    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U16": "<u2",
+    "U8": "|u1",
+}  # fmt: skip
+_NAMES = {kind: name for name, kind in _TYPES.items()}
+_Shape = tuple[str | int, ...]
+_EXPECTED: dict[str, tuple[str, _Shape]] = {
+    "origin": ("<f8", (3,)),
+    "stations": ("<f4", ("stations", 3)),
+    "points": ("<f4", ("points", 3)),
+    "normals": ("|i1", ("points", 3)),
+    "tile_index": ("<i8", ("tiles", 4)),
+    "surveyed": ("|u1", ("rows", "columns")),
+    "surveyed_corner": ("<f8", (2,)),
+    **{
+        f"station_codes{tier}{part}": expected
+        for tier in ("", ".rest")
+        for part, expected in {
+            "": ("<i2", ("stations", 16, 16)),
+            ".basis": ("<f4", (16, 16, "columns of the basis", 2)),
+            ".step": ("<f4", (16, 2, 16)),
+            ".norm": ("<f4", (33,)),
+        }.items()
+    },
+    "field.tiles": ("<i4", ("field tiles", 3)),
+    "field.occupied": ("<i8", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "field.ground": ("<i2", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "field.edge": ("|u1", ("field tiles", FIELD_TILE, FIELD_TILE)),
+    "learned.local": ("|i1", ("learned tiles", "learned rows", "learned columns", "features")),
+    "learned.sigma": ("|u1", ("learned tiles", "learned rows", "learned columns")),
+    "learned.tiles": ("<i4", ("learned tiles", 2)),
+    "learned.place": ("|i1", ("places", "numbers")),
+    "learned.place_at": ("<f4", ("places", 2)),
+}
+"""Type and shape of each array; dimensions of the same name have the same length."""
+_MAX_METRES = 1e7  # of a corner or a station: no map of the Earth is larger
+
 
 class Loaded(NamedTuple):
     """Content of a map file.
@@ -55,17 +96,6 @@ class Loaded(NamedTuple):
     parameters: dict[str, Any]
     sha256: str
     identity: FileIdentity
-
-
-_DAMAGE = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, MemoryError, OSError)
-_MAX_ARRAYS = 256  # ten times as many as a map has
-_CHUNK = 1 << 22  # bytes written or hashed at a time
-_CACHE_LINE = 64  # bytes
-_TYPES = {
-    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U16": "<u2",
-    "U8": "|u1",
-}  # fmt: skip
-_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey | None = None) -> str:
@@ -310,41 +340,6 @@ def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[b
         for chunk in content(name):
             total.update(chunk)
     return total.hexdigest()
-
-
-_Shape = tuple[str | int, ...]
-
-_EXPECTED: dict[str, tuple[str, _Shape]] = {
-    "origin": ("<f8", (3,)),
-    "stations": ("<f4", ("stations", 3)),
-    "points": ("<f4", ("points", 3)),
-    "normals": ("|i1", ("points", 3)),
-    "tile_index": ("<i8", ("tiles", 4)),
-    "surveyed": ("|u1", ("rows", "columns")),
-    "surveyed_corner": ("<f8", (2,)),
-    **{
-        f"station_codes{tier}{part}": expected
-        for tier in ("", ".rest")
-        for part, expected in {
-            "": ("<i2", ("stations", 16, 16)),
-            ".basis": ("<f4", (16, 16, "columns of the basis", 2)),
-            ".step": ("<f4", (16, 2, 16)),
-            ".norm": ("<f4", (33,)),
-        }.items()
-    },
-    "field.tiles": ("<i4", ("field tiles", 3)),
-    "field.occupied": ("<i8", ("field tiles", FIELD_TILE, FIELD_TILE)),
-    "field.ground": ("<i2", ("field tiles", FIELD_TILE, FIELD_TILE)),
-    "field.edge": ("|u1", ("field tiles", FIELD_TILE, FIELD_TILE)),
-    "learned.local": ("|i1", ("learned tiles", "learned rows", "learned columns", "features")),
-    "learned.sigma": ("|u1", ("learned tiles", "learned rows", "learned columns")),
-    "learned.tiles": ("<i4", ("learned tiles", 2)),
-    "learned.place": ("|i1", ("places", "numbers")),
-    "learned.place_at": ("<f4", ("places", 2)),
-}
-"""Type and shape of each array; dimensions of the same name have the same length."""
-
-_MAX_METRES = 1e7  # of a corner or a station: no map of the Earth is larger
 
 
 def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> None:

@@ -26,6 +26,14 @@ _MARGIN = 24.0
 
 _MIN_POINTS = 10  # for a cloth to rest on
 
+_MIN_CELLS = 50
+"""Occupied cells below which all lowest points count as ground: too few for a cloth to rest on."""
+_PORTION = 1_000_000  # points classified at a time
+# of the morphological filter; scored by ``python -m bench ground``
+_MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
+_MAX_SLOPE = 0.3  # of terrain between two windows
+_FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
+
 
 def cloth_available() -> bool:
     """Return whether the wheel is installed; there is none for Python 3.13 and for ARM."""
@@ -120,17 +128,6 @@ def _silence() -> Iterator[None]:
         os.dup2(saved, 1)
         os.close(null)
         os.close(saved)
-
-
-_MIN_CELLS = 50
-"""Occupied cells below which all lowest points count as ground: too few for a cloth to rest on."""
-
-_PORTION = 1_000_000  # points classified at a time
-
-# of the morphological filter; scored by ``python -m bench ground``
-_MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
-_MAX_SLOPE = 0.3  # of terrain between two windows
-_FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
 
 
 @dataclass(frozen=True)

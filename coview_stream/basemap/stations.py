@@ -22,6 +22,16 @@ _SUBCELL = 0.5  # metres: airborne scans of 8 points/m2 still fill two
 _STEP = 0.1  # metres: height resolution of the columns
 _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
 
+Described = dict[Channel, npt.NDArray[np.float16]]
+"""(M, R, S) of each channel."""
+RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
+_PORTION = 512  # stations at a time: 7 MB of bins
+_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
+_BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
+_CEILING = 6.0  # metres: as LevelConfig.cover
+LEVEL_GAP = 2.5
+"""Metres: stations farther apart in height are on different storeys."""
+
 
 @dataclass(frozen=True)
 class LevelConfig:
@@ -176,15 +186,7 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     return np.concatenate(levels)
 
 
-Described = dict[Channel, npt.NDArray[np.float16]]
-"""(M, R, S) of each channel."""
-
-RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
-_PORTION = 512  # stations at a time: 7 MB of bins
 _FLOORS = LevelConfig(area=25.0)  # square metres: most smaller floors are overhangs
-_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
-_BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
-_CEILING = 6.0  # metres: as LevelConfig.cover
 
 
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
@@ -338,10 +340,6 @@ def rasterise(
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0
     return HeightRaster(top.reshape(height, width), count.astype(np.int32).reshape(height, width), corner, cell)
-
-
-LEVEL_GAP = 2.5
-"""Metres: stations farther apart in height are on different storeys."""
 
 
 class StationGrid:

@@ -33,6 +33,25 @@ _FLAT_SHARE = 2.0  # times as many surfaces as face up face another way, where a
 _FACING = np.cos(np.radians(20.0))
 _HOLES = 0.15  # share of a station's surroundings that has to be surveyed, for half of the stations
 
+_DRAWN_POINTS = 2_000_000
+_PIXELS = 800  # along the longer side
+_DARK, _LIGHT = 0.15, 0.9  # grey of the highest and of the lowest points
+_STRAY_HEIGHTS = 1.0  # per cent of the heights at either end that may be birds or pits
+POINTS_OF_FILE = 300_000
+"""Points of a view of a map on this machine."""
+POINTS_ON_WIRE = 100_000
+"""Points of a view from a node: 0.8 MB of JSON."""
+MAX_WIRE_BYTES = 4 * 1024 * 1024
+"""Largest JSON of a view, bytes."""
+_MAX_POINTS = 500_000  # that are read
+_OVERSAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
+_GROWTH = 1.2  # of the cells, until few enough are left
+_GROUND_BAND = 0.4  # metres above the ground's height: still the ground
+_GROUND_CELL = 4.0  # metres: of a survey without a map, in which the lowest point is the ground
+_MAX_CRS = 8000  # letters
+_FINEST = 0.005  # metres: a step on the wire
+_MAX_COORDINATE = 1e8  # metres: no place on this planet
+
 
 @dataclass(frozen=True)
 class MapSummary:
@@ -179,12 +198,6 @@ def _covered(base_map: SummarizedMap) -> str | None:
     )
 
 
-_DRAWN_POINTS = 2_000_000
-_PIXELS = 800  # along the longer side
-_DARK, _LIGHT = 0.15, 0.9  # grey of the highest and of the lowest points
-_STRAY_HEIGHTS = 1.0  # per cent of the heights at either end that may be birds or pits
-
-
 def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, axes: Any = None) -> Any:
     """Draw a map from above in the frame of its sources, metres, darker where it is higher.
 
@@ -222,22 +235,6 @@ def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, ax
     axes.locator_params(axis="x", nbins=5)  # numbers of UTM are long
     axes.ticklabel_format(useOffset=False, style="plain")
     return axes
-
-
-POINTS_OF_FILE = 300_000
-"""Points of a view of a map on this machine."""
-POINTS_ON_WIRE = 100_000
-"""Points of a view from a node: 0.8 MB of JSON."""
-MAX_WIRE_BYTES = 4 * 1024 * 1024
-"""Largest JSON of a view, bytes."""
-_MAX_POINTS = 500_000  # that are read
-_OVERSAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
-_GROWTH = 1.2  # of the cells, until few enough are left
-_GROUND_BAND = 0.4  # metres above the ground's height: still the ground
-_GROUND_CELL = 4.0  # metres: of a survey without a map, in which the lowest point is the ground
-_MAX_CRS = 8000  # letters
-_FINEST = 0.005  # metres: a step on the wire
-_MAX_COORDINATE = 1e8  # metres: no place on this planet
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
 
-_MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/operate.md promises two
+_MAX_SHUTDOWN = 1.5  # seconds after a signal: docs/operate.md promises two
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -296,7 +296,7 @@ class GraphConfig:
         huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
             once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
             kernel that lets go altogether would, with an optimistic covariance, lock the map out for good
-            (``tests/localization/tracking/test_pose_graph_robust_kernel.py``).
+            (``tests/localization/tracking/test_pose_graph.py``).
     """
 
     window: int = 40

@@ -13,7 +13,7 @@ METRICS_ADDRESS = "127.0.0.1:9464"
 
 @dataclass(frozen=True)
 class NodeConfig:
-    """Limits and rates of the node, in seconds, metres, Hz and bytes; set by hand.
+    """Limits and rates of the node, in seconds, metres, Hz and bytes.
 
     Attributes:
         pose_rate: of the poses, while TRACKING.

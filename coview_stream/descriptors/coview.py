@@ -17,7 +17,7 @@ Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
 _VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_strict": "off"}
-_GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows the ground; set by hand
+_GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows the ground
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:

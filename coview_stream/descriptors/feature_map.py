@@ -1,4 +1,8 @@
-"""Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points."""
+"""Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points.
+
+It is built by the aerial network over bird's-eye views of the map, in windows that overlap by more than the network's
+reach: the result does not depend on where they lie.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ TILE = 32
 
 _NAMES = ("local", "sigma", "tiles", "place", "place_at")
 _SCALE = 127.0
-_MIN_SIGMA, _MAX_SIGMA = 0.02, 50.0  # range of the stored sigmas; set by hand
+_MIN_SIGMA, _MAX_SIGMA = 0.02, 50.0  # range of the stored sigmas
 _STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 
 
@@ -228,11 +232,11 @@ def _overlap(begin: int, size: int) -> tuple[slice, slice]:
 
 
 WINDOW = 256
-"""Metres along the edge of a window, drawn and encoded at a time; a multiple of a tile's edge; set by hand."""
+"""Metres along the edge of a window, drawn and encoded at a time; a multiple of a tile's edge."""
 
-_DRAW_MARGIN = 48  # metres around a window whose points determine its ground; set by hand
+_DRAW_MARGIN = 48  # metres around a window whose points determine its ground
 _NET_MARGIN = 64  # metres around a window that the network sees: 30 m for its layers, 28 for GeM's disk
-_KNOWN_RADIUS = 4  # metres from the nearest point within which the map is known, to bridge shadows; set by hand
+_KNOWN_RADIUS = 4  # metres from the nearest point within which the map is known, to bridge shadows
 _CELLS = round(1 / CELL)  # image cells a metre
 _PER_PLACE = 2  # cells of the network's global descriptors along the edge of a stored one's
 

@@ -1,1 +1,1 @@
-"""Checks of the machine, a map, the network and what robots send; each finding says what to do."""
+"""Checks of the machine, a map, the network and the robots' messages, each with a remedy."""

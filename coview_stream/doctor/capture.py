@@ -1,4 +1,4 @@
-"""Messages received of robots, described without their bytes; the modules ``*_checks`` judge them."""
+"""Messages received from robots, described without their bytes; the modules ``*_checks`` judge them."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Wait = Callable[[float], object]
 """Passes some seconds."""
 
 Codecs = tuple[str | None, str | None]
-"""Codec of all clouds and of all odometry; None: as the messages name it."""
+"""Codecs of all clouds and of all odometry; None: the one that a message names."""
 
-# set by hand
-_MAX_MESSAGES = 20_000  # kept of a channel: enough for 30 s of the fastest IMU odometry
+# bounds of the memory
+_MAX_MESSAGES = 20_000  # of a channel: enough for 30 s of the fastest IMU odometry
 _MAX_KEPT = 30_000  # points of a cloud
-_MAX_CLOUDS = 300  # of which points are kept
+_MAX_CLOUDS = 300  # with their points
 _MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wrong format are any size
 
 
@@ -43,18 +43,18 @@ class CapturedMessage:
     Attributes:
         arrived: local time, seconds.
         key: key expression of the sample.
-        encoding: as the sample names it; empty if it does not.
+        encoding: named by the sample; empty without one.
         size: bytes.
         codec: codec that read it; empty if none could.
         counter: name of the node's counter for a message that cannot be read; empty for others.
         reason: why it cannot be read; empty if it can.
-        readable_as: codec that could read it if it were named; empty if there is none.
+        readable_as: another codec that could read it; empty if none can.
         stamp_ns: sensor time, None if it cannot be read.
-        points: number of points, finite ones.
+        points: number of finite points.
         distance: median distance of the points, metres, NaN without points.
         sweep: seconds after the stamp of the first and the last point, None without a time per point.
         T_odom_body: (4, 4) odometry, None for clouds.
-        cloud: (N, 3) float32 finite points, some of them, of some clouds; None of the others.
+        cloud: (N, 3) float32 sample of the finite points; None past the first clouds.
     """
 
     arrived: float
@@ -80,9 +80,9 @@ class RobotCapture:
     Attributes:
         keys: keys of the robot.
         clouds: in order of arrival.
-        odometry: likewise.
-        status: newest of the node, None if there was none.
-        servers: nodes that published statuses, as they name themselves.
+        odometry: in order of arrival.
+        status: newest one of the node; None without any.
+        servers: names of the nodes that published statuses.
         alive: whether a node holds the liveliness token.
         began: local time at which the capture began, seconds.
         ended: local time at which it ended, seconds.
@@ -106,13 +106,13 @@ def capture_robots(
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> list[RobotCapture]:
-    """Receive what robots send for ``seconds``.
+    """Receive the robots' messages for ``seconds``.
 
     Args:
         transport: open transport.
         keys: keys of each robot.
         seconds: duration.
-        codecs: instead of those that the messages name.
+        codecs: instead of the ones that the messages name.
         wait: passes the time.
         clock: local time, seconds.
     """
@@ -158,7 +158,7 @@ def capture_robots(
 def capture_cloud(
     sample: Sample, arrived: float, option: str | None = None, hint: str | None = None
 ) -> CapturedMessage:
-    """Describe a lidar frame, read as the node would read it."""
+    """Describe a lidar frame, decoded like in the node."""
     captured, message = _capture("cloud", CLOUD_CODECS, decode_cloud, sample, arrived, option, hint)
     if message is None:
         return captured
@@ -186,7 +186,7 @@ def _some(points: Points) -> Points:
 def capture_odometry(
     sample: Sample, arrived: float, option: str | None = None, hint: str | None = None
 ) -> CapturedMessage:
-    """Describe an odometry sample, read as the node would read it."""
+    """Describe an odometry sample, decoded like in the node."""
     captured, message = _capture("odometry", ODOMETRY_CODECS, decode_odometry, sample, arrived, option, hint)
     if message is None:
         return captured
@@ -214,7 +214,7 @@ def _capture(
 
 
 def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: Sample) -> str:
-    """Return the name of a codec that reads plausible values; formats that check most come first, raw rows last."""
+    """Return the name of a codec that reads plausible values; the strictest formats are tried first, raw rows last."""
     raw = ("xyzi", "xyz")
     for name in [name for name in codecs if name not in raw] + [name for name in raw if name in codecs]:
         try:

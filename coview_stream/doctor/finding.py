@@ -1,4 +1,4 @@
-"""Findings of the doctor: what was checked, what is the case, and what to do about it."""
+"""Findings of the doctor: the check, its result, and the remedy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coview_stream.stream.client.fleet_table import printable
 
 Verdict = Literal["ok", "warn", "FAIL"]
 
-_VERDICT_WIDTH, _WHAT_WIDTH = 4, 22  # characters of the first columns
+_VERDICT_WIDTH, _NAME_WIDTH = 4, 22  # characters of the first columns
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Finding:
     """Result of one check.
 
     Attributes:
-        verdict: ``ok``; ``warn``: it works, but less well or not for everything; ``FAIL``: it will not work.
-        what: what was checked.
-        found: what is the case.
-        remedy: what to do; may be empty.
-        robot: name of the robot; None if it concerns all.
+        verdict: ``ok``; ``warn``: it works, with limits; ``FAIL``: it will not work.
+        what: name of the check.
+        found: its result.
+        remedy: action to take; may be empty.
+        robot: name of the robot; None for all.
     """
 
     verdict: Verdict
@@ -33,9 +33,9 @@ class Finding:
 
     def line(self) -> str:
         """Return one printable line, without control characters that came from the network."""
-        what = f"{self.robot} {self.what}" if self.robot else self.what
+        name = f"{self.robot} {self.what}" if self.robot else self.what
         remedy = f"  ({self.remedy})" if self.remedy else ""
-        return printable(f"{self.verdict:<{_VERDICT_WIDTH}}  {what:<{_WHAT_WIDTH}}  {self.found}{remedy}").rstrip()
+        return printable(f"{self.verdict:<{_VERDICT_WIDTH}}  {name:<{_NAME_WIDTH}}  {self.found}{remedy}").rstrip()
 
     def to_json(self) -> dict[str, str | None]:
         """Return plain data, for JSON."""

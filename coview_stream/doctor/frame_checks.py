@@ -238,21 +238,21 @@ def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[_P
         target: LocalMap | None = None
         for k, frame in enumerate(frames):
             points = voxelized(frame.points, level, KeyframeConfig())
-            seen = None
+            answer: Pose | None = None
             if target is not None:
                 scan = prepare_scan(points, here, config)
                 for guess in _guesses(frames[k - 1].T_odom_body, frame.T_odom_body, step):
-                    found = register(scan, guess, target, config, _SCALES, centre=here)
-                    if found is not None and found.converged:
-                        sigmas = config.inflation * np.sqrt(np.diag(np.linalg.inv(found.information))[3:5])
+                    match = register(scan, guess, target, config, _SCALES, centre=here)
+                    if match is not None and match.converged:
+                        sigmas = config.inflation * np.sqrt(np.diag(np.linalg.inv(match.information))[3:5])
                         if sigmas.max() < _CERTAIN:
-                            seen = found.T_map_source
+                            answer = match.T_map_source
                             break
             target = LocalMap(*surface_points(points))
-            if seen is None:
+            if answer is None:
                 first, motion, step = k, np.eye(4), np.eye(4)
                 continue
-            step = seen
+            step = answer
             motion = motion @ step
             if np.linalg.norm(motion[:3, 3]) > _BASELINE or k - first >= _LONGEST_CHAIN:
                 pairs.append(_Pair(motion, frames[first].T_odom_body, frame.T_odom_body))
@@ -295,11 +295,11 @@ def _fit(pairs: Sequence[_Pair], R_up: Floats, change: Change | None = None, R_b
         before, after = (pair.before, pair.after) if change is None else (change(pair.before), change(pair.after))
         moved = rot_z(-yaw_of(before)) @ (after[:3, 3] - before[:3, 3])
         step = complex(moved[0], moved[1])
-        seen = complex(pair.motion[0, 3], pair.motion[1, 3]) * np.exp(1j * heading)
+        driven = complex(pair.motion[0, 3], pair.motion[1, 3]) * np.exp(1j * heading)
         turn = wrap_angle(yaw_of(after) - yaw_of(before) - yaw_of(pair.motion))
-        misfits.append(abs(step - seen) + _METRES_PER_RADIAN * abs(turn))
-        if min(abs(step), abs(seen)) > _STILL:
-            ratios.append(seen / step)
+        misfits.append(abs(step - driven) + _METRES_PER_RADIAN * abs(turn))
+        if min(abs(step), abs(driven)) > _STILL:
+            ratios.append(driven / step)
     if not ratios:
         return _Fit(float(np.median(misfits)) if misfits else math.inf, 0.0, math.pi, 1.0, 0)
     angles = np.angle(ratios)
@@ -365,9 +365,9 @@ def _still(frames: Sequence[SeenFrame], pairs: Sequence[_Pair], robot: str | Non
     moved = float(np.linalg.norm(at - at[0], axis=1).max())
     if moved > _STILL:
         return None
-    seen = float(np.median([np.linalg.norm(pair.motion[:2, 3]) for pair in pairs])) if pairs else 0.0
-    if len(pairs) >= _MIN_PAIRS and seen > _MOVING:
-        found = f"odometry stands still, but the lidar moves: {seen:.1f} m between frames, odometry {moved:.2f} m"
+    driven = float(np.median([np.linalg.norm(pair.motion[:2, 3]) for pair in pairs])) if pairs else 0.0
+    if len(pairs) >= _MIN_PAIRS and driven > _MOVING:
+        found = f"odometry stands still, but the lidar moves: {driven:.1f} m between frames, odometry {moved:.2f} m"
         return Finding("FAIL", "motion", found, "is odometry the identity, or not running? send it live", robot)
     found = f"the robot stands still ({moved:.2f} m): nothing can be said of its motion"
     return Finding("ok", "motion", found, "drive ten metres and ask again", robot)

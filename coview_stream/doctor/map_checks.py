@@ -14,15 +14,15 @@ from coview_stream.errors import MapError
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
-# set by hand; of onnxruntime, the network and what else is imported, in two processes
+# of onnxruntime, the network and other imports, in two processes
 _NETWORK_MEMORY = 0.2 * GB
-_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, and what a search says of each
+_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, the rest of a search's results
 _FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level
 _FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores
 
 
 def open_map(path: Path) -> tuple[BaseMap | None, Finding]:
-    """Open a map, reading all of it and comparing its checksum; None if it cannot be used."""
+    """Open a map, read all of it and compare its checksum; None if it cannot be used."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.file_format import VERSION
 
@@ -62,7 +62,7 @@ def _features_finding(base_map: BaseMap) -> Finding:
 
 
 def node_memory(base_map: BaseMap) -> float:
-    """Return a node's own bytes: processes, the station index, the likelihood field, and what a search takes."""
+    """Return a node's bytes: processes, the station index, the likelihood field, and a search."""
     surveyed = int((base_map.survey.values > 0).sum()) * base_map.config.block**2
     return MIN_MEMORY + len(base_map) * _INDEX_MEMORY + surveyed * _FIELD_MEMORY + _learned_memory(base_map)
 

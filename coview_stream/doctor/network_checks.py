@@ -1,4 +1,4 @@
-"""Checks of the network: connections, and what the robots send."""
+"""Checks of the network: connections, the robots' messages, and discovery of other clouds and odometry."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _KEYS = (
 )
 _LISTEN = 2.0  # seconds: clouds come at 5 Hz or more
 _MAX_LISTED = 3  # candidates in one line
-_MAX_CANDIDATES = 200  # set by hand; a large site has more than anyone reads
+_MAX_CANDIDATES = 200  # a large site has more than anyone reads
 
 
 @dataclass(frozen=True, order=True)
 class Candidate:
-    """Clouds or odometry that a robot could be served from.
+    """Clouds or odometry on the network.
 
     Attributes:
         channel: ``cloud`` or ``odometry``.
@@ -59,13 +59,13 @@ class Candidate:
 def discover(transport: Transport, wait: Callable[[float], object] = time.sleep) -> list[Candidate]:
     """Return the clouds and odometry on the network, sorted.
 
-    Listens for two seconds to the keys of all robots, whose clouds all come here meanwhile, then asks for tokens.
+    Listens for two seconds to the keys of all robots (all their clouds come here meanwhile), then asks for tokens.
     """
-    found: set[Candidate] = set()
+    candidates: set[Candidate] = set()
 
     def add(candidate: Candidate | None) -> None:
-        if candidate is not None and len(found) < _MAX_CANDIDATES:
-            found.add(candidate)
+        if candidate is not None and len(candidates) < _MAX_CANDIDATES:
+            candidates.add(candidate)
 
     for key in _KEYS:
         transport.subscribe(key, lambda sample: add(from_key(sample.key)), "newest")
@@ -73,7 +73,7 @@ def discover(transport: Transport, wait: Callable[[float], object] = time.sleep)
     for expression in _TOKENS:
         for token in transport.tokens(expression):
             add(from_token(token))
-    return sorted(found)
+    return sorted(candidates)
 
 
 def served_robots(transport: Transport) -> set[str]:
@@ -85,10 +85,10 @@ def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "
     """Name the candidates of a channel, with the options that subscribe to them; empty if there are none.
 
     Args:
-        candidates: found on the network.
+        candidates: on the network.
         channel: ``cloud`` or ``odometry``.
-        like: key that nothing came on: those that are spelt most like it come first.
-        served: robots that have a node; their data is named only if there is no other.
+        like: a silent key; candidates spelt most like it come first.
+        served: robots that have a node; their data is named only without any other.
     """
     others = set(served)
     fitting = [c for c in candidates if c.channel == channel]
@@ -97,10 +97,10 @@ def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "
         return ""
     if like:
         fitting.sort(key=lambda c: SequenceMatcher(None, c.where.strip("/"), like.strip("/")).ratio(), reverse=True)
-    what = "clouds come" if channel == "cloud" else "odometry comes"
+    subject = "clouds come" if channel == "cloud" else "odometry comes"
     listed = "; ".join(f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_LISTED])
     more = f"; and {len(fitting) - _MAX_LISTED} more" if len(fitting) > _MAX_LISTED else ""
-    return f"{what} {listed}{more}"
+    return f"{subject} {listed}{more}"
 
 
 def from_token(token: str) -> Candidate | None:
@@ -153,7 +153,7 @@ def _ros_topic(preset: str, channel: str, topic: str, domain: str = "0", ending:
 
 
 def _valid(preset: str, channel: str, where: str, options: str, robot: str, base: str = "coview") -> Candidate | None:
-    """Return the candidate; None if its names are none that the options accept."""
+    """Return the candidate; None if the options refuse its names."""
     try:
         robot_keys(preset, base, robot)
     except ConfigError:
@@ -161,7 +161,7 @@ def _valid(preset: str, channel: str, where: str, options: str, robot: str, base
     return Candidate(channel, where, options)
 
 
-# all set by hand, seconds
+# seconds
 _CONNECT_TIMEOUT = 2.0  # for a first connection to the given endpoints
 _LISTEN_TIMEOUT = 6.0  # for a first connection from outside: a client tries again every 1 to 4 s
 _POLL_PERIOD = 0.05
@@ -193,7 +193,7 @@ def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait 
 
 
 def try_tcp(endpoint: str) -> str:
-    """Try a plain TCP connection to an endpoint that zenoh cannot reach, and return what came of it, in words."""
+    """Try a plain TCP connection to an endpoint that zenoh cannot reach, and return the result in words."""
     address = _TCP.match(endpoint)
     if address is None:
         return "does not answer"
@@ -228,9 +228,9 @@ def robot_findings(
     """Judge all of one robot.
 
     Args:
-        capture: what it sent.
-        candidates: what else is on the network.
-        sha256: the map's, if one is known.
+        capture: its messages.
+        candidates: other clouds and odometry on the network.
+        sha256: of the map; None if unknown.
         served: robots that have a node.
     """
     others = set(served) - {capture.keys.robot}
@@ -262,7 +262,7 @@ def robots_findings(
 
 
 def candidates_finding(candidates: Sequence[Candidate]) -> Finding:
-    """Name the clouds and odometry there are, for a user who has named no robot."""
+    """List the clouds and odometry on the network, for a user who has named no robot."""
     texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(candidates, channel))]
     if texts:
         return Finding("ok", "robots", "; ".join(texts))

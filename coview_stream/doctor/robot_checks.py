@@ -1,4 +1,4 @@
-"""Checks of a robot's clouds against its odometry, and of the node against both."""
+"""Checks of a robot's clouds, its odometry, both together, and the node that serves it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from coview_stream.stream.node.inputs import FrameSync
 from coview_stream.version import __version__
 
 _NODE = NodeConfig()
-# all set by hand
+# limits of usual robots
 _MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s there are 2.5 m between frames
 _MIN_ODOMETRY_RATE = 5.0  # Hz; poses are published at 10 Hz, each with the newest odometry
 _MIN_PER_CLOUD = 0.9  # odometry samples for each cloud, less the difference of the two ways of counting
@@ -50,7 +50,7 @@ def cloud_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding]:
 
 
 def odometry_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding]:
-    """Judge the odometry; ``elsewhere`` likewise."""
+    """Judge the odometry; ``elsewhere`` names other keys with odometry."""
     robot, messages = capture.keys.robot, capture.odometry
     maker = str((capture.status or {}).get("odometry", "robot"))
     if maker != "robot":
@@ -67,13 +67,12 @@ def odometry_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding
         yield gravity_finding(readable, robot)
 
 
-def _missing(what: str, capture: RobotCapture, key: str, elsewhere: str) -> Finding:
-    remedy = "does the robot publish, on this key, and do access rules let it?"
-    remedy = elsewhere or remedy
-    if what == "odometry":
+def _missing(channel: str, capture: RobotCapture, key: str, elsewhere: str) -> Finding:
+    remedy = elsewhere or "does the robot publish, on this key, and do access rules let it?"
+    if channel == "odometry":
         remedy += f"{'.' * bool(elsewhere)} If it has none: `serve --odometry kiss-icp`"
-    found = f"none in {capture.ended - capture.began:.1f} s on {key}"
-    return Finding("FAIL", what, found, remedy, capture.keys.robot)
+    result = f"none in {capture.ended - capture.began:.1f} s on {key}"
+    return Finding("FAIL", channel, result, remedy, capture.keys.robot)
 
 
 def _made_by_node(maker: str, ignored: int, robot: str) -> Finding:
@@ -85,7 +84,7 @@ def _made_by_node(maker: str, ignored: int, robot: str) -> Finding:
 
 
 def _unreadable(
-    what: str, option: str, codecs: list[str], unreadable: list[CapturedMessage], total: int, robot: str
+    channel: str, option: str, codecs: list[str], unreadable: list[CapturedMessage], total: int, robot: str
 ) -> Finding:
     first = unreadable[0]
     found = f"{len(unreadable)} of {total} cannot be read: {first.reason}"
@@ -97,7 +96,7 @@ def _unreadable(
         remedy = f"send one of {', '.join(codecs)}, and name it in the Encoding"
     else:
         remedy = "compare the sender with docs/wire.md, 'Byte layout'"
-    return Finding("FAIL" if len(unreadable) == total else "warn", what, found, remedy, robot)
+    return Finding("FAIL" if len(unreadable) == total else "warn", channel, found, remedy, robot)
 
 
 def rate(messages: Sequence[CapturedMessage]) -> float | None:
@@ -164,18 +163,18 @@ def _odometry(messages: list[CapturedMessage], capture: RobotCapture) -> Finding
     return Finding("ok", "odometry", found, robot=robot)
 
 
-def stamps_finding(what: str, messages: Sequence[CapturedMessage], robot: str) -> Finding:
+def stamps_finding(channel: str, messages: Sequence[CapturedMessage], robot: str) -> Finding:
     """Judge whether stamps increase, and about as fast as the local clock."""
     stamps = [m.stamp_ns for m in messages if m.stamp_ns is not None]
     steps = [later - earlier for earlier, later in pairwise(stamps)]
     back, same = sum(step < 0 for step in steps), sum(step == 0 for step in steps)
     if steps and same == len(steps):
         remedy = "the sender has to stamp each message with its sensor time, nanoseconds"
-        return Finding("FAIL", what, f"all {len(stamps)} are {stamps[0]}", remedy, robot)
+        return Finding("FAIL", channel, f"all {len(stamps)} are {stamps[0]}", remedy, robot)
     if back or same:
         verdict: Verdict = "FAIL" if back + same > len(steps) / 2 else "warn"
         found = f"of {len(steps)} steps {back} go backwards, {same} stand still"
-        return Finding(verdict, what, found, "two senders on one key, or a sender that repeats itself?", robot)
+        return Finding(verdict, channel, found, "two senders on one key, or a sender that repeats itself?", robot)
     span, elapsed = (stamps[-1] - stamps[0]) * 1e-9, messages[-1].arrived - messages[0].arrived
     if elapsed >= 1.0 and not 1 / _MAX_CLOCK_RATIO < span / elapsed < _MAX_CLOCK_RATIO:
         found = f"run {span / elapsed:.3g} times as fast as the clock here"
@@ -183,8 +182,8 @@ def stamps_finding(what: str, messages: Sequence[CapturedMessage], robot: str) -
         remedy = (
             "write nanoseconds" if wrong else "fine for a recording at another speed, else look at the sender's clock"
         )
-        return Finding("FAIL" if wrong else "warn", what, found, remedy, robot)
-    return Finding("ok", what, f"increasing, newest {stamps[-1] * 1e-9:.3f} s", robot=robot)
+        return Finding("FAIL" if wrong else "warn", channel, found, remedy, robot)
+    return Finding("ok", channel, f"increasing, newest {stamps[-1] * 1e-9:.3f} s", robot=robot)
 
 
 def gravity_finding(messages: Sequence[CapturedMessage], robot: str) -> Finding:
@@ -209,13 +208,13 @@ _MAX_STATUS_AGE = 5.0  # seconds; a node publishes one every second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
 _LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds
 _MAX_FRAMES = 60  # compared with odometry
-_NEAREST_NS = 100_000_000  # a cloud's stamp from the odometry that is taken for it
+_NEAREST_NS = 100_000_000  # between a cloud's stamp and its odometry's
 _LONG_SEARCH = 60.0  # seconds: most robots are found within ten
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
 
 def cross_findings(capture: RobotCapture) -> Iterator[Finding]:
-    """Judge whether both are on one clock, and how many clouds find their odometry."""
+    """Judge whether clouds and odometry share a clock, and how many clouds find their odometry."""
     clouds = [m for m in capture.clouds if m.stamp_ns is not None]
     odometry = [m for m in capture.odometry if m.stamp_ns is not None]
     if not clouds or not odometry:
@@ -227,7 +226,7 @@ def cross_findings(capture: RobotCapture) -> Iterator[Finding]:
 
 
 def clock_finding(clouds: list[CapturedMessage], odometry: list[CapturedMessage], robot: str) -> Finding:
-    """Compare the distances of both channels' stamps from their times of arrival."""
+    """Compare the delays of both channels, from stamp to arrival."""
     ahead = _offset(odometry) - _offset(clouds)
     size = abs(ahead)
     found = f"odometry stamps are {_seconds(size)} {'ahead of' if ahead > 0 else 'behind'} the clouds'"
@@ -258,7 +257,7 @@ def _seconds(value: float) -> str:
 def pairing_finding(
     clouds: list[CapturedMessage], odometry: list[CapturedMessage], ended: float, robot: str
 ) -> Finding:
-    """Pass the messages to the node's own pairing, in order of arrival, and judge what becomes of the clouds."""
+    """Pass the messages to the node's pairing in order of arrival, and count the clouds that find odometry."""
     config, counters = NodeConfig(odometry_history=60.0), Counters()
     buffer = OdometryBuffer(config)
     pairing = FrameSync(config, buffer, counters)
@@ -282,7 +281,7 @@ def pairing_finding(
         found += f" ({', '.join(dropped)})"
     if jumps := kinds[SampleKind.JUMP]:
         found += f"; odometry jumps {jumps} times"
-        remedy = "two senders of odometry, or one that starts anew: after each jump the robot is LOST"
+        remedy = "two senders of odometry, or one that restarts: after each jump the robot is LOST"
         return Finding("FAIL", "pairing", found, remedy, robot)
     if paired < len(clouds) / 2:
         remedy = "send odometry before the cloud that it belongs to, 20 to 100 a second, on the same clock"
@@ -291,7 +290,7 @@ def pairing_finding(
 
 
 def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
-    """Return the clouds that were kept, each with the odometry nearest to its stamp."""
+    """Return the sampled clouds, each with the odometry nearest to its stamp."""
     odometry = [(m.stamp_ns or 0, m.T_odom_body) for m in capture.odometry if m.T_odom_body is not None]
     odometry.sort(key=lambda item: item[0])
     clouds = [m for m in capture.clouds if m.cloud is not None and m.stamp_ns is not None]
@@ -307,13 +306,13 @@ def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
 
 
 def _without_points(captured: CapturedMessage) -> CloudMessage:
-    """Return a cloud of the same stamp without points: pairing reads stamps only."""
+    """Return a cloud of the same stamp without points, since pairing reads stamps only."""
     times = None if captured.sweep is None else np.array(captured.sweep)
     return CloudMessage(captured.stamp_ns or 0, np.zeros((0, 3), np.float32), times)
 
 
 def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None = None) -> Finding:
-    """Judge whether a node serves the robot, and its status; ``sha256`` of the map it should have, None for any."""
+    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None for any."""
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
         return Finding("warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot)
@@ -345,11 +344,11 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
 
 
 def _not_found(reason: str) -> str:
-    """Say what to do about a robot that has no place."""
+    """Return the remedy for a robot that is not localized."""
     if "waiting for" in reason or reason.startswith("no clouds"):
         return "its data does not come: see clouds and odometry above"
     if "two places" in reason or "several places" in reason or "leads" in reason:
-        return "drive on, past what tells these places apart; `info --ambiguity` shows where that takes long"
+        return "drive on, to where these places differ; `info --ambiguity` shows where that takes long"
     return "drive ten metres; if all else here is ok: is it on this map? docs/reasons.md"
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.recordings.run import Run
 
-# set by hand
+# sizes of the sample
 _FRAMES, _WINDOWS = 80, 4
 _APART = 1.0  # metres between frames, about
 _STANDING_STRIDE = 5  # frames, where odometry does not move
@@ -24,7 +24,7 @@ _SEARCHED = 60  # frames
 
 
 def run_findings(run: Run, base_map: BaseMap | None = None) -> Iterator[Finding]:
-    """Judge a run of several frames; with a map also whether a place is found for it."""
+    """Judge a run of several frames and, with a map, whether it is localized there."""
     yield stamps_finding(run)
     try:
         frames = seen_frames(run)
@@ -40,7 +40,7 @@ def run_findings(run: Run, base_map: BaseMap | None = None) -> Iterator[Finding]
 
 
 def stamps_finding(run: Run) -> Finding:
-    """Judge the time between frames: seconds are not milliseconds or nanoseconds."""
+    """Judge the time between frames, to find milliseconds or nanoseconds in place of seconds."""
     step = float(np.median(np.diff(run.stamps))) if len(run) > 1 else float("nan")
     found = f"{len(run)} frames, {step:.4g} s from one to the next"
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
@@ -54,7 +54,7 @@ def stamps_finding(run: Run) -> Finding:
 
 
 def seen_frames(run: Run) -> list[SeenFrame]:
-    """Read some frames about a metre apart, in a few stretches of a long run; damaged ones are left out."""
+    """Read frames about a metre apart, in a few stretches of a long run, without damaged ones."""
     steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
     step = float(np.median(steps)) if len(steps) else 0.0
     stride = _STANDING_STRIDE if len(run) > 2 * _FRAMES else 1
@@ -62,9 +62,9 @@ def seen_frames(run: Run) -> list[SeenFrame]:
         stride = max(1, min(round(_APART / step), stride * 4))
     indices = np.arange(0, len(run), stride)
     if len(indices) > _FRAMES:
-        each = _FRAMES // _WINDOWS
-        begins = np.linspace(0, len(indices) - each, _WINDOWS).astype(int)
-        indices = indices[np.unique((begins[:, None] + np.arange(each)).ravel())]
+        window = _FRAMES // _WINDOWS
+        begins = np.linspace(0, len(indices) - window, _WINDOWS).astype(int)
+        indices = indices[np.unique((begins[:, None] + np.arange(window)).ravel())]
     frames = []
     for index in indices:
         try:

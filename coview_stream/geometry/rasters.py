@@ -89,7 +89,7 @@ def filled(z: Floats32) -> Floats32:
     return np.where(unknown, smooth, z).astype(np.float32)
 
 
-_SAMPLE = 100_000  # distances that a median is taken of; set by hand
+_SAMPLE = 100_000  # distances that a median is taken of
 
 
 def argsmallest(values: Floats32, count: int) -> Ints:

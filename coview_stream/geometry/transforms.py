@@ -190,7 +190,7 @@ def is_pose(T: Reals) -> bool:
 
 
 def why_no_pose(T: Reals) -> str:
-    """Return what is wrong with a matrix that is no pose (:func:`is_pose`), and what to do, as a clause."""
+    """Return the fault of a matrix that is no pose (:func:`is_pose`), and the remedy, as a clause."""
     return f"is no rigid transform: {_flaw(T)}"
 
 

@@ -1,4 +1,4 @@
-"""Checks of what callers hand over: clouds, poses, stamps and covariances.
+"""Checks of input: clouds, poses, stamps and covariances.
 
 Arrays are copied where the caller may write into them again.
 """

@@ -121,7 +121,7 @@ class FramePreparation:
 
 
 class OdometryCorrection:
-    """Odometry with its scale and its heading corrected, step by step; what has been corrected stays as it is.
+    """Odometry with its scale and its heading corrected, step by step; corrected steps stay as they are.
 
     Gravity stays odometry's: turns are about the vertical.
     """

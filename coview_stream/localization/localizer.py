@@ -29,7 +29,7 @@ from coview_stream.localization.tracking.monitor import LossMonitor, RejectionRe
 from coview_stream.localization.tracking.tracker import Tracker
 
 _BY_INDEX = ("exhaustive", "consensus")  # modes of retrieval and consensus
-_DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
+_DEFERRED = 3.0  # times as far apart are registrations that are deferred
 
 
 class Localizer:
@@ -173,7 +173,7 @@ class Localizer:
             defer: the caller is behind: while tracking, put registrations off that can wait, to every third metre.
 
         Returns:
-            What has to be searched for, if anything: hand it to a :class:`GlobalSearch`, on another thread or in
+            The search request, if any: hand it to a :class:`GlobalSearch`, on another thread or in
             another process if you like, and its result to :meth:`apply_search_result`, between two frames. Meanwhile
             frames go on.
 
@@ -219,7 +219,7 @@ class Localizer:
         self._update(replace(match, confirms_search=True), ruling)
 
     def fix(self) -> Fix:
-        """Return what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
+        """Return the fix of the newest frame, as :meth:`step` does; RuntimeError before the first."""
         newest, evidence = self._newest, self._evidence
         if newest is None:
             raise RuntimeError("no frame yet; call add_frame or step first")
@@ -247,7 +247,7 @@ class Localizer:
         events, self._events = tuple(self._events), []
         return events
 
-    # ---- what the caller knows
+    # ---- knowledge of the caller
 
     def hint_pose(self, T_map_body: Pose) -> None:
         """Hint that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
@@ -268,9 +268,9 @@ class Localizer:
     def guess_place(self, guess: PlaceGuess, check: bool = True) -> None:
         """Have the search try, from the next frame on, where somebody says that the robot is.
 
-        Never trusted: what is tried there is judged like what the descriptors name; but with ``guess.within`` nothing
-        outside of that circle, and of what is driven meanwhile, is searched, until a place is accepted, another guess
-        comes or the search begins anew (:meth:`relocalize`). Ignored while a place is known.
+        Never trusted: poses tried there are judged like those that the descriptors name; but with ``guess.within``
+        nothing outside that circle, widened by the metres driven meanwhile, is searched, until a place is accepted,
+        another guess comes or the search begins anew (:meth:`relocalize`). Ignored while a place is known.
 
         Args:
             guess: of the place.
@@ -297,7 +297,7 @@ class Localizer:
             self._requests.guess(guess)
 
     def hint_calibration(self, known: Calibration) -> None:
-        """Begin with what was known of this robot before, less well; it goes on being measured.
+        """Begin with an earlier calibration of this robot, less certain; it goes on being measured.
 
         Ignored while a place is known, and as far as it is known better here.
         """
@@ -316,7 +316,7 @@ class Localizer:
     # ---- the steps
 
     def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Frame, SearchRequest | None]:
-        """Check a frame and move the predicted pose on by its odometry; return it and what to search for, if anything.
+        """Check a frame and move the predicted pose on by its odometry; return it and the search request, if any.
 
         Nothing is searched for while a place is known.
         """

@@ -1,4 +1,4 @@
-"""Localization of a recorded run, offline; what came of it as files: trajectory, evidence, timings."""
+"""Localization of a recorded run, offline, and its files: trajectory, evidence, timings."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class RunResult:
 
     @property
     def calibration(self) -> Calibration | None:
-        """What was corrected of the sensor and of odometry in the end, posed or not; None if that was never known."""
+        """The run's last calibration, posed or not; None if there was none."""
         return self.fixes[-1].calibration if self.fixes else None
 
     @property
@@ -200,7 +200,7 @@ def locate(
 def from_stream(
     stamps: Sequence[float], poses: Sequence[dict[str, Any]], statuses: Sequence[dict[str, Any]]
 ) -> RunResult:
-    """Sort what a node published (JSON poses and statuses) under a run's frames, by stamp in seconds.
+    """Sort a node's published messages (JSON poses and statuses) under a run's frames, by stamp in seconds.
 
     A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
     have the state that the newest status before them names.

@@ -29,7 +29,7 @@ _SHARES = tuple(f.name for f in fields(Evidence))
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """The evidence of one keyframe, and what it decided.
+    """The evidence of one keyframe, and its decision.
 
     Attributes:
         stamp: seconds.
@@ -40,7 +40,7 @@ class KeyframeEvidence:
         evidence: its parts, if a hypothesis could be registered.
         station: winning station, if this keyframe searched.
         shift: winning shift of the co-view descriptors; None if the place was found by learned features.
-        cause: what decided, while tracking; None from a search.
+        cause: of the decision, while tracking; None from a search.
         innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
             from the ones before; None where nothing could be registered, and from a search.
         confidence: posterior probability that the robot is at the most probable place, or where it is tracked.
@@ -81,9 +81,9 @@ class KeyframeEvidence:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
-        """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else.
+        """Read back :meth:`to_json`'s data; KeyError or ValueError if it is something else.
 
-        Earlier versions left out the shares that were not known, the cause, the innovation and what chance would do.
+        Earlier versions left out the shares that were not known, the cause, the innovation and the places by chance.
         """
         known = data.get(_SHARES[0]) is not None
         parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
@@ -119,7 +119,7 @@ class Fix:
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
             see docs/tracking.md; None unless TRACKING.
-        calibration: what is corrected of the sensor's tilt and of odometry, in any state: it is estimated from the
+        calibration: corrections of the sensor's tilt and of odometry, in any state: it is estimated from the
             first two keyframes on.
     """
 

@@ -9,7 +9,7 @@ class State(StrEnum):
     """State of a robot's localization: how much is known of its place."""
 
     SEARCHING = "SEARCHING"
-    """No place explains what the robot sees well enough, or too little has been seen."""
+    """No place explains the scans well enough, or there are too few points."""
     AMBIGUOUS = "AMBIGUOUS"
     """A place does, but another one does too, or the evidence does not suffice yet."""
     TRACKING = "TRACKING"

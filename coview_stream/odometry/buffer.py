@@ -93,7 +93,7 @@ class OdometryBuffer:
         self._discontinuous_since = float("inf")
 
     def continue_from(self, other: OdometryBuffer) -> None:
-        """Go on with another buffer's samples, so that what does not continue those is noticed."""
+        """Go on with another buffer's samples, to notice poses that do not continue them."""
         self.newest, self.arrived = other.newest, other.arrived
         self.travelled, self.turned = other.travelled, other.turned
         self._samples = other._samples.copy()

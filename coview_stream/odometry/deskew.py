@@ -8,8 +8,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, interpolate, inverse
 from coview_stream.odometry.buffer import Segment
 
-_STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s; set by hand
-_INSTANT = 1e-4  # seconds: times that differ by less are one; set by hand
+_STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s
+_INSTANT = 1e-4  # seconds: times that differ by less are one
 
 
 def deskew(
@@ -30,7 +30,7 @@ def deskew(
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
         R_body_cloud: (3, 3) rotation that levels a cloud whose sensor leans against the body; None for none.
-        scale: what odometry's distances have to be multiplied with, less one.
+        scale: factor that corrects odometry's distances, less one.
     """
     if len(segment.stamps) < 2 or not len(points):
         return points

@@ -123,7 +123,7 @@ def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple
 
 
 def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
-    """Return what :func:`gravity_from_walls` does, and in between the walls' own information (3, 3), 1 / radians^2."""
+    """Return :func:`gravity_from_walls`, and in between the walls' own information (3, 3), 1 / radians^2."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
@@ -204,12 +204,12 @@ def _sums(values: Floats, which: Indices, count: int) -> Floats:
 
 # set by hand
 _WIDE = float(np.radians(10.0))  # sigma of the up direction that walls are looked for about
-_UNSEEN = float(np.radians(30.0))  # sigma of what walls say along the way that they all face
+_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical along the direction that they all face
 
 
 @dataclass(frozen=True)
 class Plumb:
-    """What the surfaces around say in level axes, for a filter.
+    """The vertical by the surrounding surfaces, in level axes, for a filter.
 
     Attributes:
         walls: (2,) x and y of the unit vector that walls are parallel to; None without walls.

@@ -43,7 +43,13 @@ class ScanRegistration(Protocol):
 
 
 class KissRegistration:
-    """kiss-icp's point-to-point ICP against its voxel map, with its adaptive threshold."""
+    """kiss-icp's (MIT; Vizzo et al., RA-L 2023) point-to-point ICP against its voxel map, with its adaptive threshold.
+
+    kiss-icp's own deskewing takes normalised time stamps for a rotation, unchecked: where all are equal, or one is not
+    finite, 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``). So it gets no time stamps, and the frames come
+    deskewed by :func:`~coview_stream.odometry.deskew.deskew`, which refers them to the frame's stamp as well: kiss-icp
+    refers them to the sweep's end, or its middle, by version.
+    """
 
     def __init__(self, config: LidarOdometryConfig) -> None:
         self._kiss_icp, self._settings = _settings(config)
@@ -101,7 +107,7 @@ class LidarOdometry:
     Attributes:
         config: the settings.
         ground: the plane that gravity was taken from; None before it is found, and where gravity was given.
-        points: (N, 3) float32, the finite points of the newest frame, deskewed: what to give to a ``Localizer``.
+        points: (N, 3) float32, the finite points of the newest frame, deskewed: input of a ``Localizer``.
         restarts: how often the local map was begun anew, after a gap or an impossible motion: what the robot drove
             meanwhile is missing from the odometry then.
     """
@@ -210,7 +216,7 @@ class LidarOdometry:
         return pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
 
     def _level(self, around: Surfaces, metres: float, since: Since) -> None:
-        """Take what registration tilted out of the newest pose, and turn the odometry frame about it, slowly."""
+        """Take registration's tilt out of the newest pose, and turn the odometry frame about it, slowly."""
         assert self._pose is not None
         R, here = self._pose[:3, :3], self._pose[:3, 3]
         own = upright(self._tilt.update(around.seen(R), metres, since))

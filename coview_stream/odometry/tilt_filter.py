@@ -16,7 +16,7 @@ frame k, two numbers each (radians):
     up by ground   z_s = d + n + s
     tilted since   z_m = n + m     the frame before, in its pose as it was given
 
-What is turned is d (all of the odometry frame, slowly) and n (this frame alone). A frame's jitter is then that of the
+Turned are d (all of the odometry frame, slowly) and n (this frame alone). A frame's jitter is then that of the
 better witness: where registration is good to 0.03 degrees and walls to 1, n stays what it is, 0; where rings on bare
 ground hold registration fast while the robot shakes, walls and ground outvote it.
 
@@ -27,7 +27,7 @@ freedom rather than a normal one: a kerb taken for the ground, or a parked lorry
 So is a registration that turns a covered sensor over by 27 degrees: it may be that wrong, the body cannot be that fast.
 As such a likelihood has several maxima, two are looked for, with n as usual and with n an outlier.
 
-The odometry frame turns by no more, per frame, than 1.5 times what the local map is thought to drift: what is learnt
+The odometry frame turns by no more, per frame, than 1.5 times the presumed drift of the local map: what is learnt
 late about gravity (a first frame on a slope) comes in slowly, and a pose never jumps for it.
 """
 
@@ -50,15 +50,15 @@ _FRAME_TILT = float(np.radians(0.2))  # sigma of a frame's tilt by registration,
 _SLOPE_STEP = float(np.radians(0.5))  # likewise of the ground's slope, from frame to frame
 _SLOPE = float(np.radians(4.0))  # one sigma of the ground's slope: gravity.SLOPE
 _WALL_METRES = 10.0  # over which walls err alike
-_NO_WALLS = float(np.radians(2.0))  # sigma of what walls err alike, while none are seen
+_NO_WALLS = float(np.radians(2.0))  # sigma of the walls' common error, while none are seen
 _LEAST = float(np.radians(0.01))  # sigma below which nothing is believed to be
 _LEAST_KAPPA = 1e-3
 _GROUND_FIT = float(np.radians(0.02))  # sigma of the plane's fit alone
 _FREEDOM = 4.0  # of Student's t
 _ROUNDS = 5  # of reweighting
 _STARTS = ((1.0, 1.0, 1.0), (1e-4, 1.0, 1.0))  # weights of n, v and w that it begins with
-_FADE = 1.0 - 1.0 / 60.0  # of what was learnt, per frame
-_PRIOR = 2.0  # degrees of freedom of what is believed at the beginning: a frame's
+_FADE = 1.0 - 1.0 / 60.0  # memory per frame
+_PRIOR = 2.0  # degrees of freedom of the prior: a frame's
 
 _EYE, _ZERO = np.eye(2), np.zeros((2, 2))
 _WALLS, _GROUND = slice(0, 2), slice(2, 4)  # rows of the measurement
@@ -145,7 +145,7 @@ class TiltFilter:
         return tilt
 
     def turn(self) -> Floats:
-        """Return by what (2,) to turn the odometry frame now, and take it for turned."""
+        """Return the turn (2,) of the odometry frame that is due, and take it for done."""
         tilt = self._x[_MAP].copy()
         most = _MAX_TURN * self._drift()
         tilt *= min(1.0, most / max(float(np.linalg.norm(tilt)), 1e-12))
@@ -215,15 +215,15 @@ def _reweighted(
     """Find a maximum of the likelihood of an innovation (K,) that several errors share (EM), from ``weights``.
 
     Args:
-        innovation: what is to be explained.
-        known: (K, K) covariance of what is normal in it.
+        innovation: to be explained.
+        known: (K, K) covariance of its normal part.
         errors: (2, 2) covariance of each that has Student's t distribution, all zero for none.
         ways: (K, 2) how each gets into the innovation.
         weights: of each to begin with; its covariance is divided by that.
 
     Returns:
         Minus the log-likelihood but for a constant, the innovation's inverse covariance, that times the innovation,
-        and of each error its covariance as weighed, its share (2,) and what is left of its covariance.
+        and of each error its covariance as weighed, its share (2,) and the rest of its covariance.
     """
     for _ in range(_ROUNDS):
         wide = [C / weight for C, weight in zip(errors, weights, strict=True)]

@@ -50,8 +50,8 @@ def test_file_with_only_nan_points_is_refused(tmp_path: Path, suffix: str) -> No
 def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: str) -> None:
     write_cloud(tmp_path / f"a{real}", POINTS[:52])
     os.rename(tmp_path / f"a{real}", tmp_path / f"a{named}")  # noqa: PTH104 - Path.rename reads worse here
-    what = "LAS" if real == ".laz" else real[1:].upper()
-    with pytest.raises(CloudError, match=f"content is {what}"):
+    content = "LAS" if real == ".laz" else real[1:].upper()
+    with pytest.raises(CloudError, match=f"content is {content}"):
         read_cloud(tmp_path / f"a{named}")
 
 

@@ -24,7 +24,7 @@ WINDOW = Window((500_100.0, 5_600_050.0), (500_200.0, 5_600_150.0))
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Serves a folder, parts of files where ``ranges`` is set, and keeps what it sent."""
+    """Serves a folder, with ranges if ``ranges`` is set, and records the sizes it sent."""
 
     ranges = True
     sent: list[int] = []  # noqa: RUF012
@@ -107,7 +107,7 @@ def test_of_a_web_server_only_parts_are_fetched(server: str, site: Path, points:
 
 
 def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
-    """Of a file as small as this one the bytes beside what is asked for are many: they are allowed for."""
+    """In a file this small most bytes come from rounding requests up to a block; the bound allows for them."""
     rng = np.random.default_rng(5)
     write_copc(tmp_path / "wide.copc.laz", rng.uniform([0.0, 0.0, 0.0], [900.0, 900.0, 40.0], (60_000, 3)), levels=5)
     served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(tmp_path)))

@@ -107,7 +107,7 @@ def test_pcd_binary_compressed_stores_fields_one_after_another(tmp_path: Path) -
 
 
 def test_lzf_back_references_repeat_and_overlap() -> None:
-    # "ab", then 5 from distance 2 (it reads what it writes), then a long one of 7 + 3 + 2 from distance 7
+    # "ab", then 5 from distance 2 (it overlaps its own output), then a long one of 7 + 3 + 2 from distance 7
     packed = bytes([1]) + b"ab" + bytes([3 << 5, 1]) + bytes([7 << 5, 3, 6])
     assert lzf_decompress(packed, 19) == b"ab" + b"ababa" + (b"abababa" * 2)[:12]
     with pytest.raises(ValueError, match="before the start"):

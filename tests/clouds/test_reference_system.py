@@ -99,7 +99,7 @@ def test_known_place_has_its_coordinates():
 
 @pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:32633", "EPSG:28992", "EPSG:2193"])
 def test_heading_is_that_of_the_geodesic(crs):
-    """Ten metres ahead on the map lie where the heading says, within what a projection's scale does to angles."""
+    """Ten metres ahead on the map lie in the direction of the heading, up to the projection's distortion of angles."""
     geo = GeoReference(crs)
     area = pyproj.CRS(crs).area_of_use
     there = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(

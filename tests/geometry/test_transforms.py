@@ -6,9 +6,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
 from se3 import exp_se3
 
 from coview_stream.geometry import transforms as g
+from coview_stream.geometry.transforms import (
+    adjoint,
+    along_body,
+    along_map,
+    boxminus,
+    boxplus,
+    exp_so3,
+    log_so3,
+    matrix_to_quat,
+    nearest_rotation,
+    pose_from,
+    quat_to_matrix,
+    slerp,
+)
 
 angle = st.floats(-3.1, 3.1)
 metre = st.floats(-1e3, 1e3)
@@ -109,3 +124,121 @@ def test_interpolation_turns_at_a_constant_rate_and_extrapolates():
         expected = g.pose_from(g.rot_z(0.2 + 0.4 * share), [1 + 2 * share, 2, 3 - 2 * share])
         np.testing.assert_allclose(T, expected, atol=1e-12)
         np.testing.assert_allclose(g.interpolate(start, end, share), expected, atol=1e-12)
+
+
+RNG = np.random.default_rng(3)
+VECTORS = np.concatenate(
+    [
+        RNG.normal(size=(200, 3)),
+        RNG.normal(size=(50, 3)) * 1e-7,
+        RNG.normal(size=(20, 3)) * 1e-12,
+        np.zeros((1, 3)),
+        np.pi * np.eye(3),
+        (np.pi - 1e-9) * np.eye(3),
+        -np.pi * np.eye(3)[::-1],
+        (np.pi / np.sqrt(2)) * np.array([[1.0, 1, 0], [0, -1, 1], [1, 0, -1]]),
+    ]
+)
+
+
+def test_exp_so3_matches_scipy():
+    np.testing.assert_allclose(exp_so3(VECTORS), Rotation.from_rotvec(VECTORS).as_matrix(), atol=1e-15)
+    for vector in VECTORS[-12:]:
+        np.testing.assert_allclose(exp_so3(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
+
+
+def test_quaternion_round_trip():
+    R = Rotation.from_rotvec(VECTORS).as_matrix()
+    q = matrix_to_quat(R)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-15)
+    theirs = Rotation.from_matrix(R).as_quat()
+    np.testing.assert_allclose(np.abs((q * theirs).sum(axis=1)), 1.0, atol=1e-14)
+    np.testing.assert_allclose(quat_to_matrix(q), R, atol=1e-14)
+    np.testing.assert_allclose(quat_to_matrix(-7.0 * q), R, atol=1e-14)
+    np.testing.assert_array_equal(matrix_to_quat(R[0]), q[0])
+    assert matrix_to_quat(R[:0]).shape == (0, 4)
+    assert quat_to_matrix(np.empty((0, 4))).shape == (0, 3, 3)
+
+
+def test_log_so3_matches_scipy():
+    R = Rotation.random(200, random_state=5)
+    np.testing.assert_allclose(log_so3(R.as_matrix()), R.as_rotvec(), atol=1e-9)
+    np.testing.assert_array_equal(log_so3(np.eye(3)), np.zeros(3))
+
+
+def test_slerp_matches_scipy():
+    R = Rotation.from_rotvec(VECTORS[:270]).as_matrix()
+    start, end, share = R[:-1], R[1:], RNG.random(len(R) - 1)
+    found = slerp(start, end, share)
+    for k in range(len(start)):
+        path = Slerp([0.0, 1.0], Rotation.from_matrix(R[k : k + 2]))
+        np.testing.assert_allclose(found[k], path(share[k]).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(slerp(start, end, np.zeros(len(start))), start, atol=1e-15)
+    np.testing.assert_allclose(slerp(start, end, np.ones(len(start))), end, atol=1e-13)
+    np.testing.assert_allclose(slerp(start[3], end[3], 0.25), slerp(start[3:4], end[3:4], [0.25])[0])
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3])
+def test_nearest_rotation_is_a_rotation(noise):
+    R = Rotation.from_rotvec(VECTORS).as_matrix()
+    found = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
+    np.testing.assert_allclose(found, R, atol=10 * noise + 1e-14)
+    assert (np.linalg.det(found) > 0).all()
+
+
+T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])
+
+
+def random_covariance(seed=0, scale=0.01):
+    A = np.random.default_rng(seed).standard_normal((6, 8)) * scale
+    return A @ A.T
+
+
+def exp_of(xi):
+    """The exponential by its definition, sixty times squared."""
+    A = np.zeros((4, 4))
+    A[:3, :3] = np.array([[0, -xi[2], xi[1]], [xi[2], 0, -xi[0]], [-xi[1], xi[0], 0]])
+    A[:3, 3] = xi[3:]
+    M = np.eye(4) + A / 2**20 + 0.5 * (A @ A) / 2**40
+    for _ in range(20):
+        M = M @ M
+    return M
+
+
+@pytest.mark.slow
+def test_body_axes_covariance_matches_sampled_motions():
+    """Samples drawn in the body's tangent scatter along the map's axes as the converted covariance says."""
+    body = random_covariance()
+    draws = np.random.default_rng(1).multivariate_normal(np.zeros(6), body, 20_000)
+    gaps = np.array([boxminus(T @ exp_se3(xi), T) for xi in draws[:4000]])
+    predicted = along_map(body, T)
+    sigma = np.sqrt(np.diag(predicted))
+    np.testing.assert_allclose(np.cov(gaps.T) / np.outer(sigma, sigma), predicted / np.outer(sigma, sigma), atol=0.06)
+
+
+def test_body_and_map_axes_conversions_are_inverse():
+    C = random_covariance(3)
+    np.testing.assert_allclose(along_body(along_map(C, T), T), C, atol=1e-16)
+    assert np.abs(along_map(C, T) - C).max() > 1e-5
+
+
+def test_gtsam_tangent_is_the_body_tangent():
+    import gtsam
+
+    xi = np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.1])
+    pose = gtsam.Pose3(T)
+    np.testing.assert_allclose(pose.retract(xi).matrix(), T @ exp_of(xi), atol=1e-9)
+    np.testing.assert_allclose(pose.localCoordinates(pose.retract(xi)), xi, atol=1e-12)
+    np.testing.assert_allclose(adjoint(T), pose.AdjointMap(), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 2.5, np.pi - 1e-6])
+def test_boxplus_and_boxminus_are_inverse(angle):
+    step = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, 2.0, -3.0])
+    np.testing.assert_allclose(boxminus(boxplus(T, step), T), step, atol=1e-9)
+
+
+def test_adjoint_moves_increment_to_the_other_side():
+    xi = np.array([0.1, -0.05, 0.2, 0.5, 0.3, -0.4])
+    np.testing.assert_allclose(T @ exp_of(xi), exp_of(adjoint(T) @ xi) @ T, atol=1e-6)

@@ -8,7 +8,8 @@ from fake_lidar_odometry import frame
 
 from coview_stream.config.odometry import LidarOdometryConfig, down, parse_gravity
 from coview_stream.errors import ConfigError
-from coview_stream.odometry.gravity import find_ground, level_rotation
+from coview_stream.geometry.transforms import rot_z
+from coview_stream.odometry.gravity import Surfaces, find_ground, gravity_from_walls, ground_plane, level_rotation
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2), (-0.3, 0.15)])
@@ -100,3 +101,92 @@ def test_accelerometer_sign_is_explained():
 def test_lidar_odometry_config_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError):
         LidarOdometryConfig(**wrong)
+
+
+TRUE = np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
+
+
+def wall_facing(normal, at, seed=0):
+    """Points of an upright wall; upright along TRUE, horizontal along what is square to both."""
+    rng = np.random.default_rng(seed)
+    n = normal - (normal @ TRUE) * TRUE
+    n /= np.linalg.norm(n)
+    along = np.cross(TRUE, n)
+    a, b = rng.uniform(-10, 10, (2, 3000))
+    return at * n + a[:, None] * along + 0.4 * b[:, None] * TRUE + rng.normal(0, 0.01, (3000, 3))
+
+
+def lean(up):
+    return np.degrees(np.arccos(np.clip(up @ TRUE, -1, 1)))
+
+
+GROUND = np.array([-0.03, 0.02, 1.0]) / np.linalg.norm([-0.03, 0.02, 1.0])  # the normal of a slope
+
+
+def test_two_walls_correct_a_slope():
+    cloud = np.concatenate([wall_facing(np.array([1.0, 0, 0]), 8.0), wall_facing(np.array([0, 1.0, 0]), -9.0)])
+    up, count = gravity_from_walls(cloud, GROUND)
+    assert lean(GROUND) > 5
+    assert lean(up) < 0.3
+    assert count > 15
+    assert np.linalg.norm(up) == pytest.approx(1.0)
+
+
+def test_one_wall_corrects_across_it_and_leaves_the_rest():
+    up, _ = gravity_from_walls(wall_facing(np.array([1.0, 0, 0]), 8.0), GROUND)
+    assert abs(up[0] - TRUE[0]) < 0.01
+    assert abs(up[1] - GROUND[1]) < 0.01
+
+
+def test_without_walls_gravity_is_unchanged():
+    flat = np.random.default_rng(0).uniform([-20, -20, -1.7], [20, 20, -1.69], (5000, 3))
+    up, count = gravity_from_walls(flat, GROUND)
+    assert np.allclose(up, GROUND)
+    assert count == 0
+    assert np.allclose(gravity_from_walls(np.empty((0, 3)), GROUND)[0], GROUND)
+
+
+def test_leaning_surfaces_are_outvoted_by_walls():
+    cloud = [wall_facing(np.array([1.0, 0, 0]), 8.0), wall_facing(np.array([0, 1.0, 0]), -9.0)]
+    cloud.append(wall_facing(np.array([1.0, 0, 0.2]), -8.0)[:600] @ _turn(10.0))
+    up, _ = gravity_from_walls(np.concatenate(cloud), GROUND)
+    assert lean(up) < 0.6
+
+
+def _turn(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+
+
+def test_walls_and_ground_of_a_tilted_frame_point_up(scene):
+    cloud, up = frame(scene, (0.05, -0.04))
+    around = Surfaces.around(cloud, np.array([0.0, 0.0, 1.0]), None)
+    seen = around.seen(rot_z(0.7) @ level_rotation(up))
+    assert np.degrees(np.abs(seen.walls).max()) < 0.2
+    assert np.degrees(np.abs(seen.ground).max()) < 0.3
+    assert np.degrees(np.sqrt(np.diag(seen.covariance)).max()) < 2.0
+    assert len(seen.rows()[1]) == 4
+
+
+def test_nothing_around_is_nothing_seen():
+    around = Surfaces.around(np.zeros((0, 3)), np.array([0.0, 0.0, 1.0]), None)
+    seen = around.seen(np.eye(3))
+    assert seen.walls is None
+    assert seen.ground is None
+    assert len(seen.rows()[1]) == 0
+    assert np.isfinite(seen.covariance).all()
+
+
+def test_ground_is_found_again_from_the_one_before(scene):
+    cloud, _ = frame(scene, (0.02, 0.0))
+    anew = ground_plane(cloud)
+    again = ground_plane(cloud, ground_plane(frame(scene)[0]))
+    assert np.degrees(np.arccos(np.clip(anew.up @ again.up, -1, 1))) < 0.3
+    assert abs(anew.height - again.height) < 0.03
+
+
+def test_ground_that_is_gone_is_searched_for_anew(scene):
+    cloud, up = frame(scene)
+    above = ground_plane(cloud + np.array([0.0, 0.0, -6.0]))  # a sensor that stood 6 m higher
+    found = ground_plane(cloud, above)
+    assert np.degrees(np.arccos(np.clip(found.up @ up, -1, 1))) < 0.3

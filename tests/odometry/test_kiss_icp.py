@@ -113,7 +113,7 @@ def test_no_input_aborts_the_process():
 
 @pytest.mark.slow
 def test_kiss_icp_still_aborts_without_the_input_check():
-    """If kiss-icp no longer aborts, the module docstring of odometry/kiss.py is to be rewritten."""
+    """If kiss-icp no longer aborts, the docstring in odometry/lidar_odometry.py is to be rewritten."""
     code, out, _ = said(ABORTS)
     if (code, out) == (0, "alive"):
         pytest.skip("this kiss-icp survives constant time stamps; the guard costs nothing")

@@ -1,4 +1,4 @@
-"""Recordings as runs: every storage, stamps of headers, deskewing, topics, and what cannot be read."""
+"""Recordings as runs: every storage, stamps of headers, deskewing, topics, mounts, and unreadable files."""
 
 from __future__ import annotations
 

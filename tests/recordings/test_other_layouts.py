@@ -31,7 +31,7 @@ def test_folder_of_sc_lio_sam(tmp_path):
     (tmp_path / "odom_poses.txt").write_text(rows(" ", POSES))
     run = open_run(tmp_path)
     assert run.stamps.tolist() == [100, 100.5, 101, 101.5, 102]
-    np.testing.assert_allclose(run.poses, POSES, atol=1e-8)  # odometry before what loops have closed
+    np.testing.assert_allclose(run.poses, POSES, atol=1e-8)  # odometry, not the poses after loop closure
     (tmp_path / "odom_poses.txt").unlink()
     np.testing.assert_allclose(open_run(tmp_path).poses, POSES[::-1], atol=1e-8)
 

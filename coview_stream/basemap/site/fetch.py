@@ -31,6 +31,9 @@ from coview_stream.errors import CloudError, MapError, TransportError, require_l
 
 _PIECE = 1 << 20
 
+log = logging.getLogger("coview_stream.maps")
+_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
+
 
 class SiteSource(Protocol):
     """Source of a site's bytes, which are untrusted.
@@ -170,11 +173,6 @@ def _body(answer: Any, limit: int, address: str) -> bytes:
 
 def _short(error: BaseException) -> str:
     return " ".join(str(error).split())[:160] or type(error).__name__
-
-
-log = logging.getLogger("coview_stream.maps")
-
-_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
 
 
 class Mirror:

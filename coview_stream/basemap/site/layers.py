@@ -42,6 +42,15 @@ _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "d
 PACKING: Mapping[str, Packing] = {"cloud": "bz2", "stations": "bz2", "features": "lzma"}
 """Compression of the arrays of each layer."""
 
+STEPS = 12
+"""Steps of a voxel's edge."""
+_CELLS = 64  # of the octahedral map, along each edge
+_PLANARITY = 15  # steps
+_MAX_LEVEL = 30_000  # voxels above or below zero
+_MAX_COLUMNS = 1 << 24
+Layer = dict[str, npt.NDArray[Any]]
+_MAX_BLOCK = 1 << 26  # blocks from the origin: 100,000 km
+
 
 def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
     """Return the bytes of arrays of small integers or float32; the same arrays give the same bytes."""
@@ -123,16 +132,6 @@ def _whole(content: bytes, wanted: int) -> npt.NDArray[np.uint8]:
 def _planes(array: npt.NDArray[Any]) -> bytes:
     """Return an array's bytes, the lowest byte of all numbers first: the others of small numbers are alike."""
     return array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()
-
-
-STEPS = 12
-"""Steps of a voxel's edge."""
-_CELLS = 64  # of the octahedral map, along each edge
-_PLANARITY = 15  # steps
-_MAX_LEVEL = 30_000  # voxels above or below zero
-_MAX_COLUMNS = 1 << 24
-
-Layer = dict[str, npt.NDArray[Any]]
 
 
 def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: float, voxel: float) -> Layer:
@@ -229,9 +228,6 @@ def _directions(cells: npt.NDArray[np.uint8]) -> Floats32:
     normal = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
     return normal.astype(np.float32)
-
-
-_MAX_BLOCK = 1 << 26  # blocks from the origin: 100,000 km
 
 
 def stations_layer(stations: Floats32, block: float) -> Layer:

@@ -40,6 +40,15 @@ _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
 _PURPOSE = b"site manifest\n"
 
+TILE = 320.0
+"""Edge of a tile, metres: a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)."""
+HALO = 64.0
+"""Metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin."""
+FEATURE_HALO = 112.0
+"""Metres around a tile whose points affect its learned features: 64 for the network, 48 for the ground below these."""
+PART_SUFFIX = ".tiles"
+_FORMAT = "coview-part"
+
 
 @dataclass(frozen=True)
 class LayerEntry:
@@ -259,16 +268,6 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-TILE = 320.0
-"""Edge of a tile, metres: a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)."""
-
-HALO = 64.0
-"""Metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin."""
-
-FEATURE_HALO = 112.0
-"""Metres around a tile whose points affect its learned features: 64 for the network, 48 for the ground below these."""
-
-
 @dataclass(frozen=True)
 class SiteGrid:
     """Grid of a site's tiles, and settings of their build.
@@ -309,10 +308,6 @@ def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, fl
     middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
     x, y = (math.floor(float(value) / TILE) * TILE for value in middle[:2])
     return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0
-
-
-PART_SUFFIX = ".tiles"
-_FORMAT = "coview-part"
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,11 @@ from coview_stream.errors import ConfigError, MapError
 SHA256 = re.compile(r"[0-9a-f]{64}")
 _FOLDER = "layers"
 
+_GB = 1e9
+_MAX_GB = 20.0
+_MAX_RECORD = 1 << 24  # bytes
+_MARK = ".checked"  # suffix of the record of a file that has been compared with its checksum
+
 
 def layer_path(sha256: str) -> str:
     """Return the path of a layer relative to its site's directory; MapError if ``sha256`` is no hash."""
@@ -106,12 +111,6 @@ class TileStore:
         for path in self.folder.glob("[0-9a-f][0-9a-f]/*"):
             if SHA256.fullmatch(path.name) and path.name not in hashes:
                 path.unlink(missing_ok=True)
-
-
-_GB = 1e9
-_MAX_GB = 20.0
-_MAX_RECORD = 1 << 24  # bytes
-_MARK = ".checked"  # suffix of the record of a file that has been compared with its checksum
 
 
 def cache_folder() -> Path:

@@ -12,11 +12,11 @@ from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from
 
-_WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next three
+_WORTH_TELLING = math.radians(0.5)  # lean of a sensor beyond which a clause says so; the next three likewise
 _SCALE = 0.01
 _TURN = math.radians(0.05)  # per metre
 _GROUND = 0.1  # metres
-_MOVED_TILT = math.radians(1.0)  # sigmas of what was known of a robot before it was out of sight; set by hand
+_MOVED_TILT = math.radians(1.0)  # sigmas of a calibration from before the robot was out of sight
 _MOVED_SCALE = 0.02
 _MOVED_TURN = math.radians(0.02)  # per metre
 
@@ -28,7 +28,7 @@ class Calibration:
     Attributes:
         roll: radians about the body's x by which clouds have to be turned to agree with odometry's gravity.
         pitch: radians about the body's y, likewise.
-        scale: what odometry's distances have to be multiplied with, less one.
+        scale: factor that corrects odometry's distances, less one.
         turn: radians per metre driven that odometry's heading has to be turned by.
         sigma_tilt: radians, one sigma, each of roll and pitch.
         sigma_scale: of the scale.
@@ -61,7 +61,7 @@ class Calibration:
         return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
     def describe(self, mount: Mount | None = None) -> list[str]:
-        """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
+        """Describe the corrections in plain words, a clause each; none where sensor and odometry are right.
 
         Signs are those of ``--mount``. ``mount`` is the one that clouds have been read with already.
         """
@@ -76,8 +76,8 @@ class Calibration:
             beyond = "" if mount is None or mount == Mount() else " beyond its mount"
             said.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; set --mount={option} to silence this")
         if abs(self.scale) >= _SCALE:
-            what = "short" if self.scale > 0 else "long"
-            said.append(f"odometry measures {abs(self.scale):.1%} too {what}: corrected")
+            size = "short" if self.scale > 0 else "long"
+            said.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")
         if abs(self.turn) >= _TURN:
             side = "left" if self.turn < 0 else "right"
             said.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
@@ -98,7 +98,7 @@ class Calibration:
         )
 
     def to_json(self, mount: Mount | None = None) -> dict[str, Any]:
-        """Plain data: degrees, metres, factors, and what :meth:`describe` says of it."""
+        """Plain data: degrees, metres, factors, and the clauses of :meth:`describe`."""
         deg = math.degrees
         return {
             "roll_deg": round(deg(self.roll), 2),

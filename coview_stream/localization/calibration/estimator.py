@@ -1,9 +1,9 @@
-"""Estimation of the calibration: a Kalman filter over what is constant about a robot, or nearly so.
+"""Estimation of the calibration: a Kalman filter over a robot's constants, or nearly so.
 
 The state is x = (roll, pitch, s, w, g): the tilt of the sensor against odometry's gravity, the scale of odometry's
-distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2). It is what is
-left of the pose graph's errors when those that are independent from step to step
-(:class:`coview_stream.localization.tracking.motion.Drift`) are taken away. Each registration to the map that is
+distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2): the errors
+of the pose graph but for those that are independent from step to step
+(:class:`coview_stream.localization.tracking.motion.Drift`). Each registration to the map that is
 believed measures two things:
 
 * its attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the tilt
@@ -32,7 +32,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 
 
 class _Prior(NamedTuple):
-    """What is known of a group of components before anything is seen; all set by hand.
+    """Prior of a group of components; all set by hand.
 
     Attributes:
         axes: of the state.
@@ -57,11 +57,15 @@ _GROUPS = (_TILT, _SCALE, _TURN)  # that are corrected
 _WIDE = np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide) for g in (*_GROUPS, GRAVITY)])
 SIZE = len(_WIDE)
 """Components of the state."""
-_FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
+_FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
 
-class Belief:
+class CalibrationBelief:
     """Gaussian over the state x = (roll, pitch, s, w, g), heavy-tailed where measurements contradict it.
+
+    Most sensors stand straight and most odometry has the right scale. So each group of the state is a mixture: zero but
+    for a small spread, or anything up to a large one; the mean of both is applied, weighed by their probabilities
+    (Savage and Dickey's ratio, eq. C3).
 
     Attributes:
         x: (6,) mean.
@@ -75,14 +79,14 @@ class Belief:
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
-    def copy(self) -> Belief:
+    def copy(self) -> CalibrationBelief:
         """Return the same belief, to be changed on its own."""
-        other = Belief(self._sensor_leans)
+        other = CalibrationBelief(self._sensor_leans)
         other.x, other.P = self.x.copy(), self.P.copy()
         return other
 
     def restore(self, known: Calibration) -> None:
-        """Begin with what was known of this robot before."""
+        """Begin with an earlier calibration."""
         self.x = np.array([known.roll, known.pitch, known.scale, known.turn, 0.0, 0.0])
         self.P = np.diag(_WIDE**2)
         sigmas = [known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]
@@ -90,7 +94,7 @@ class Belief:
         self._stand_straight()
 
     def learn(self, known: Calibration) -> None:
-        """Take over what was known of this robot before, as far as it is known better than here."""
+        """Take over an earlier calibration as far as it is better known than the present one."""
         own = self.applied()
         values = np.array([known.roll, known.pitch, known.scale, known.turn])
         sigmas = (known.sigma_tilt, known.sigma_scale, known.sigma_turn)
@@ -103,7 +107,7 @@ class Belief:
         self._stand_straight()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
+        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
         self.x[GRAVITY.axes] = 0.0
         self.P[GRAVITY.axes], self.P[:, GRAVITY.axes] = 0.0, 0.0
         self.P[GRAVITY.axes, GRAVITY.axes] = np.eye(2) * GRAVITY.wide**2
@@ -116,7 +120,7 @@ class Belief:
         self._stand_straight()
 
     def doubt_tilt(self, seen: Floats, H: Floats, R: Floats) -> None:
-        """Widen a tilt that a measurement contradicts by far: it is as probably right as what the state came from."""
+        """Widen a tilt that a measurement contradicts by far: it is as probably right as the measurements before."""
         gap, spread = seen - H @ self.x, H @ self.P @ H.T + R
         factor = heavier(float(gap @ np.linalg.solve(spread, gap)), len(gap))
         widest = _TILT.wide**2 / max(float(self.P[0, 0]), float(self.P[1, 1]), 1e-30)
@@ -152,7 +156,7 @@ class Belief:
         return Calibration(*means.tolist(), *sigmas)
 
     def _stand_straight(self) -> None:
-        """Know for sure that the sensor does not lean, if it cannot: then what leans is odometry's gravity."""
+        """Know for sure that the sensor does not lean, if it cannot: then odometry's gravity leans."""
         if not self._sensor_leans:
             self.x[:2] = 0.0
             self.P[:2], self.P[:, :2] = 0.0, 0.0
@@ -180,53 +184,53 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
 
 
 def heavier(distance: float, size: int) -> float:
-    """Return what a variance is to be multiplied with under Student's t distribution.
+    """Return the factor on a variance under Student's t distribution.
 
     Args:
-        distance: squared Mahalanobis distance of what was measured.
-        size: how many numbers that were.
+        distance: squared Mahalanobis distance of the measurement.
+        size: its number of components.
     """
     return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
 
-_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own; set by hand
-_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch; set by hand
-_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else; set by hand
+_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own
+_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch
+_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else
 
 
 class CalibrationEstimator:
     """Estimate of the calibration, and the correction of clouds and odometry by it.
 
     Attributes:
-        calibration: what is applied.
+        calibration: the applied one.
     """
 
     def __init__(self, sensor_leans: bool = True) -> None:
         """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
-        self._known = Belief(sensor_leans)
-        self._supposed: Belief | None = None  # the same if a place that leads a search is the right one
+        self._known = CalibrationBelief(sensor_leans)
+        self._supposed: CalibrationBelief | None = None  # the same if a place that leads a search is the right one
         self._probability = 0.0  # that it is
         self._apply()
 
     def restore(self, known: Calibration) -> None:
-        """Begin with what was known of this robot before; it goes on being measured."""
+        """Begin with an earlier calibration; it goes on being measured."""
         self._supposed = None
         self._known.restore(known)
         self._apply()
 
     def learn(self, known: Calibration) -> None:
-        """Take over what was known of this robot before, as far as it is known better than here."""
+        """Take over an earlier calibration as far as it is better known than the present one."""
         self._supposed = None
         self._known.learn(known)
         self._apply()
 
     def forget_leader(self) -> None:
-        """Forget what was supposed of a place that led a search."""
+        """Forget the supposition by a place that led a search."""
         self._supposed = None
         self._apply()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
+        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
         self._supposed = None
         self._known.begin_odometry()
         self._apply()
@@ -330,13 +334,13 @@ class CalibrationEstimator:
             self.calibration = mixed(self.calibration, self._supposed.applied(), self._probability)
 
 
-def _measure_attitude(belief: Belief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
+def _measure_attitude(belief: CalibrationBelief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
     R_body_cloud = belief.applied().R_body_cloud
     left = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
     left[2] = 0.0
     seen = log_so3(exp_so3(left) @ R_body_cloud)[:2]
     H = np.eye(2, SIZE)
-    H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # what leans with odometry's frame turns as the body does
+    H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # the lean of odometry's frame turns with the body
     R = np.eye(2) * (variance + _ATTITUDE**2)
     belief.doubt_tilt(seen, H, R)
     belief.update(seen, H, R)

@@ -1,4 +1,4 @@
-"""Motion from frame to frame by the lidar alone, before any place is known: what it says of sensor and odometry.
+"""Motion from frame to frame by the lidar alone, before any place is known, as a measurement of sensor and odometry.
 
 The newest keyframe is registered to the one before. With ε the tilt of the sensor that is not corrected yet, t and R
 odometry's motion in the body's axes, s and w as in :mod:`coview_stream.localization.calibration.estimator`, the
@@ -35,7 +35,7 @@ _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the reg
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
 _FREE_METRE = 0.1  # sigmas by which the motion may differ from odometry's, and metres more per metre driven
 _POSITION = 0.02  # sigma of a registered motion, metres
-_POSITION_METRE = 0.01  # and per metre driven: what three real runs at two to eight metres a step show
+_POSITION_METRE = 0.01  # and per metre driven: as in three real runs at two to eight metres a step
 _ANGLE = math.radians(0.2)  # likewise
 _HEADING = math.radians(1.0)  # sigma of the heading of the sensor on the body
 _POORER = 3.0  # times odometry may drift as it is known to, or configured

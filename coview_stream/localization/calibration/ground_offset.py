@@ -30,26 +30,26 @@ _OFFSETS = 0.02 * np.arange(-25, 26)  # metres that an offset may have
 _REACH = 0.5  # metres to a map point
 _WIDTH = 0.15  # metres off its plane at which a point is half as good
 _POINTS = 400  # of each kind that are compared
-_PATCH = 4.0  # metres: what stands in a patch is one observation
+_PATCH = 4.0  # metres: a patch of structure is one observation
 _FEW = 4  # points of a patch; fewer say nothing
 _CHANCE = 0.1  # share of a patch that fits anywhere
 _NONE = 0.98  # prior probability of none: 0.9 left drives through changed campuses (bench tracking) 0.1 m off in height
 _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
 _VIEWED = 0.07  # metres, one sigma, by which structure seen from below differs in height from that seen from above
 _INDEPENDENT = 0.3  # observations for each patch: neighbours err alike
-_KEPT = 0.9  # of what earlier registrations told, from one to the next
+_KEPT = 0.9  # weight of earlier registrations, from one to the next
 _FOLLOWED = 0.25  # of a change, at each registration but the first ones: the height follows it smoothly
 _STILL, _CHANGED = 0.6, 0.1  # probability that an offset known before is still there; metres by which it may be another
 
 
-# what has grown since the survey looks as if the ground had sunk: a nuisance, summed over; set by hand
+# growth since the survey looks as if the ground had sunk: a nuisance, summed over
 _HEIGHTS, _PARTS = 0.1 * np.arange(1, 7), (0.5, 1.0)  # metres of growth, share of the patches
 _GROWTHS = np.array([(0.0, 0.0), *((height, part) for height in _HEIGHTS for part in _PARTS)])
 _GROWN = 0.5  # prior probability of any growth
 
 
 class GroundOffset:
-    """What registrations have told of the ground offset at one site.
+    """Estimate of the ground offset at one site, from registrations.
 
     Attributes:
         metres: the robot's ground above the survey's, as it is corrected for.
@@ -78,7 +78,7 @@ class GroundOffset:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what has been learned: the place is another."""
+        """Forget the registrations: the place is another."""
         self._told, self._views = np.zeros((len(_GROWTHS), len(_OFFSETS))), 0
         self.metres = self._weigh()
 
@@ -90,7 +90,7 @@ class GroundOffset:
         """Learn from a registration that is believed.
 
         Args:
-            cloud: what was registered, lowered or not.
+            cloud: the registered one, lowered or not.
             T_map_source: (4, 4) where.
             target: the map around it.
         """
@@ -102,7 +102,7 @@ class GroundOffset:
         self.metres += max(_FOLLOWED, 1.0 / self._views) * (self._weigh() - self.metres)
 
     def _weigh(self) -> float:
-        """Weigh the hypotheses by what has been told; return the mean of the more probable one, metres."""
+        """Weigh the hypotheses by the registrations; return the mean of the more probable one, metres."""
         likelihoods = _blurred(_GROWTH_PRIOR @ np.exp(self._told - self._told.max()))
         some, none = likelihoods * self._some, likelihoods * self._none
         self.probability = float(some.sum() / (some.sum() + none.sum()))

@@ -14,18 +14,18 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, rotation_angle
 from coview_stream.localization.calibration.calibration import RawScan
 
-_PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
+_PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points
 _RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
-_PARTS = 3  # in which the points of keyframes are gathered; set by hand
-_SMEARED = np.radians(1.0)  # keyframes that lean by less are not gathered again; set by hand
+_PARTS = 3  # in which the points of keyframes are gathered
+_SMEARED = np.radians(1.0)  # keyframes that lean by less are not gathered again
 
-# of OdometryCheck
-_VOXEL = 1.0  # metres; set by hand
-_STRIDE = 2.0  # metres between the frames that others are compared with; set by hand
-_POINTS = 2000  # of a frame, compared; set by hand
-_MIN_POINTS = 300  # of a frame that is judged; set by hand
-_MIN_SHARE = 0.22  # set by hand, from the shares in the class docstring, which no command prints
-_PATIENCE = 3  # frames in a row: one may be dust; set by hand
+# of OdometryCheck; set by hand
+_VOXEL = 1.0  # metres
+_STRIDE = 2.0  # metres between the frames that others are compared with
+_POINTS = 2000  # of a frame, compared
+_MIN_POINTS = 300  # of a frame that is judged
+_MIN_SHARE = 0.22  # by the shares in the class docstring, which no command prints
+_PATIENCE = 3  # frames in a row: one may be dust
 _BITS = 21  # of a coordinate in a voxel's key
 
 

@@ -12,13 +12,13 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rotation_angle
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
-SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
+_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift
+SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
 SAME_ANGLE = float(np.radians(5.0))  # likewise
 
 
 class Epoch(NamedTuple):
-    """Number of what belongs together in time: scans and poses of one odometry frame, between two losses.
+    """Period within which scans and poses belong together: one odometry frame, between two losses.
 
     Attributes:
         odometry: number of the odometry frame, as the caller counts them.
@@ -57,12 +57,12 @@ class SearchRequest:
         stamp: seconds, of the keyframe.
         T_odom_body: (4, 4) of the keyframe.
         scan: (N, 3) float32 virtual local scan, odometry frame, metres; empty if no descriptor is made of it.
-        submap: (N, 3) float32 points of the newest keyframes, odometry frame: what is registered.
+        submap: (N, 3) float32 points of the newest keyframes, odometry frame: to be registered.
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
         epoch: of the localizer's memory; a request of another epoch starts the search from nothing.
-        hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
-        guesses: (4, 4) each, ``T_map_odom`` of a place that somebody named, heights open: tried like what votes name.
+        hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged like the votes' hypotheses.
+        guesses: (4, 4) each, ``T_map_odom`` of a place that somebody named, heights open: tried likewise.
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
         R_body_cloud: (3, 3) rotation that ``cloud`` has been levelled by.

@@ -53,9 +53,13 @@ def find_rivals(
 ) -> list[Rival]:
     """Return the most probable poses beside a registered one (4, 4) that do not lead back there; perhaps none.
 
+    Registration starts where odometry leads. After a slip that is beside the right place, and a wall that was moved
+    since the survey may hold it there. So the map is looked up on rings of poses around, and the most probable one is
+    registered, too: a place has to explain the scan better than the best of those.
+
     Args:
-        place: what is known of how the map explains scans here.
-        scan: what was registered.
+        place: how well the map usually explains scans here.
+        scan: the registered one.
         T_map_odom: (4, 4) where.
         target: the map around it.
         config: of the registration.
@@ -103,7 +107,7 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
     return np.asarray(pose + np.concatenate([around + np.array([0.0, 0.0, 0.0, turn]) for turn in turns]))
 
 
-_MAX_RIVALS = 2  # that are looked for where something is wrong; set by hand
+_MAX_RIVALS = 2  # that are looked for where something is wrong
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,7 @@ class MapMatch:
         T_map_body: (4, 4) as the map alone has it.
         covariance: (6, 6) of that, over (rx, ry, rz, x, y, z) along the map's axes.
         innovation: squared Mahalanobis distance from where the graph predicts the pose.
-        scan: what was registered; None where nothing could be.
+        scan: the registered one; None where registration failed.
         target: the map around it; None likewise.
         rivals: poses metres beside it, the most probable first, as far as they were looked for.
         moves_place: it contradicts odometry, and is believed in its place.
@@ -144,9 +148,9 @@ class MapMatcher:
     Attributes:
         base_map: knows where it has been surveyed.
         config: of registration and acceptance.
-        place: what a scan says of the place, against chance.
+        place: evidence of a scan for the place, against chance.
         dispute: which place is right while odometry is contradicted.
-        baseline: usual shares, by which people are told what is missing.
+        baseline: usual shares, for reasons in words.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
@@ -157,7 +161,7 @@ class MapMatcher:
         self.baseline = EvidenceBaseline()
 
     def clear(self) -> None:
-        """Forget what is usual: the place is another."""
+        """Forget the usual shares: the place is another."""
         self.place.clear()
         self.baseline.clear()
 
@@ -173,7 +177,7 @@ class MapMatcher:
         """Register (eq. 13), verify and judge; where registration fails, the belief stays.
 
         Args:
-            scan: what to register.
+            scan: to be registered.
             belief: pose and covariance that it starts from, and that take part in it as a prior.
             target: the map around it.
             scales: largest correspondence distance of each scale, metres.
@@ -215,8 +219,8 @@ class MapMatcher:
         """Match again, from a wide belief and from the best rival of a match, and hold all against each other.
 
         Args:
-            first: what may be wrong.
-            scan: what to register.
+            first: the match in doubt.
+            scan: to be registered.
             belief: wide enough for a slip.
             target: the map around it.
             predicted: as for :meth:`match`.
@@ -248,7 +252,7 @@ class MapMatcher:
 
         Args:
             match: the best of ``tries``.
-            scan: what was registered.
+            scan: the registered one.
             tries: all matches of the scan.
             led: (4, 4) where odometry leads, or a match that did not contradict it.
             belief: pose and covariance that odometry leads to.
@@ -301,7 +305,7 @@ class MapMatcher:
         return replace(match, verdict=verdict)
 
     def _judge(self, seen: Observation, evidence: Evidence) -> tuple[RejectionReason, str]:
-        """Return what a scan says of a pose: a cause, and a clause."""
+        """Judge a scan at a pose: a cause, and a clause."""
         if seen.against_elsewhere > 0.0:
             return RejectionReason.VERIFIED, "verified"
         if seen.ratio > 0.0:

@@ -1,4 +1,4 @@
-"""Monitoring a place while tracking: how probable it is that the robot is elsewhere, and what follows from that.
+"""Monitoring a place while tracking: how probable it is that the robot is elsewhere, and the consequences.
 
 Two hypotheses are compared: the robot is where it is tracked, or it is not (odometry has jumped, it has been carried,
 the place was wrong from the beginning). Each registration weighs them by its log-likelihood ratio
@@ -28,27 +28,27 @@ PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displ
 _PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
 _UNSEEN = 5e-4  # while nothing was known of the robot
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
-_OFF_MAP = 0.3  # of what is seen on the map: less is told as such, it decides nothing; set by hand
-_NEWEST_SHARE = 0.2  # of new shares in what is usual: about the last five registrations; set by hand
+_OFF_MAP = 0.3  # share of the scan on the map below which the reason says so; decides nothing
+_NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: about the last five registrations
 
 
 class RejectionReason(StrEnum):
-    """Reason of a verdict on a registration while tracking; docs/tracking.md says what an operator can do about it."""
+    """Reason of a verdict on a registration while tracking; docs/tracking.md has the remedies."""
 
     VERIFIED = "verified"
     """Nothing speaks against the place."""
     BLIND = "blind"
     """Too few points: the sensor is covered, or nothing is within its reach."""
     OFF_MAP = "off-map"
-    """The robot sees what the map does not cover."""
+    """The scan lies where the map has no data."""
     TILT = "tilt"
     """The pose leans against gravity."""
     FITNESS = "fitness"
-    """What stands above the ground is not where the map has it."""
+    """Structure above the ground is not where the map has it."""
     GROUND = "ground"
     """The ground is not where the map has it."""
     FREE_SPACE = "free-space"
-    """Rays passed through what the map shows."""
+    """Rays passed through structure of the map."""
     ODOMETRY = "odometry"
     """The place fits, but not where odometry says that the robot has moved."""
 
@@ -62,11 +62,11 @@ class MatchVerdict:
     """The verdict on one registration.
 
     Attributes:
-        cause: what decided.
+        cause: of the decision.
         reason: one clause for people.
         evidence: of the registered pose; None where nothing could be registered.
         innovation: squared Mahalanobis distance to the prediction; None likewise.
-        observation: what the scan says of that pose, against chance; None likewise.
+        observation: likelihood of the scan at that pose, against chance; None likewise.
     """
 
     cause: RejectionReason
@@ -92,7 +92,7 @@ class MatchVerdict:
 
 
 class EvidenceBaseline:
-    """The usual shares of the last metres, by which people are told what is missing, and the protection level widens.
+    """The usual shares of the last metres, for reasons in words and for the width of the protection level.
 
     Attributes:
         usual: running average; None before the first registration.
@@ -114,13 +114,13 @@ class EvidenceBaseline:
         self.usual = Evidence(**{n: before[n] + _NEWEST_SHARE * (now[n] - before[n]) for n in now})
 
     def fallen(self, evidence: Evidence) -> float:
-        """Return how many times better what is usual is than ``evidence``: 1 at least."""
+        """Return how many times better the usual shares are than ``evidence``: 1 at least."""
         if self.usual is None:
             return 1.0
         return max(1.0, self.usual.score / evidence.score) if evidence.score > 0 else math.inf
 
     def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
-        """Return the cause of poor evidence, the share that has fallen furthest below what is usual, and a clause."""
+        """Return the cause of poor evidence, the share that has fallen furthest below the usual one, and a clause."""
         usual = self.usual
         structure = evidence.near * evidence.covered / ((usual.near * usual.covered if usual else 0.0) or 0.25)
         ground = evidence.ground / ((usual.ground if usual else 0.0) or 1.0)
@@ -140,7 +140,7 @@ class EvidenceBaseline:
 
 
 class Ruling(NamedTuple):
-    """What a registration means for the place, after those before it.
+    """Consequence of a registration for the place, after the earlier ones.
 
     Attributes:
         event: for the robot's state; None: nothing.
@@ -158,8 +158,8 @@ class Ruling(NamedTuple):
 class LossMonitor:
     """Odds that the place is wrong, from registration to registration.
 
-    What speaks against the place adds up, a view at a time: registrations within ``TrackingConfig.distance`` of each
-    other are one view, of which the newest counts. What speaks for it does not: a place that fits by chance goes on to
+    Evidence against the place adds up, a view at a time: registrations within ``TrackingConfig.distance`` of each
+    other are one view, of which the newest counts. Evidence for it does not: a place that fits by chance goes on to
     fit, so that one view has to make up for all that was said against the place.
     """
 
@@ -185,7 +185,7 @@ class LossMonitor:
             self._before, self._odds = self._before + _UNSEEN, self._odds + _UNSEEN
 
     def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> Ruling:
-        """Return what a registration at ``travelled`` metres means for the place."""
+        """Return the consequence for the place of a registration at ``travelled`` metres."""
         self._weigh(verdict, stamp, travelled)
         wrong = self._odds / (1.0 + self._odds)
         if self._odds >= 1.0:
@@ -216,7 +216,7 @@ class LossMonitor:
         return Ruling(Event.MATCH_REJECTED, reason, wrong, False)
 
     def _weigh(self, verdict: MatchVerdict, stamp: float, travelled: float) -> None:
-        """Move the odds on by what was driven since the newest registration, and by what this one says."""
+        """Update the odds by the metres driven since the newest registration and by this one's evidence."""
         waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
         self._newest = stamp, travelled
         prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
@@ -227,7 +227,7 @@ class LossMonitor:
             return
         if travelled - self._viewed_at >= self._tracking.distance:
             self._viewed_at = travelled
-            # what spoke against the place stays; what spoke for it is not counted twice
+            # evidence against the place stays; evidence for it is not counted twice
             self._before = max(self._before, self._odds)
         ratio = float(np.logaddexp(math.log1p(-_NOTHING) + verdict.ratio, math.log(_NOTHING)))
         self._odds = self._before * math.exp(-ratio)

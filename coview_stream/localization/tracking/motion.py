@@ -21,7 +21,7 @@ from coview_stream.localization.calibration.estimator import CalibrationEstimato
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 MAX_FRAMES = 40
-"""Frames whose points are held; set by hand."""
+"""Frames whose points are held."""
 _OWN_NOISE = 0.4
 """Share of two neighbouring registrations' variances that is in their difference; the rest they have in common.
 
@@ -114,7 +114,7 @@ class DriftEstimator:
             rows = list(axes)
             if driven < _MIN_STEP and rows != [2]:
                 continue  # turning on the spot tells of the heading alone
-            # a turn on the spot says of the heading what metres of driving do
+            # for the heading, a turn on the spot is worth metres of driving
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
             # by how much it can tell: a registration that hardly knows a direction says nothing of its drift
             weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
@@ -162,7 +162,7 @@ class OdometryTracker:
     """
 
     def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
-        """Begin with the configured rates; ``calibration`` learns what is no random walk."""
+        """Begin with the configured rates; ``calibration`` learns the systematic part."""
         self.travelled = 0.0
         self.pose: Pose | None = None
         self._calibration = calibration

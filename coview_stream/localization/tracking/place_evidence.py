@@ -2,8 +2,8 @@
 
 In a search nothing is known of how much of the site is as the map has it, of what the survey shows of it, and of how
 foliage lets rays through: these are summed over, and so they are here at first, evenly. A robot that has been here for
-some metres knows them, for they change slowly along its way: what was learned at one registration, spread a little, is
-presumed at the next. So what is usual here is part of the likelihood (docs/integrity.md, eq. 6): explaining half of
+some metres knows them, for they change slowly along its way: those learned at one registration, spread a little, are
+presumed at the next. So the usual shares are part of the likelihood (docs/integrity.md, eq. 6): explaining half of
 the scan speaks for a place in a street where half of everything has changed, and against it where nearly all was
 explained a metre before.
 """
@@ -34,7 +34,7 @@ _BESIDE = 0.5  # of a place that is wrong: that the right one lies metres beside
 
 @dataclass(frozen=True)
 class Observation:
-    """What a scan says of a pose.
+    """Evidence of a scan for a pose.
 
     Attributes:
         ratio: log-likelihood ratio of "the robot is here" against chance.
@@ -62,7 +62,7 @@ class _Around(NamedTuple):
 
 
 class PlaceEvidence:
-    """What registrations have told of the nuisances at one place, and what a scan says of it by that."""
+    """Belief over the nuisances at one place, from registrations, and the evidence of a scan given them."""
 
     def __init__(self, base_map: BaseMap) -> None:
         self._base_map = base_map
@@ -70,11 +70,11 @@ class PlaceEvidence:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what is known: the place is another."""
+        """Forget the nuisances: the place is another."""
         self._known = np.full(NUISANCES, 1.0 / np.prod(NUISANCES))
 
     def observe(self, scan: ObservedScan, T_map_odom: Pose) -> Observation:
-        """Return what a scan, put there by a pose (4, 4), says of it; changes nothing."""
+        """Return the evidence of a scan at a pose (4, 4); changes nothing."""
         likelihoods = self._likelihoods(scan, T_map_odom[None])
         return Observation(float(self._ratios(likelihoods)[0]), likelihoods[0])
 

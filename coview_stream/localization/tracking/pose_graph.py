@@ -11,11 +11,10 @@ Only the newest pose is asked for, where filtering and smoothing are the same; s
 registration be weighed again in the light of later ones.
 
 The memory is bounded: a graph that has grown to ``restart`` keyframes is begun anew with the newest ``window`` of them.
-In place of the past stands the *filtering* belief of the first that stays: what was known when that keyframe was the
-newest, from everything before and at it. For a chain this is exact up to linearisation: the past meets the future in
-that one pose. The smoothed belief would be wrong there, as it holds already the later measurements that stay in the
-graph, which would then count twice. (gtsam's own fixed-lag smoother is known to leak and to lose keys: gtsam issues
-1452, 1638 and 1935.)
+The past is replaced by the *filtering* belief of the first of them: the belief when it was the newest, from all before
+it. For a chain this is exact up to linearisation, as past and future meet in that one pose. The smoothed belief would
+be wrong, for it holds the later measurements that stay in the graph: they would count twice. (gtsam's own
+fixed-lag smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class _Keyframe:
         T: (4, 4) ``T_map_body``, where it is linearised or first was.
         between: this body in the frame of the one before; None for the first.
         corrections: measured poses in the map.
-        filtered: what was believed when it was the newest; None while it is.
+        filtered: belief when it was the newest; None while it is.
     """
 
     T: Pose
@@ -183,7 +182,7 @@ class PoseGraph:
         return self._keyframes[-1]
 
     def _belief(self) -> _Gaussian:
-        """Return what is believed of the newest keyframe, solved for when asked the first time."""
+        """Return the newest keyframe's pose and covariance; solves at the first call."""
         self._newest()
         if self._newest_belief is None:
             self._update()
@@ -220,7 +219,7 @@ class PoseGraph:
         self._update()
 
     def _update(self) -> None:
-        """Give iSAM2 the new factors and values, and linearise again what they move."""
+        """Give iSAM2 the new factors and values, and linearise again the poses that they move."""
         self._isam.update(self._factors, self._values)
         self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
         for _ in range(_MAX_UPDATES):

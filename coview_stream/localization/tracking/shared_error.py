@@ -44,7 +44,7 @@ class SharedErrorModel:
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the clustered sigma, and what the pairs do not show.
+        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the clustered sigma, and other errors.
 
         The latter is above all that odometry's roll and pitch tremble from frame to frame.
         """
@@ -61,7 +61,7 @@ def clustered_covariance(
     """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None if too little was seen.
 
     Args:
-        source: what was registered.
+        source: the registered points.
         T_map_source: (4, 4) where.
         target: the map around it.
         pivot: (3,) source-frame point that rotations are about.
@@ -87,7 +87,7 @@ def clustered_covariance(
     A = (J * weight[:, None]).T @ J + 1e-6 * np.eye(6)
     loose = weights[chosen] * (1.0 - planarity)
     loose /= kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / config.residual_scale**2
-    for axis in np.eye(3, dtype=np.float32):  # what forms no surface tells of all three directions
+    for axis in np.eye(3, dtype=np.float32):  # points without a surface constrain all three directions
         J = np.concatenate([np.cross(arm, axis), np.broadcast_to(axis, arm.shape)], axis=1).astype(np.float64)
         gradient += J * (loose * (gap @ axis))[:, None]
         A += (J * loose[:, None]).T @ J

@@ -1,9 +1,9 @@
-"""Evidence of a slip: whether odometry has slipped, or the registration is drawn to something that was moved.
+"""Evidence of a slip or of a displaced robot, between two registrations and where they contradict odometry.
 
 A registration may fit, and yet not lie where odometry leads. Either odometry is wrong (wheels slip, the robot is
 pushed), and the robot is where the lidar sees it; or odometry is right, and a building or a stack of containers stands
 a metre off where it was surveyed. The scans themselves decide, by how much better they are explained at the one place
-than at all others: the ratio of their likelihoods, with what is usual here taken into account.
+than at all others: the ratio of their likelihoods, given the usual shares of this place.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def matters(metres: float, degrees: float) -> bool:
 
 
 class Dispute:
-    """Places that may be the right one while odometry is contradicted, and what the scans since then say of each.
+    """Places that may be the right one while odometry is contradicted, and the scans' evidence for each since then.
 
     The first is where odometry leads. Scans of one view (a metre) tell the same: of each the newest counts, and views
     add up. All are as likely beforehand; a place that is seen later begins like the first.
@@ -59,7 +59,7 @@ class Dispute:
         """Return the pose ``T_map_body`` (4, 4) that must be the right one, as odometry has slipped; None: undecided.
 
         Args:
-            scan: what was registered.
+            scan: the registered one.
             T_map_predicted: (4, 4) pose of the body where odometry leads.
             T_map_seen: (4, 4) each, where it was registered.
             travelled: metres driven.
@@ -77,7 +77,7 @@ class Dispute:
         total = self._before + self._newest
         best = int(total.argmax())
         here = [each @ scan.T_odom_body for each in self._poses]
-        # what has come so near to the best that either is good enough does not contradict it, but for odometry
+        # a place near enough to the best contradicts it only if it is odometry's
         apart = np.array([k == 0 or matters(*off_by(each, here[best])) for k, each in enumerate(here)])
         if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):
             return None
@@ -117,7 +117,13 @@ _DROP = 0.7  # of the usual share: see the module
 
 
 class DisplacementCheck:
-    """The usual share of points on the map, which every frame's is compared with.
+    """Check of single frames against the map, which asks for a registration before the next one is due.
+
+    A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
+    air, would be at a wrong place until then. So of a few hundred points above the ground of every frame the share with
+    a map point near them is compared with the usual one. Below 0.7 of it were fewer than one frame in 100 at the right
+    pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else (seen once, on the simulated
+    worlds 5101, 5103, 5106 and 5108; no command prints it).
 
     Attributes:
         usual: share in [0, 1]; None before the first registration.
@@ -127,7 +133,7 @@ class DisplacementCheck:
         self.usual: float | None = None
 
     def clear(self) -> None:
-        """Forget what was usual."""
+        """Forget the usual shares."""
         self.usual = None
 
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:

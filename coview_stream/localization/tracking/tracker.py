@@ -30,12 +30,12 @@ from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
-_MIN_POINTS = 100  # to register; set by hand
-_STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand
+_MIN_POINTS = 100  # to register
+_STANDING_DRIVE = 0.2  # metres that standing still until the next registration counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
-"""Covariance of a place that the search has accepted and that may not have converged yet; set by hand."""
+"""Covariance of a place that the search has accepted and that may not have converged yet."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
-"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried; set by hand."""
+"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried."""
 
 
 class Tracker:
@@ -50,7 +50,7 @@ class Tracker:
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, calibration: CalibrationEstimator
     ) -> None:
-        """Track on a map; ``calibration`` has corrected what is given, and learns from each registration."""
+        """Track on a map; ``calibration`` has corrected the odometry, and learns from each registration."""
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
@@ -63,9 +63,9 @@ class Tracker:
         self._scans = ScanBuffer(config.tracking, calibration)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
-        self._learned_at = -math.inf  # metres driven where what is usual here was learned last
-        self._disputed = False  # whether what fits has been off from where odometry leads, and may be wrong
-        self._doubt = 1.0  # by how much the newest evidence that was believed has fallen below what is usual
+        self._learned_at = -math.inf  # metres driven at the newest lesson about the place
+        self._disputed = False  # the last match contradicted odometry
+        self._doubt = 1.0  # how many times the usual evidence exceeds the newest believed one
 
     # ---- scans
 
@@ -76,7 +76,7 @@ class Tracker:
         self._unregistered += 1
 
     def forget_odometry(self) -> None:
-        """Drop the scans and the newest odometry: what lost the place may be an odometry that jumped."""
+        """Drop the scans and the newest odometry, which may have jumped."""
         self.forget_scans()
         self.odometry.forget_pose()
 
@@ -149,7 +149,7 @@ class Tracker:
             T_odom_body: (4, 4) its odometry.
             standing_still: by its odometry the robot stands still: use only frames since the last registration, and
                 believe the odometry a little less; standing and looking again and again must not add up to certainty.
-            newest_only: use the newest frame alone: something is wrong with it, or with what came before.
+            newest_only: use the newest frame alone: something is wrong with it, or with earlier ones.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
@@ -207,7 +207,7 @@ class Tracker:
         return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
 
     def reported_covariance(self) -> Floats:
-        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
+        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), with the error that all registrations share, map axes."""
         return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
 
     def protection_level(self) -> ProtectionLevel:
@@ -227,7 +227,7 @@ class Tracker:
         self._set_belief(T_odom_body)
 
     def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
-        """Add a keyframe where odometry leads, and return what is believed of it."""
+        """Add a keyframe where odometry leads; return its pose and covariance."""
         driven, turned = self.odometry.since_keyframe()
         spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self.odometry.motion(T_odom_body)
@@ -251,7 +251,7 @@ class Tracker:
         self.T_map_odom = self._belief().T_map_body @ inverse(T_odom_body)
 
     def _learn(self, match: MapMatch, position: Floats) -> None:
-        """Learn from a verified registration: odometry's drift, what is usual here, what errors repeat."""
+        """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat."""
         verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
         evidence, seen = verdict.evidence, verdict.observation
         if evidence is None or seen is None or scan is None or target is None or newest is None:

@@ -12,6 +12,9 @@ from coview_stream.errors import TransportError
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.keys import check_chunk, check_prefix
 
+_NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
+_TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
+
 
 @dataclass(frozen=True)
 class MapKeys:
@@ -46,10 +49,6 @@ class MapKeys:
     def all(self) -> str:
         """Expression of all of them."""
         return f"{self.prefix}/**"
-
-
-_NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
-_TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 
 
 class ZenohSource:

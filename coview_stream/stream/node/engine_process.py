@@ -52,7 +52,7 @@ class CancelledError(Exception):
 
 
 class Opening(NamedTuple):
-    """Message that tells a child what to open.
+    """Message that names the map that a child has to open.
 
     Attributes:
         map_path: the map's file.

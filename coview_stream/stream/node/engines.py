@@ -40,7 +40,7 @@ class Engine(Protocol):
         ...
 
     def forget(self, robot: str) -> None:
-        """Drop what is known of a robot."""
+        """Forget a robot."""
         ...
 
     @property
@@ -54,11 +54,11 @@ class Engine(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Do what would make the first job slow; called before it."""
+        """Prepare for the first job; called before it."""
         ...
 
     def prepare_later(self) -> None:
-        """Do what would make a later job slow; called between jobs."""
+        """Prepare for later jobs; called between jobs."""
         ...
 
 
@@ -76,16 +76,15 @@ class TrackEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, int, Localizer]] = {}  # first epoch, epoch
-        # without its weights: it says what requests have to bring, and the search engine searches
+        # without its weights: it only lists the contents of requests, for the search engine
         self._index = SearchIndex.of(base_map, self.config, load=False)
 
     def run(self, job: Job) -> FrameResult:
         """Take in one frame.
 
         Raises:
-            CloudError, RunError: the frame is unusable and changes nothing. What comes with it (a search's result, a
-                hint, the demand to verify the place) may have been applied; with the next frame once more, it changes
-                nothing either.
+            CloudError, RunError: the frame is unusable and changes nothing. Its search result, hint or demand to
+                verify the place may have been applied; applied again with the next frame they change nothing.
         """
         if not isinstance(job, FrameJob):
             raise TypeError(f"{type(job).__name__}: the tracking engine does frames")
@@ -119,7 +118,7 @@ class TrackEngine:
         """Do nothing: the map is cropped where robots are."""
 
     def prepare_later(self) -> None:
-        """Import what the graph of poses runs on, and load what a slip of odometry is judged by."""
+        """Import the library of the graph of poses, and load the field that a slip of odometry is judged by."""
         PoseGraph(self.config.graph)
         _ = self.base_map.field.layers
 
@@ -164,7 +163,7 @@ class SearchEngine:
         self._searches.pop(robot, None)
 
     def prepare(self) -> None:
-        """Make what the first query would: of the stations' index, of the learned features, and of the field."""
+        """Prepare the stations' index, the learned features and the field for the first query."""
         GlobalSearch(self.base_map, self.config, self._local_maps, self._index).prepare()
 
     def prepare_later(self) -> None:

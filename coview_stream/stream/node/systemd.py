@@ -21,7 +21,7 @@ class Notifier:
         environment: of the process.
 
     Attributes:
-        watchdog_period: seconds between two signs of life, half of what systemd allows; None if it wants none.
+        watchdog_period: seconds between two signs of life, half of the limit that systemd sets; None if it wants none.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:

@@ -1,19 +1,18 @@
-"""Queue of one robot's frames and search requests to the engines, without a session."""
+"""Queue of one robot's work for the engines, and the order of robots at an engine: nobody waits without end."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from fake_robot import POINTS, ns, pose, search_request, search_result, tracking, unknown
+from fake_robot import POINTS, ns, pose, search_request, search_result, tracking
 
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages.types import CloudMessage
 from coview_stream.stream.node.counters import Counters, ErrorLog
-from coview_stream.stream.node.engine_queue import EngineQueue, SearchDemand, SearchJob
+from coview_stream.stream.node.engine_queue import EngineQueue, RoundRobin, SearchDemand, search_order
 from coview_stream.stream.node.inputs import PairedFrame
 from coview_stream.stream.node.last_place import PlaceHints
 
@@ -65,127 +64,7 @@ def queue():
 # ---- frames
 
 
-def test_frame_goes_to_the_engine_as_it_was_put(queue):
-    assert queue.take_next() is None
-    queue.put(0.2)
-    queue.hints.offer(hint := pose(3.0), None)
-    job = queue.take_frame(True, queue.hints)
-    assert (job.robot, job.epoch, job.stamp_ns, job.defer) == ("r1", EPOCH, ns(0.2), False)
-    assert (job.require_verification, job.search_result) == (True, None)
-    assert job.hint is hint
-    np.testing.assert_array_equal(job.T_odom_body, pose(0.2))
-    frame = queue.frame_done(job, tracking(job), NOW)
-    assert (frame.job, frame.paired.travelled, frame.paired.turned) == (job, 0.2, 0.5)
-    assert queue.counted == {"processed": 1}
-
-
-def test_newest_frame_replaces_the_one_that_waits(queue):
-    for k in range(3):
-        queue.put(0.1 * k, NOW + 0.1 * k)
-    job = queue.take_next()
-    assert job.stamp_ns == ns(0.2)
-    assert job.defer  # the engine is behind
-    assert queue.take_next() is None
-    assert queue.counted == {"dropped": 2}
-    queue.frame_done(job, tracking(job), NOW + 0.5)
-    assert queue.longest_wait == pytest.approx(0.5)  # since the first of them
-
-
-def test_only_one_frame_is_under_way(queue):
-    job = queue.take(0.0)
-    assert queue.take(0.1) is None
-    queue.frame_done(job, tracking(job), NOW)
-    after = queue.take_next()
-    assert (after.stamp_ns, after.defer) == (ns(0.1), False)
-
-
-def test_latency_runs_from_the_coming_of_the_cloud(queue):
-    assert queue.processed_at is None
-    job = queue.take(0.0)
-    queue.frame_done(job, tracking(job), NOW + 0.03)
-    assert queue.latency.to_json()["p50"] == pytest.approx(130.0)
-    assert queue.engine_latency.to_json()["p50"] == pytest.approx(10.0)
-    assert queue.processed_at == NOW + 0.03
-
-
-def test_fix_of_an_old_epoch_is_only_counted(queue):
-    job = queue.take(0.0)
-    queue.put(0.1)
-    queue.begin_epoch(EPOCH + 1)
-    assert queue.take_next() is None  # the one that waited was dropped
-    assert queue.frame_done(job, unknown(job, ask=search_request()), NOW) is None
-    assert queue.take_search_request() is None
-    assert queue.counted == {"processed": 1, "dropped": 1}
-    assert queue.take(0.2).epoch == EPOCH + 1
-
-
-def test_failures_of_an_old_epoch_are_only_counted(queue):
-    frame, search = queue.take(0.0), queue.search()
-    queue.begin_epoch(EPOCH + 1)
-    after = queue.take(0.1)
-    other = queue.search()
-    assert not queue.frame_failed(frame, "boom", rejected=False)
-    queue.search_failed(search, "boom")
-    assert queue.take(0.2) is None  # what is under way is another one
-    assert queue.search() is None
-    assert (after.epoch, other.epoch) == (EPOCH + 1, EPOCH + 1)
-    assert queue.counted == {"engine_errors": 1, "search_errors": 1}
-
-
-def test_jobs_from_before_a_reset_are_ignored(queue):
-    old = replace(queue.take(0.0), epoch=EPOCH - 1)
-    search = SearchJob("r1", replace(search_request(), epoch=(EPOCH - 1, 1)))
-    assert queue.frame_done(old, tracking(old), NOW) is None
-    assert not queue.frame_failed(old, "boom", rejected=True)
-    queue.search_done(search, search_result(), NOW)
-    queue.search_failed(search, "boom")
-    assert queue.counted == {}
-    assert list(queue.errors.texts) == []
-    assert queue.processed_at is None
-
-
-@pytest.mark.parametrize(("rejected", "counter"), [(True, "rejected"), (False, "engine_errors")])
-def test_frame_that_failed_is_counted_and_named_once(queue, rejected, counter):
-    for k in range(2):
-        assert queue.frame_failed(queue.take(0.1 * k), f"Traceback\nboom {k}", rejected)
-    assert queue.counted == {counter: 2}
-    (error,) = queue.errors.texts
-    assert error.endswith("the first: boom 0")
-
-
 # ---- searches
-
-
-def test_newest_search_request_replaces_the_one_that_waits(queue):
-    job = queue.search(0.0)
-    assert job.request.stamp == 0.0
-    for k in (1, 2):
-        assert queue.search(0.1 * k) is None  # one is under way
-    queue.search_done(job, search_result(), NOW)
-    assert queue.take_search_request().request.stamp == 0.2
-    assert queue.counted == {"searches_skipped": 1, "searches": 1}
-
-
-def test_request_of_a_fix_is_queued(queue):
-    job = queue.take(0.0)
-    queue.frame_done(job, unknown(job, ask=search_request(0.7)), NOW)
-    assert queue.take_search_request().request.stamp == 0.7
-
-
-def test_search_result_goes_with_the_next_frame_once(queue):
-    result = search_result()
-    queue.search_done(queue.search(), result, NOW)
-    job = queue.take(0.0)
-    assert job.search_result is result
-    queue.frame_done(job, unknown(job), NOW)
-    assert queue.take(0.1).search_result is None
-
-
-def test_search_result_of_a_rejected_frame_goes_with_the_next_one_too(queue):
-    result = search_result()
-    queue.search_done(queue.search(), result, NOW)
-    assert queue.frame_failed(queue.take(0.0), "too few points", rejected=True)
-    assert queue.take(0.1).search_result is result
 
 
 def test_newer_search_result_replaces_that_of_a_rejected_frame(queue):
@@ -283,3 +162,130 @@ def test_new_odometry_wants_nothing_until_its_first_keyframe(queue):
     assert queue.search_demand is None
     queue.ask(0.1, NOW + 4.0)
     assert queue.search_demand == SearchDemand(NOW + 4.0)
+
+
+KEYFRAMES = 1.33  # seconds between those of a robot: 2 m at 1.5 m/s
+
+
+def first(*demands):
+    """Robot that is searched for first."""
+    return search_order(demands, NOW)[0]
+
+
+def waiting(seconds, searches=0, support=0):
+    return SearchDemand(NOW - seconds, searches, support)
+
+
+def test_robots_without_a_keyframe_are_left_out():
+    assert search_order([None, waiting(0.1), None], NOW) == [1]
+    assert search_order([None], NOW) == []
+
+
+def test_among_equals_who_has_waited_longest_is_first():
+    assert search_order([waiting(0.1), waiting(0.3), waiting(0.2)], NOW) == [1, 2, 0]
+
+
+def test_proposed_place_comes_first_then_the_newly_lost():
+    assert search_order([waiting(1.0, 100), waiting(0.5, 2), waiting(0.1, 50, 3)], NOW) == [2, 1, 0]
+
+
+def test_whose_place_was_proposed_most_often_in_a_row_comes_first():
+    assert first(waiting(0.5, 3, 1), waiting(0.1, 4, 2)) == 1
+
+
+def test_place_that_is_proposed_without_end_gives_no_precedence():
+    assert first(waiting(0.1, 40, 40), waiting(0.05, 4, 1)) == 1
+    assert first(waiting(0.1, 40, 40), waiting(0.2, 40)) == 1
+
+
+def test_keyframe_that_has_waited_too_long_comes_before_all():
+    assert first(waiting(1.6, 500), waiting(1.4, 4, 3)) == 0
+    assert first(waiting(1.6, 4, 3), waiting(1.7, 500)) == 1
+
+
+class Robots:
+    """Lost robots before one search engine; those that are on the map are found after five searches.
+
+    Attributes:
+        found: seconds from its first keyframe after which a robot was found.
+        waits: the longest wait of each for a search, its answer included.
+    """
+
+    def __init__(self, on_map, off_map, cost, off_map_support=0, on_map_from=0.0, seconds=60.0):
+        robots = range(on_map + off_map)
+        begin = [on_map_from * (k < on_map) + 0.013 * k for k in robots]
+        due = list(begin)
+        since, searches = [None] * len(begin), [0] * len(begin)
+        self.found, self.waits = {}, [0.0] * len(begin)
+        now = 0.0
+        while now < seconds:
+            for k in robots:
+                while due[k] <= now:
+                    since[k] = due[k] if since[k] is None and k not in self.found else since[k]
+                    due[k] += KEYFRAMES
+            support = [max(0, n - 1) if k < on_map else off_map_support * n for k, n in enumerate(searches)]
+            demands = [None if since[k] is None else SearchDemand(since[k], searches[k], support[k]) for k in robots]
+            order = search_order(demands, now)
+            if not order:
+                now = min(due)
+                continue
+            now += cost
+            k = order[0]
+            self.waits[k] = max(self.waits[k], now - since[k])
+            since[k], searches[k] = None, searches[k] + 1
+            if k < on_map and searches[k] == 5:
+                self.found[k] = now - begin[k]
+                since[k] = None
+        for k in robots:
+            if since[k] is not None:
+                self.waits[k] = max(self.waits[k], now - since[k])
+
+
+@pytest.mark.parametrize("on_map_from", [0.0, 40.0, 40.7])
+@pytest.mark.parametrize("off_map_support", [0, 1])
+def test_eight_of_sixteen_are_found_and_nobody_starves(on_map_from, off_map_support):
+    """At a tenth of a second a search: sixteen robots take more than the engine has."""
+    (alone,) = Robots(1, 0, 0.1).found.values()
+    robots = Robots(8, 8, 0.1, off_map_support, on_map_from)
+    assert len(robots.found) == 8
+    assert max(robots.found.values()) < alone + 5.0
+    assert max(robots.waits) < 3.0
+
+
+def test_engine_that_cannot_keep_up_lets_all_wait_equally_long():
+    robots = Robots(0, 16, 0.4)
+    assert max(robots.waits) < 17 * 0.4
+    assert min(robots.waits) > 14 * 0.4
+
+
+def test_engine_that_can_keep_up_searches_for_every_keyframe():
+    assert max(Robots(8, 8, 0.05).waits) < 16 * 0.05 + 0.05
+
+
+ROBOTS = ("a", "b", "c", "d")
+
+
+def served(turns, count, ready=ROBOTS):
+    """Robots in the order in which they are served, of those that are ``ready``."""
+    names = ""
+    for _ in range(count):
+        k = next(k for k in turns.order() if ROBOTS[k] in ready)
+        turns.serve(k)
+        names += ROBOTS[k]
+    return names
+
+
+def test_robots_are_served_in_order():
+    assert served(RoundRobin(4), 8) == "abcdabcd"
+
+
+def test_idle_robot_keeps_its_turn():
+    turns = RoundRobin(4)
+    assert served(turns, 2, ready="bd") == "bd"
+    assert served(turns, 4) == "acbd"
+
+
+def test_no_jobs_keep_the_order():
+    turns = RoundRobin(4)
+    assert turns.order() == turns.order() == [0, 1, 2, 3]
+    assert served(turns, 1) == "a"

@@ -48,8 +48,8 @@ def test_engine_that_starts_is_not_ready_but_live(site):
     assert document["ready"] == {"ok": False, "reasons": ["the search engine is starting"]}
 
 
-def test_node_that_was_told_to_connect_is_not_ready_without(site, monkeypatch):
-    monkeypatch.setattr(site.net, "connection", Connection)
+def test_node_that_was_told_to_connect_is_not_ready_without(site):
+    site.net.go_away()
     assert NodeHealth(site.node).ready_reasons() == []
     assert NodeHealth(site.node, needs_connection=True).ready_reasons() == ["not connected to any router or peer"]
 

@@ -267,31 +267,18 @@ def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
     assert load(tmp_path, "r1", SHA) is not None
 
 
-def writes(monkeypatch):
-    made = []
-
-    def record(folder, robot, place):
-        made.append(place)
-        save(folder, robot, place)
-
-    monkeypatch.setattr(last_place_keeper, "save", record)
-    return made
-
-
-def test_standing_robot_is_saved_once(tmp_path, monkeypatch):
-    made = writes(monkeypatch)
+def test_standing_robot_is_saved_once(tmp_path):
     site, kept = remembering(tmp_path, "r1")
     site.frame("r1", 0.0)
     for k in range(1, 4):
         site.moves("r1", STEP * k, x=0.01 * k)
         kept.keep()
-    assert len(made) == 1
-    site.moves("r1", 0.3, x=0.5)
-    kept.keep()
-    site.moves("r1", 0.4, x=0.5, yaw=0.1)
-    kept.keep()
-    assert len(made) == 3
-    np.testing.assert_allclose(made[-1].T_map_body, T_MAP_ODOM @ pose(0.5, yaw=0.1), atol=1e-9)
+    assert load(tmp_path, "r1", SHA).stamp_ns == ns(STEP)
+    for seconds, place in ((0.3, {"x": 0.5}), (0.4, {"x": 0.5, "yaw": 0.1})):
+        site.moves("r1", seconds, **place)
+        kept.keep()
+        assert load(tmp_path, "r1", SHA).stamp_ns == ns(seconds)
+    np.testing.assert_allclose(load(tmp_path, "r1", SHA).T_map_body, T_MAP_ODOM @ pose(0.5, yaw=0.1), atol=1e-9)
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
@@ -332,14 +319,14 @@ def test_failing_disk_logs_one_warning(tmp_path, caplog):
     assert len(caplog.records) == 2  # once more, for it had worked meanwhile
 
 
-def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, caplog):
+def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, caplog):
     def fail():
         raise RuntimeError("unforeseen")
 
     site, kept = remembering(tmp_path, "r1", "r2")
     for name in ("r1", "r2"):
         site.frame(name, 0.0)
-    monkeypatch.setattr(site.sessions["r1"], "last_place", fail)
+    site.sessions["r1"].last_place = fail
     kept.keep()
     assert load(tmp_path, "r2", SHA) is not None
     assert "unforeseen" in caplog.text
@@ -352,14 +339,11 @@ def running(site, kept):
 
 def test_running_node_saves_periodically_and_at_close(tmp_path):
     site = Site("r1")
-    kept = LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.05)
-    running(site, kept)
+    running(site, LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.5))
     try:
         site.sees("r1", 0.0)
         until(lambda: load(tmp_path, "r1", SHA) is not None)
-        kept._interval = 60.0
-        time.sleep(0.1)
-        site.moves("r1", 1.0)
+        site.moves("r1", 1.0)  # well before the next round
     finally:
         assert site.node.close(5.0)
     np.testing.assert_allclose(load(tmp_path, "r1", SHA).T_map_body, T_MAP_ODOM @ pose(2.0), atol=1e-9)

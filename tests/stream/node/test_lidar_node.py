@@ -129,7 +129,6 @@ def test_lidar_node_subscribes_to_no_odometry(quiet):
 
 def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
     node, net, engine = quiet
-    node._stopping.wait = lambda seconds: None  # the pause after a death
     net.publish(cloud(0.0))
     worked(node, "odometry", "track")
     engine.dead = True

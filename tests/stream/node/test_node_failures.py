@@ -16,6 +16,7 @@ from coview_stream.localization.result import Fix
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.engine_process import DiedError
+from coview_stream.stream.node.engine_queue import FrameResult
 
 
 def test_failures_of_one_robot_do_not_affect_others(pair):
@@ -103,7 +104,6 @@ def test_repeated_engine_restart_reason_is_reported(pair, engine, caplog):
         for name in ("r1", "r2"):
             pair.frame(name, 0.0)
     pair.engine.answer = lambda job: unknown(job, ask=search_request())
-    pair.node._stopping.wait = lambda seconds: True  # no pauses
     for k, text in enumerate(["it died", REPLACED, REPLACED, REPLACED], 1):
         getattr(pair, engine).run = die(text)
         pair.frame("r1", STEP * k)
@@ -187,7 +187,6 @@ def test_repeated_failures_are_rate_limited_in_the_log(site, caplog):
     assert "r1: the track engine" in lines[0]
     assert "bad frame" in lines[0]
     site.track.run = lambda job: 1 / 0
-    site.node._stopping.set()  # no pauses
     for k in range(50, 60):
         site.frame("r1", STEP * k)
     assert len([r for r in caplog.records if "unexpected" in r.getMessage()]) == 1
@@ -202,13 +201,20 @@ class UnwritableEvidence:
         raise RuntimeError("cannot be written")
 
 
+def unwritable(job, evidence):
+    return FrameResult(Fix(job.stamp_ns * 1e-9, State.SEARCHING, evidence=evidence), None, 0.01, ())
+
+
 def test_failing_status_of_one_robot_does_not_affect_others(pair):
-    pair.sessions["r1"].robot_state._fix = Fix(0.0, State.SEARCHING, evidence=UnwritableEvidence())
+    good = pair.engine.answer
+    pair.engine.answer = lambda job: unwritable(job, UnwritableEvidence())
+    pair.frame("r1", 0.0)
     for _ in range(3):
         publish_statuses(pair.node, time.monotonic())
     assert len(pair.statuses("r2")) == 3
     assert pair.statuses("r1") == []
-    pair.sessions["r1"].robot_state._fix = None
+    pair.engine.answer = good
+    pair.frame("r1", STEP)
     assert pair.status("r1")["robot"] == "r1"
 
 
@@ -232,9 +238,10 @@ def test_failing_status_is_not_retried_in_a_loop():
             asked.append(time.monotonic())
             return super().to_json()
 
-    site.sessions["r1"].robot_state._fix = Fix(0.0, State.SEARCHING, evidence=Counting())
+    site.engine.answer = lambda job: unwritable(job, Counting())
     site.node.start()
     try:
+        site.sees("r1", 0.0)
         until(lambda: len(asked) >= 3)
     finally:
         site.node.close()

@@ -1,0 +1,477 @@
+"""Session's epochs, its states after pauses and doubts, and their history."""
+
+from __future__ import annotations
+
+import json
+import random
+
+import pytest
+from fake_robot import (
+    EVENTS,
+    KEYS,
+    Robot,
+    counted,
+    doubted,
+    ns,
+    reason,
+    search_request,
+    search_result,
+    state,
+    tracking,
+    unknown,
+)
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.state import Event, State, next_state
+from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.robot_state import StateHistory
+from coview_stream.stream.node.status import status
+from coview_stream.stream.transport.transport import Connection
+
+
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_restart_search_drops_the_place(robot):
+    robot.localized(0.0)
+    before = robot.frame(0.1)
+    robot.session.restart_search("asked to search again")
+    assert robot.session.state() == (State.LOST, "asked to search again")
+    assert robot.session.pose() is None
+    assert robot.counters.received == 2  # nothing is forgotten but the place
+    after = robot.frame(0.2, unknown)
+    assert after.epoch != before.epoch
+    assert robot.session.pose() is None
+
+
+def test_restart_search_before_a_fix_is_not_a_loss(robot):
+    robot.frame(0.0, unknown)
+    robot.session.restart_search("asked to search again")
+    assert state(robot) is State.SEARCHING
+    assert robot.counters.losses == 0
+
+
+def test_reset_clears_the_session(robot):
+    epoch = robot.localized(0.0).frame(0.1).epoch
+    robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
+    robot.session.reset()
+    assert counted(robot) == {}
+    assert not robot.session.errors.texts
+    assert robot.session.pose() is None
+    assert robot.session.robot_state.evidence is None
+    assert robot.session.robot_state.last_frame_ns is None
+    assert robot.session.queue.latency.to_json()["p50"] is None
+    assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
+    assert robot.frame(0.2, unknown).epoch != epoch
+
+
+@pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
+def test_results_of_old_epoch_are_ignored(robot, how):
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    searching = robot.session.take_job("search")
+    robot.drive(0.05, 0.2)
+    robot.saw(0.15)
+    busy = robot.session.take_job("track")
+    if how == "begin_anew":
+        robot.session.restart_search("asked to")
+    elif how == "reset":
+        robot.session.reset()
+    else:
+        robot.moved(0.25, x=500.0)
+    robot.session.handle_result(busy, tracking(busy), robot.now)
+    assert robot.session.pose() is None
+    robot.session.handle_result(searching, search_result(accepted="a place"), robot.now)
+    far = 500.0 if how == "jump" else 0.6
+    robot.moved(0.3, x=far)
+    robot.moved(0.35, x=far)
+    robot.saw(0.33)
+    job = robot.session.take_job("track")
+    assert job.search_result is None
+    assert job.epoch > busy.epoch
+    # the old frame's end does not end the new one
+    robot.session.handle_result(job, unknown(job, ask=search_request(1.0)), robot.now)
+    assert robot.session.take_job("search").epoch == job.epoch
+
+
+def test_failure_of_old_epoch_does_not_end_running_frame(robot):
+    robot.drive(0.0, 0.2)
+    robot.saw(0.15)
+    old = robot.session.take_job("track")
+    robot.session.restart_search("asked to")
+    robot.saw(0.18)
+    busy = robot.session.take_job("track")
+    assert busy is not None
+    robot.session.handle_failure(old, "boom", rejected=False)
+    robot.saw(0.19)
+    assert robot.session.take_job("track") is None
+    robot.session.handle_result(busy, tracking(busy), robot.now)
+    assert robot.session.pose() is not None
+
+
+def test_search_result_goes_with_the_next_frame_once(robot):
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    said = search_result()
+    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
+    assert robot.frame(0.1, unknown).search_result is said
+    assert robot.frame(0.2, unknown).search_result is None
+
+
+def test_search_result_is_kept_when_frame_is_rejected(robot):
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    said = search_result()
+    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
+    robot.drive(0.05, 0.2)
+    robot.saw(0.1)
+    robot.session.handle_failure(robot.session.take_job("track"), "too few points", rejected=True)
+    robot.saw(0.15)
+    assert robot.session.take_job("track").search_result is said
+
+
+def test_failed_search_skips_only_its_keyframe(robot):
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    robot.session.handle_failure(robot.session.take_job("search"), "boom")
+    assert robot.frame(0.1, unknown, ask=search_request(0.1)).search_result is None
+    assert robot.session.take_job("search") is not None
+
+
+def test_engine_failure_starts_new_epoch(robot):
+    epoch = robot.localized(0.0).frame(0.1).epoch
+    robot.drive(0.15, 0.3)
+    robot.saw(0.25)
+    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=False)
+    assert robot.session.pose() is None
+    assert state(robot) is State.LOST
+    assert robot.frame(0.4, unknown).epoch != epoch
+
+
+def test_frame_result_of_before_reset_is_ignored():
+    robot = Robot()
+    robot.drive(-0.1, 0.1)
+    robot.saw(0.0)
+    job = robot.session.take_job("track")
+    robot.session.reset()
+    robot.session.handle_result(job, tracking(job), robot.now)
+    assert robot.counters.received == robot.counters.processed == 0
+
+
+def test_search_result_of_before_reset_is_ignored():
+    robot = Robot()
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    job = robot.session.take_job("search")
+    robot.session.reset()
+    robot.session.handle_result(job, search_result(), robot.now)
+    assert robot.counters.searches == 0
+
+
+def test_odometry_gap_during_first_fix_restarts_search():
+    robot = Robot()
+    robot.frame(0.0, unknown, state=State.AMBIGUOUS)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    busy = robot.session.take_job("track")  # carries the verdict that will be accepted
+    robot.moved(2.0, x=0.6, now=robot.now + 0.02)
+    assert robot.counters.odometry_gaps == 1
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)
+    assert robot.session.pose() is None
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    assert robot.session.take_job("track").epoch > busy.epoch  # the search begins anew
+
+
+def test_long_odometry_outage_loses_the_place():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    assert robot.session.pose() is not None
+    robot.moved(2.7, x=0.6, now=robot.now + 2.4)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "odometry was away for too long")
+
+
+@pytest.fixture
+def covered():
+    """A robot whose sensor has been covered after it was found."""
+    robot = Robot().localized(0.0)
+    robot.frame(0.1, doubted)
+    assert robot.session.state() == (State.DOUBTED, "only 0 points to register")
+    return robot
+
+
+def changes(robot):
+    told = status(robot.session, Connection((), ()), 0, 0.0, 1.0)["transitions"]
+    return [(c["from"], c["to"], c["reason"]) for c in told]
+
+
+def test_doubted_state_is_reported_as_ambiguous(covered):
+    assert state(covered) is State.DOUBTED
+    assert changes(covered)[-1] == ("TRACKING", "AMBIGUOUS", "only 0 points to register")
+
+
+def test_odometry_pause_while_doubted_keeps_the_place(covered):
+    epoch = covered.frame(0.2, doubted).epoch
+    covered.moved(0.9, x=0.4)
+    assert covered.counters.odometry_gaps == 1
+    assert state(covered) is State.DOUBTED
+    assert covered.counters.losses == 0
+    covered.moved(1.0, x=0.5)
+    covered.saw(0.95)
+    job = covered.session.take_job("track")
+    assert (job.epoch, job.require_verification) == (epoch, True)
+    covered.session.handle_result(job, tracking(job), covered.now)
+    assert covered.session.pose() is not None
+
+
+def test_odometry_timeout_while_doubted_keeps_the_place(covered):
+    epoch = covered.frame(0.2, doubted).epoch
+    covered.session.tick(covered.now + 0.6)
+    assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
+    covered.moved(0.9, x=0.4)
+    covered.moved(1.0, x=0.5)
+    covered.saw(0.95)
+    job = covered.session.take_job("track")
+    assert (job.epoch, job.require_verification) == (epoch, True)
+    covered.session.handle_result(job, tracking(job), covered.now)
+    assert state(covered) is State.TRACKING
+    assert covered.counters.losses == 1
+
+
+def test_odometry_pause_while_searching_restarts_search():
+    robot = Robot()
+    epoch = robot.frame(0.0, unknown, state=State.AMBIGUOUS).epoch
+    robot.moved(0.7, x=0.4)
+    assert robot.frame(0.8, unknown).epoch != epoch
+    assert robot.counters.losses == 0
+
+
+def test_odometry_jump_while_doubted_is_a_loss(covered):
+    covered.moved(0.15, x=900.0)
+    assert covered.session.state() == (State.LOST, "odometry jumped")
+    assert covered.counters.losses == 1
+    covered.moved(0.2, x=900.0)
+    covered.moved(0.8, x=900.1)  # nothing is known there that could be verified
+    assert reason(covered) == "odometry jumped"
+    assert not covered.session.robot_state.engine_has_place
+    assert covered.counters.losses == 1
+
+
+def test_odometry_timeout_while_doubted_is_a_loss(covered):
+    covered.session.tick(covered.now + 0.4)
+    assert state(covered) is State.DOUBTED
+    covered.session.tick(covered.now + 3600.0)
+    assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
+    assert covered.counters.losses == 1
+    assert changes(covered)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
+
+
+@pytest.mark.parametrize("answer", [tracking, doubted])
+def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(answer):
+    robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
+    robot.frame(0.1, answer)
+    robot.moved(0.8, x=0.3)  # after a pause
+    for k in range(17, 80):
+        robot.moved(0.05 * k, x=0.3)
+        robot.session.tick(robot.now)
+    assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
+    assert robot.counters.losses == 1
+    robot.saw(3.9, now=robot.now)
+    job = robot.session.take_job("track")
+    assert job.stamp_ns == ns(3.9)
+    for k in range(80, 84):  # while the frame is under way
+        robot.moved(0.05 * k, x=0.3)
+        robot.session.tick(robot.now)
+    robot.session.handle_result(job, tracking(job), robot.now)
+    assert state(robot) is State.TRACKING
+
+
+def test_loss_has_newest_reason_and_is_counted_once():
+    robot = Robot().localized(0.0)
+    silent = robot.now + 0.6
+    robot.session.tick(silent)
+    for answer, stamp in ((doubted, 0.1), (unknown, 0.2)):
+        robot.moved(stamp, now=silent + stamp)
+        robot.saw(stamp - 0.01, now=silent + stamp)
+        job = robot.session.take_job("track")
+        more = {"state": State.LOST, "reason": "in doubt for 60 s"} if answer is unknown else {}
+        robot.session.handle_result(job, answer(job, **more), silent + stamp)
+        if answer is doubted:
+            assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
+    assert robot.session.state() == (State.LOST, "in doubt for 60 s")
+    assert counted(robot)["losses"] == 1
+    assert changes(robot)[1:] == [("TRACKING", "LOST", "no odometry for 0.5 s"), ("LOST", "LOST", "in doubt for 60 s")]
+    robot.session.tick(silent + 0.3)
+    assert len(changes(robot)) == 3
+
+
+def test_frame_from_before_gap_does_not_count_as_verification():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    robot.session.tick(robot.now + 0.6)  # silence: LOST, the next frame is suspect
+    busy = robot.session.take_job("track")
+    assert busy.require_verification
+    robot.moved(2.0, x=0.6, now=robot.now + 1.7)  # the robot was carried away meanwhile
+    assert robot.counters.odometry_gaps == 1
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    job = robot.session.take_job("track")
+    assert job.require_verification
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.DOUBTED), (12.0, State.LOST)])
+def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.session.inputs.disconnected_at = robot.now + 1.0
+    robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
+    assert robot.session.pose() is None
+    assert robot.session.state()[0] is state
+    robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
+    robot.saw(0.35 + seconds)
+    job = robot.session.take_job("track")
+    assert job.require_verification or state is State.LOST
+    robot.session.handle_result(job, tracking(job), robot.now + 0.01)
+    assert robot.session.pose() is not None
+
+
+@pytest.mark.parametrize(("ended", "said"), [("clouds", "no clouds for 6 s"), ("odometry", "no odometry for 6 s")])
+def test_searching_robot_whose_data_end_says_so_and_for_how_long(ended, said):
+    robot = Robot()
+    robot.frame(0.0, unknown)
+    before = robot.session.state()[1]
+    for k in range(1, 61):  # 6 s
+        if ended != "odometry":
+            robot.moved(0.1 * k)
+        if ended != "clouds":
+            robot.saw(0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+    assert robot.session.state()[1] == f"{said}; before: {before}"
+
+
+def test_searching_robot_whose_data_come_has_its_own_reason():
+    robot = Robot()
+    robot.frame(0.0, unknown)
+    for k in range(1, 61):
+        robot.moved(0.1 * k)
+        robot.saw(0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+    assert robot.session.state()[1] == "no place fits"
+
+
+def test_robot_that_never_sent_anything_waits_for_it():
+    robot = Robot()
+    robot.session.tick(2000.0)
+    assert robot.session.state()[1].startswith("waiting for clouds")
+
+
+def told(robot):
+    document = status(robot.session, Connection((), ()), 0, 0.0, 1.0)
+    return json.loads(json.dumps(document))["transitions"]
+
+
+def test_fix_and_loss_are_in_the_state_history():
+    robot = Robot()
+    assert told(robot) == []
+    robot.localized(0.0)
+    robot.frame(0.1, doubted, reason="rays pass through the map")
+    robot.frame(0.2, unknown, state=State.LOST, reason="2 registrations rejected")
+    changes = told(robot)
+    assert [(c["from"], c["to"]) for c in changes] == [
+        ("SEARCHING", "TRACKING"),
+        ("TRACKING", "AMBIGUOUS"),
+        ("AMBIGUOUS", "LOST"),
+    ]
+    assert [c["number"] for c in changes] == [1, 2, 3]
+    assert [c["stamp_ns"] for c in changes] == [ns(0.0), ns(0.1), ns(0.2)]
+    assert changes[0]["evidence"]["score"] == 0.8
+    assert changes[1]["reason"] == "rays pass through the map"
+    assert changes[2]["reason"] == "2 registrations rejected"
+
+
+def test_timeout_is_in_the_state_history():
+    robot = Robot()
+    robot.localized(0.0)
+    robot.session.tick(robot.now + 60.0)
+    assert told(robot)[-1]["to"] == "LOST"
+    assert "no odometry" in told(robot)[-1]["reason"]
+
+
+def test_odometry_jump_is_in_the_state_history():
+    robot = Robot()
+    robot.localized(0.0)
+    robot.moved(0.1, x=50.0)
+    assert told(robot)[-1]["to"] == "LOST"
+    assert told(robot)[-1]["reason"] == "odometry jumped"
+
+
+def test_state_history_keeps_newest_five_with_running_numbers():
+    changes = StateHistory()
+    evidence = KeyframeEvidence(1.0, State.TRACKING, "verified", cause=RejectionReason.VERIFIED, innovation=3.25)
+    for k in range(9):
+        state = (State.TRACKING, State.AMBIGUOUS)[k % 2]
+        changes.add(state, f"reason {k}", k, evidence)
+        changes.add(state, "again", k, evidence)
+    kept = changes.to_json()
+    assert [c["number"] for c in kept] == [5, 6, 7, 8, 9]
+    assert [c["reason"] for c in kept] == [f"reason {k}" for k in range(4, 9)]
+    assert kept[-1]["evidence"]["cause"] == "verified"
+    assert kept[-1]["evidence"]["innovation"] == 3.25
+
+
+def test_reset_clears_the_state_history():
+    robot = Robot()
+    robot.localized(0.0)
+    robot.session.reset()
+    assert told(robot) == []
+
+
+RESTORING = (Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED)
+ANSWERS = {
+    None: (State.SEARCHING, State.AMBIGUOUS, State.TRACKING, State.DOUBTED),
+    State.SEARCHING: (State.SEARCHING, State.AMBIGUOUS, State.TRACKING, State.DOUBTED),
+    State.AMBIGUOUS: (State.SEARCHING, State.AMBIGUOUS, State.TRACKING, State.DOUBTED),
+    State.TRACKING: (State.TRACKING, State.DOUBTED, State.LOST),
+    State.DOUBTED: (State.TRACKING, State.DOUBTED, State.LOST),
+    State.LOST: (State.LOST, State.TRACKING),
+}
+"""States of the engine that may follow on one another within an odometry epoch."""
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_states_follow_the_table_of_transitions(seed):
+    rng, robot = random.Random(seed), Robot()
+    expected, engine, pending, now = State.SEARCHING, None, False, 0.1
+    robot.moved(0.0)
+    for _ in range(60):
+        action = rng.choice(["frame", "frame", "frame", "silence", "gap", "jump"])
+        if action == "frame":
+            after = rng.choice(ANSWERS[engine])
+            answer = {State.TRACKING: tracking, State.DOUBTED: doubted}.get(after)
+            robot.frame(now, answer or (lambda job, after=after: unknown(job, after)))
+            pending = False
+            for event in EVENTS[after]:
+                if event is Event.PLACE_GIVEN_UP and engine is State.LOST:
+                    continue
+                settled = expected not in (State.DOUBTED, State.LOST)
+                if after is State.TRACKING or event not in RESTORING or settled:
+                    expected = next_state(expected, event)
+            engine = after
+        elif action == "silence":
+            robot.session.tick(robot.now + 1.0)
+            if expected.has_place:
+                expected, pending = next_state(expected, Event.SILENCE), True
+        elif action == "gap":
+            now += 0.8
+            robot.moved(now)
+            if engine is not None and engine.has_place:
+                expected, pending = next_state(expected, Event.VERIFICATION_REQUIRED), True
+            else:
+                expected, engine, pending = next_state(expected, Event.ODOMETRY_RESTARTED), None, False
+        else:
+            robot.session.restart_search("odometry jumped")
+            expected, engine, pending = next_state(expected, Event.ODOMETRY_RESTARTED), None, False
+        assert robot.session.state()[0] is expected, (action, pending)
+        now += 0.1

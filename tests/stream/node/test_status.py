@@ -1,0 +1,219 @@
+"""Statuses: bounded in size, with the router's reconnections and the places that a search considers."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_node import publish_statuses
+from fake_robot import SHA, Robot, search_request, search_result, tracking, unknown
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import TransportError
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.search.considered import Considered
+from coview_stream.messages.json_messages import decode_hypotheses
+from coview_stream.stream.node.robot_endpoints import MapViewAnswer
+from coview_stream.stream.node.status import (
+    MAX_STATUS,
+    ConnectionMonitor,
+    NodeIdentity,
+    encode_status,
+    hypotheses,
+    status,
+)
+from coview_stream.stream.transport.transport import Connection
+
+LONG = "the place that fits best is 1 in 3 to be wrong, and another one fits as well; " * 8
+
+
+def told(robot, connection=None):
+    return status(robot.session, connection or Connection((), ()), 0, 10.0, 100.0)
+
+
+def test_usual_status_is_whole():
+    document = told(Robot().localized(0.0), Connection(("a" * 32,), ("b" * 32,)))
+    text = encode_status(document)
+    assert len(text) <= 2500
+    assert json.loads(text) == json.loads(json.dumps(document))
+
+
+def worst():
+    robot = Robot().localized(0.0)
+    for k in range(12):
+        robot.session.errors.add(f"{k}: {LONG}")
+    for k in range(1, 8):
+        robot.session.restart_search(f"{k} {LONG}")
+        robot.frame(2.0 * k, unknown, reason=f"{k} {LONG}")
+    document = told(robot, Connection(tuple("a" * 32 for _ in range(50)), tuple("b" * 32 for _ in range(50))))
+    document["calibration"] = {**Calibration().to_json(), "says": [LONG] * 6}
+    document["node"] = {"id": "c" * 16, "host": "h" * 64, "since": 1.0}
+    document["reason"] = LONG
+    document["transitions"] = (document["transitions"] or [{"reason": LONG, "evidence": document["evidence"]}]) * 5
+    return document
+
+
+def test_worst_status_is_cut_where_it_matters_least():
+    document = worst()
+    assert len(json.dumps(document)) > 2 * MAX_STATUS
+    text = encode_status(document)
+    assert len(text) <= MAX_STATUS
+    short = json.loads(text)
+    for name in ("robot", "state", "stamp_ns", "map_sha256", "pose", "counters", "latency_ms"):
+        assert short[name] == document[name]
+    assert {"connection", "transitions", "errors"} <= set(short["shortened"])
+    assert document["reason"].startswith(short["reason"].removesuffix(" ..."))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.text(max_size=1500), st.text(max_size=250), st.lists(st.text(max_size=400), max_size=10))
+def test_no_text_makes_it_longer(reason, host, errors):
+    document = worst()
+    document["reason"], document["errors"], document["node"]["host"] = reason, errors, host[:64]
+    assert len(encode_status(document)) <= MAX_STATUS
+
+
+@pytest.mark.parametrize("length", [1, 64, 200])
+def test_long_name_of_a_robot_stays_whole(length):
+    document = worst()
+    document["robot"] = "r" * length
+    short = json.loads(encode_status(document))
+    assert short["robot"] == "r" * length
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"", b"{", b"[]", b"7", b"null", b'{"node": 3}', b"[" * 100_000, b" " * 70_000,
+        *(
+            json.dumps({"node": {"id": "a", "term": 1, "period_s": 1.0, "ending": False} | wrong}).encode()
+            for wrong in (
+                {"id": ""}, {"id": 4}, {"id": "x" * 65}, {"period_s": 0}, {"period_s": -1.0}, {"period_s": 1e9},
+                {"period_s": float("nan")}, {"period_s": None}, {"period_s": True}, {"ending": 1}, {"id": "a\nb"},
+                {"host": "\x1b[2J"}, {"host": 3}, {"host": "x" * 65},
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_status_of_a_stranger_names_no_node(text):
+    assert NodeIdentity.read(text) is None
+
+
+def test_node_is_read_as_it_was_written():
+    node = NodeIdentity("abc", "machine-7", 0.5)
+    assert NodeIdentity.read(json.dumps({"state": "LOST", "node": node.to_json()}).encode()) == node
+    assert NodeIdentity.read(json.dumps({"node": node.to_json(ending=True)}).encode()).ending
+
+
+def looks(link, *connections):
+    for routers, peers in connections:
+        link.update(Connection(tuple(routers), tuple(peers)))
+    return link.reconnects
+
+
+@pytest.fixture
+def said(caplog):
+    caplog.set_level(logging.INFO, "coview_stream.node")
+    return lambda: [(r.levelname, r.getMessage()) for r in caplog.records]
+
+
+def test_first_router_is_not_a_reconnection(said):
+    assert looks(ConnectionMonitor(), ("", ""), ("A", ""), ("A", "")) == 0
+    assert said() == [("INFO", "connected to router A")]
+
+
+def test_returning_router_is_a_reconnection(said):
+    assert looks(ConnectionMonitor(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
+    assert said()[1:3] == [
+        ("WARNING", "router A is gone: no subscriber can be reached"),
+        ("INFO", "connected to router A again"),
+    ]
+
+
+def test_router_replaced_between_two_polls_is_a_reconnection(said):
+    assert looks(ConnectionMonitor(), ("A", ""), ("B", ""), ("B", "")) == 1
+    assert said()[-1] == ("INFO", "connected to router B instead of A")
+
+
+def test_router_replaced_after_outage_and_additional_router():
+    link = ConnectionMonitor()
+    assert looks(link, ("A", ""), ("", ""), ("B", "")) == 1
+    assert looks(link, ("BC", "")) == 1  # no router was missed
+
+
+def test_losing_one_of_two_routers_is_a_reconnection(said):
+    link = ConnectionMonitor()
+    assert looks(link, ("AB", ""), ("A", ""), ("AB", "")) == 1
+    assert said()[-2:] == [("WARNING", "router B is gone"), ("INFO", "connected to router B again")]
+
+
+def test_peers_are_not_reconnections(said):
+    assert looks(ConnectionMonitor(), ("", "p"), ("", ""), ("", "pq"), ("", "q")) == 0
+    assert {level for level, _ in said()} == {"INFO"}
+    assert said()[-1][1] == "peer p is gone"
+
+
+def test_connected_peer_does_not_hide_router_loss():
+    assert looks(ConnectionMonitor(), ("A", "p"), ("", "p"), ("A", "p")) == 1
+
+
+PLACES = Considered(1.5, np.array([[1.0, 2.0, 3.0, 0.5, 0.7, 9.0], [4.0, 5.0, 6.0, -0.5, 0.1, 2.0]]), 0.2)
+
+
+@pytest.fixture
+def searched(site):
+    """The session of a robot that has been searched for once, in vain."""
+    session = site.sessions["r1"]
+    site.engine.answer = lambda job: unknown(job, ask=search_request())
+    site.sees("r1", 0.0)
+    site.node.feeds[0].work("track", session, session.take_job("track"))
+    session.handle_result(session.take_job("search"), replace(search_result(), considered=PLACES), time.monotonic())
+    return session
+
+
+def published(site, all_robots=True):
+    publish_statuses(site.node, time.monotonic(), all_robots)
+    return [decode_hypotheses(s) for s in site.net.samples(site.keys["r1"].hypotheses)]
+
+
+def test_nothing_is_published_before_a_search(site):
+    assert published(site) == []
+
+
+def test_places_go_out_with_the_status_of_each_second(site, searched):
+    assert published(site, all_robots=False) == []  # a change of state brings none
+    (message,) = published(site)
+    assert np.allclose(message.places, PLACES.places)
+    assert (message.none, message.stamp_ns, message.map_sha256) == (0.2, 1_500_000_000, SHA)
+
+
+def test_of_a_robot_with_a_place_nothing_goes_out(site, searched):
+    site.engine.answer = tracking
+    site.frame("r1", 0.1)
+    assert searched.state()[0].has_place
+    assert published(site) == []
+
+
+def test_a_new_odometry_frame_forgets_them(site, searched):
+    assert hypotheses(searched) is not None
+    searched.restart_search("asked to search again", forget=True)
+    assert hypotheses(searched) is None
+
+
+def test_a_map_view_is_of_the_map_that_is_served(site, world_file):
+    served = [BaseMap.load(world_file).sha256]
+    key = site.keys["r1"].map_view
+    site.net.answer(key, MapViewAnswer({served[0]: world_file, "00": world_file}, lambda: served[0]))
+    view = site.net.query(key)
+    assert view["map_sha256"] == served[0]
+    assert view["count"] > 1000
+    assert site.net.query(key) is view  # made once
+    served[0] = "00"
+    with pytest.raises(TransportError, match="another map"):
+        site.net.query(key)
