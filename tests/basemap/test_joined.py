@@ -20,7 +20,7 @@ from coview_stream.errors import InputError, MapError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache")]
 
 RADIUS = 30.0
 FAR = np.array([512_003.0, 5_403_210.0, 287.0])
@@ -121,12 +121,6 @@ def test_parts_are_read_strictly():
         MapParts([part]).named("b")
     with pytest.raises(InputError, match="no map is named"):
         MapParts([part]).named(None)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def test_names_are_loaded_as_one_map(world_file):

@@ -12,11 +12,6 @@ from coview_stream.cli import main
 from coview_stream.errors import MapError
 
 
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-
-
 def test_each_cube_keeps_the_point_nearest_to_its_mean():
     rng = np.random.default_rng(5)
     points = rng.uniform(-3.0, 3.0, (2000, 3)).astype(np.float32)

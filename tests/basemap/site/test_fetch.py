@@ -24,10 +24,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+def no_waiting(cache, monkeypatch):
     monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
-    return tmp_path / "cache"
 
 
 class Faulty(DirectorySource):

@@ -43,12 +43,6 @@ def site(halves, tmp_path_factory):
     return directory
 
 
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
 class Interrupted(SerialExecutor):
     """Breaks off after some tiles."""
 

@@ -16,12 +16,6 @@ from coview_stream.basemap.site.working_file import earlier_file, working_file
 
 
 @pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-@pytest.fixture
 def taken(monkeypatch):
     """Number of tiles taken from an earlier file, each time that a working file is made."""
     counts, real = [], EarlierMap.__init__
