@@ -111,7 +111,7 @@ def test_search_after_loss_starts_from_scratch(found, world_drive):
     again = follow(found, anew, frames, 2.5)
     assert {fix.state for fix in again} <= {State.LOST, State.TRACKING}
     assert again[-1].state is State.TRACKING
-    assert min(fix.evidence.score for fix in again) > 0.9
+    assert min(fix.evidence.score for fix in again) > 0.8
     assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in zip(frames, again, strict=True))
 
 
