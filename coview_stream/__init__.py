@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from coview_stream.geometry.protection import ProtectionLevel
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.result import Fix, KeyframeEvidence
-    from coview_stream.localization.search.place_guess import PlaceGuess
+    from coview_stream.localization.search.hints import PlaceGuess
     from coview_stream.localization.state import State
     from coview_stream.localization.tracking.monitor import RejectionReason
     from coview_stream.messages.types import PoseMessage
@@ -93,7 +93,7 @@ _HOMES = {
     "MapConfig": "config",
     "MapError": "errors",
     "MapSummary": "basemap.summary",
-    "PlaceGuess": "localization.search.place_guess",
+    "PlaceGuess": "localization.search.hints",
     "PoseMessage": "messages.types",
     "ProtectionLevel": "geometry.protection",
     "RejectionReason": "localization.tracking.monitor",

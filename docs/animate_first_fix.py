@@ -20,7 +20,7 @@ from coview_stream import BaseMap, Fix, Localizer, LocalizerConfig
 from coview_stream.cli import main as coview_stream
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.search.considered import Considered
+from coview_stream.localization.search.acceptance import Considered
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.recordings import open_run
 from coview_stream.report.plots import STATE_COLOURS, draw_base_map

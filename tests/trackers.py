@@ -13,7 +13,7 @@ from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import voxelized
-from coview_stream.localization.registration.result import Registration
+from coview_stream.localization.registration.register import Registration
 from coview_stream.localization.tracking.tracker import Tracker
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])

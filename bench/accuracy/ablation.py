@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from bench.accuracy.accuracy import evaluated
+from bench.accuracy.paper import Modes
 from bench.accuracy.stages import WINDOW, Bank, Variant, places
 from bench.harness.files import fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs, number, table
 from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
-from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RetrievalConfig
+from coview_stream.config import DescriptorConfig
 from coview_stream.localization.offline import locate
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
@@ -32,23 +33,20 @@ SEEDS = tuple(range(2101, 2109))
 """Held out: not for tuning, as those of ``python -m bench accuracy``."""
 
 _LENGTH = 24.0  # metres driven in each world
-_RING_KEY = RetrievalConfig(mode="ring_key")
-_SINGLE = ConsensusConfig(mode="single")
 _COC = partial(DescriptorConfig, channels=("coview",))
-_STRICT = DescriptorConfig(channels=("coview_strict",))
 
 VARIANTS = (
     Variant("default: both channels, exhaustive, consensus"),
     Variant("Scan Context alone", DescriptorConfig(channels=("scan_context",))),
     Variant("co-view context alone", _COC()),
-    Variant("co-view alone, strict (eq. 2 only)", _STRICT),
-    Variant("ring key retrieval, 200 candidates", retrieval=_RING_KEY),
-    Variant("co-view alone, strict, ring key", _STRICT, _RING_KEY),
-    Variant("single minimum, no consensus", consensus=_SINGLE),
+    Variant("co-view alone, strict (eq. 2 only)", _COC(), Modes(strict=True)),
+    Variant("ring key retrieval, 200 candidates", modes=Modes(ring_key=True)),
+    Variant("co-view alone, strict, ring key", _COC(), Modes(ring_key=True, strict=True)),
+    Variant("single minimum, no consensus", modes=Modes(single=True)),
     Variant("keyframe's zero at the sensor", DescriptorConfig(ground_zero=False)),
     Variant("co-view alone, zero at the sensor", _COC(ground_zero=False)),
-    Variant("all three: co-view, ring key, single", _COC(), _RING_KEY, _SINGLE),
-    Variant("all three: strict, ring key, single", _STRICT, _RING_KEY, _SINGLE),
+    Variant("all three: co-view, ring key, single", _COC(), Modes(ring_key=True, single=True)),
+    Variant("all three: strict, ring key, single", _COC(), Modes(ring_key=True, single=True, strict=True)),
 )
 """The last one is the paper's own method."""
 
@@ -75,8 +73,8 @@ def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Meas
 
 
 def _localize(world: Path, bank: Bank, variant: Variant) -> dict[str, Any]:
-    config = LocalizerConfig(retrieval=variant.retrieval, consensus=variant.consensus)
-    return evaluated(locate(bank.map(variant.descriptor), open_run(world / "run"), config), world)
+    with variant.modes.localizer():
+        return evaluated(locate(bank.map(variant.descriptor, variant.modes), open_run(world / "run")), world)
 
 
 def measure(

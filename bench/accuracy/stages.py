@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from bench.accuracy.paper import Modes, SmallestDistance, add_vote
 from coview_stream import BaseMap
 from coview_stream.basemap import file_format
 from coview_stream.basemap.stations import describe_storeys
 from coview_stream.clouds import read_tum
-from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig, RetrievalConfig
+from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
@@ -26,9 +27,6 @@ from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.smallest_distance import SmallestDistance
-from coview_stream.localization.search.votes import TableVote
 from coview_stream.recordings.open_run import open_run
 
 WINDOW = 5  # keyframes that vote together in the coarse measure
@@ -45,8 +43,7 @@ class Variant:
 
     name: str
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
-    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
-    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
+    modes: Modes = field(default_factory=Modes)
 
 
 @dataclass(frozen=True)
@@ -76,20 +73,23 @@ class Bank:
         arrays, self._parameters, _ = file_format.load(path)
         self._geometry = {name: a for name, a in arrays.items() if not name.startswith(_DESCRIBED)}
         self.built = BaseMap(arrays, self._parameters)
-        self._known: dict[Channel, npt.NDArray[np.float16]] = {}
+        self._known: dict[tuple[Channel, bool], npt.NDArray[np.float16]] = {}
 
-    def map(self, descriptor: DescriptorConfig) -> BaseMap:
+    def map(self, descriptor: DescriptorConfig, modes: Modes) -> BaseMap:
         """Return the base map as if it had been built with ``descriptor``."""
-        described = {f"descriptor.{name}": self._described(name, descriptor) for name in descriptor.channels}
+        with modes.descriptors():
+            described = {
+                f"descriptor.{name}": self._described(name, descriptor, modes.strict) for name in descriptor.channels
+            }
         config = self._parameters["config"] | {"descriptor": asdict(descriptor)}
         return BaseMap(self._geometry | described, self._parameters | {"config": config})
 
-    def _described(self, name: Channel, descriptor: DescriptorConfig) -> npt.NDArray[np.float16]:
-        if name not in self._known:
+    def _described(self, name: Channel, descriptor: DescriptorConfig, strict: bool) -> npt.NDArray[np.float16]:
+        if (name, strict) not in self._known:
             one, block = replace(descriptor, channels=(name,)), self.built.config.block
             points, stations = np.array(self.built.points), self.built.stations
-            self._known[name] = describe_storeys(points, stations, block, one)[name]
-        return self._known[name]
+            self._known[name, strict] = describe_storeys(points, stations, block, one)[name]
+        return self._known[name, strict]
 
 
 def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> Iterator[Seen]:
@@ -114,19 +114,17 @@ class _Search:
 
     def __init__(self, variant: Variant, base_map: BaseMap) -> None:
         self.variant, self.places = variant, Places()
-        grid, window = base_map.station_grid, replace(variant.consensus, window=WINDOW)
-        self._alone = Consensus(grid, replace(variant.consensus, window=1))
+        grid, config = base_map.station_grid, ConsensusConfig()
+        self._alone = Consensus(grid, replace(config, window=1))
         self._window: Consensus | SmallestDistance = (
-            SmallestDistance(grid.stations, window) if window.mode == "single" else Consensus(grid, window)
+            SmallestDistance(grid.stations, WINDOW)
+            if variant.modes.single
+            else Consensus(grid, replace(config, window=WINDOW))
         )
 
     def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
-        vote = TableVote.of_distances(centre, volumes.values())
-        self._alone.vote(vote)
-        if isinstance(self._window, SmallestDistance):
-            self._window.vote(centre, volumes.values())
-        else:
-            self._window.vote(vote)
+        add_vote(self._alone, centre, volumes)
+        add_vote(self._window, centre, volumes)
         self.places.keyframes += 1
         self.places.top1 += right(self._alone.hypotheses()[0].T_map_odom, seen)
         if len(self._window) == WINDOW:
@@ -139,22 +137,24 @@ def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places
     searches = [_Search(variant, bank.built) for variant in variants]
 
     @cache
-    def retrieval(descriptor: DescriptorConfig, config: RetrievalConfig) -> Retrieval:
-        return Retrieval(bank.map(descriptor), config)
+    def described(descriptor: DescriptorConfig, modes: Modes) -> BaseMap:
+        return bank.map(descriptor, modes)
 
     for seen in keyframes_of(world, bank.built.origin, variants[0].descriptor):
-        known: dict[tuple[DescriptorConfig, RetrievalConfig], Floats32] = {}
+        known: dict[tuple[DescriptorConfig, Modes], Floats32] = {}
         for search in searches:
-            descriptor, config = search.variant.descriptor, search.variant.retrieval
+            descriptor, modes = search.variant.descriptor, replace(search.variant.modes, single=False)
             centre = np.array([*seen.position[:2], seen.ground if descriptor.ground_zero else seen.position[2]])
             volumes = {}
             for name in descriptor.channels:
                 one = replace(descriptor, channels=(name,))
-                if (one, config) not in known:
+                if (one, modes) not in known:
                     # the zero is the keyframe's affair: it does not change the stations
-                    stations = retrieval(replace(one, ground_zero=True), config)
-                    known[one, config] = stations.distances(describe(seen.scan, centre, one))[name]
-                volumes[name] = known[one, config]
+                    base_map = described(replace(one, ground_zero=True), modes)
+                    with modes.descriptors():
+                        query = describe(seen.scan, centre, one)
+                    known[one, modes] = modes.distances(base_map, query)[name]
+                volumes[name] = known[one, modes]
             search.vote(seen, centre, volumes)
     return {search.variant.name: search.places for search in searches}
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
+from bench.accuracy.paper import Modes, robust_zscore
 from bench.forest.worlds import Drive, in_odometry
 from bench.harness.files import Clock
 from coview_stream.basemap.basemap import BaseMap
@@ -31,10 +32,9 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan, v
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.localization.search.refinement import Candidate, register_place
+from coview_stream.localization.search.refinement import register_place
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.scoring import PlaceScorer, Scored
-from coview_stream.localization.search.votes import robust_zscore
 from coview_stream.report.evaluation import driven
 
 BEST, APART = 5, 10.0  # places that each method names, and metres between two of them
@@ -118,7 +118,7 @@ class Chain:
         points = prepare_scan(query.submap, query.position, self.config.registration)
         return ObservedScan.of(points, query.cloud, query.T_odom_body)
 
-    def register(self, named: list[Hypothesis], scan: ObservedScan) -> tuple[Scored, list[Candidate]]:
+    def register(self, named: list[Hypothesis], scan: ObservedScan) -> tuple[Scored, list[Hypothesis]]:
         """Return the evidence of the places named, and the most probable of them registered, in that order."""
         scored = PlaceScorer(self._base_map).score(named, range(len(named)), 0, scan)
         found = [
@@ -128,7 +128,7 @@ class Chain:
         return scored, [each for each in found if each is not None]
 
     def metric(
-        self, named: list[Hypothesis], judged: tuple[Scored, list[Candidate]], truth: Pose, query: SearchRequest
+        self, named: list[Hypothesis], judged: tuple[Scored, list[Hypothesis]], truth: Pose, query: SearchRequest
     ) -> dict[str, Any]:
         """Errors of the best hypothesis and the best candidate, and what would have been believed; plain values."""
         scored, candidates = judged
@@ -150,12 +150,9 @@ class Methods:
         """Prepare everything that a first query would wait for; ``MapError`` without features of these weights."""
         self.config, self.base_map = LocalizerConfig(reloc="auto"), base_map
         learned = SearchIndex.of(base_map, replace(self.config, reloc="learned")).learned
-        retrieval = SearchIndex.of(base_map, replace(self.config, reloc="coview")).retrieval
         assert learned is not None
-        assert retrieval is not None
-        self._learned, self._retrieval = learned, retrieval
+        self._learned = learned
         self._learned.prepare()
-        self._retrieval.prepare()
         self._chain = Chain(base_map, self.config)
         maps = LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, replace(self.config, reloc="learned"), maps)
@@ -187,7 +184,7 @@ class Methods:
         """Name places by descriptors."""
         with clock("descriptors"):
             centre = on_ground(query.scan, query)
-            volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
+            volumes = Modes().distances(self.base_map, describe(query.scan, centre, self.base_map.descriptor_config))
             both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in by_volume.items()}
@@ -201,18 +198,17 @@ class Methods:
             view = self._learned.encode(query.surroundings, centre)
         with clock("correlation"):
             vote = self._learned.vote(view)
-            peaks = replace(self.config.consensus, mode="consensus", peaks=BEST)
+            peaks = replace(self.config.consensus, peaks=BEST)
             consensus = Consensus(self.base_map.station_grid, peaks)
             consensus.vote(vote)
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
         with clock("registration"):
             judged = self._chain.register(voted, self._chain.scan(query))
-        verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in judged[1]]
         features = self._learned.features
         places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
         named, shifts = vote.candidates()
         places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
-        places["verified"] = _in_turn(verified, query)
+        places["verified"] = _in_turn(judged[1], query)
         return self._chain.metric(voted, judged, truth, query)
 
     def _searched(self, query: SearchRequest, truth: Pose) -> tuple[Floats, tuple[float, float] | None]:

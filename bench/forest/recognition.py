@@ -30,6 +30,7 @@ import numpy as np
 from matplotlib.path import Path as Outline
 
 import coview_kernels as kernels
+from bench.accuracy.paper import robust_zscore
 from bench.forest.worlds import say
 from bench.harness.rows import Row, informs, number, table
 from coview_stream.clouds import read_cloud
@@ -40,7 +41,6 @@ from coview_stream.descriptors.network import ViewName, network
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, quat_to_matrix, rot_z, transform, yaw_of
-from coview_stream.localization.search.votes import robust_zscore
 
 WITHIN = {"wild-places": 5.0, "cs-wild-places": 30.0}
 """Metres in the plane within which a submap is the right one, as the sets' own scripts have them by default."""

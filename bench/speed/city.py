@@ -33,14 +33,12 @@ from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
-from coview_stream.config import ConsensusConfig, RetrievalConfig
+from coview_stream.config import ConsensusConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
-from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.search_stations import SearchStations
-from coview_stream.localization.search.station_consensus import StationConsensus
+from coview_stream.localization.search.hints import PlaceGuess
+from coview_stream.localization.search.retrieval import Retrieval, SearchStations, StationConsensus
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
@@ -207,7 +205,7 @@ def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:
     kernels.warm_up()
     out: dict[str, Any] = {"in_circle": int(circle.holds(base_map.stations).sum())}
     for name, kind, area in (("all", _AllCompared, None), ("squares", Retrieval, None), ("circle", Retrieval, circle)):
-        consensus = StationConsensus(kind(base_map, RetrievalConfig()), config)
+        consensus = StationConsensus(kind(base_map), config)
         times, ranks = list[float](), list[int | None]()
         for drive in drives:
             places = np.array([(seen.T_map_odom @ np.append(seen.position, 1.0))[:2] for seen, _, _ in drive])

@@ -30,13 +30,12 @@ from bench.harness.worlds import WORLDS, opened, prepare, world_name
 from bench.speed.search import last_core
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import ConsensusConfig, RetrievalConfig
+from coview_stream.config import ConsensusConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.station_consensus import StationConsensus
+from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 MOST_SLOPE, MOST_MS, MOST_QUERY_MS = 1.0, 30.0, 1000.0
@@ -120,7 +119,7 @@ def voted(out: Path, radius: float | None = None, apart: int = 1) -> dict[str, A
     assert index is not None
     stations[:, :2] *= apart
     site: Any = SimpleNamespace(station_index=index, station_grid=StationGrid(stations, apart * block))
-    retrieval, config = Retrieval(site, RetrievalConfig()), ConsensusConfig()
+    retrieval, config = Retrieval(site), ConsensusConfig()
     keyframes = [
         (
             Seen(np.zeros((0, 3), dtype=np.float32), position, float(ground), truth),

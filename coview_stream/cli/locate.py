@@ -45,7 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_gravity(parser)
     add_mount(parser)
     add_topics(parser)
-    parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
     parser.add_argument(
         "--export", metavar="A,B", help="also trajectory.csv, .kitti, .geojson or .gpx: csv,kitti,geojson,gpx"
     )
@@ -63,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.config import LocalizerConfig, RegistrationConfig, RetrievalConfig
+    from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import locate, summary, write
     from coview_stream.localization.registration.gicp import library
@@ -98,7 +97,6 @@ def run(args: argparse.Namespace) -> int:
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = LocalizerConfig(
-        retrieval=RetrievalConfig(mode=args.retrieval),
         registration=RegistrationConfig(method=args.registration),
         acceptance=acceptance,
         reloc=args.reloc if missing is None else "coview",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
     from coview_stream.config.mount import Mount
     from coview_stream.config.odometry import LidarOdometryConfig
-    from coview_stream.localization.search.place_guess import PlaceGuess
+    from coview_stream.localization.search.hints import PlaceGuess
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
@@ -106,7 +106,7 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
     """
     from coview_stream.errors import ConfigError
     from coview_stream.geometry.validation import MAX_COORDINATE
-    from coview_stream.localization.search.place_guess import MIN_WITHIN, PlaceGuess
+    from coview_stream.localization.search.hints import MIN_WITHIN, PlaceGuess
 
     if text is None:
         if within is not None:

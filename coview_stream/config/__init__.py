@@ -16,7 +16,6 @@ from coview_stream.config.localizer import (
     RegistrationConfig,
     RegistrationMethod,
     Reloc,
-    RetrievalConfig,
     TrackingConfig,
 )
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, config_of_map, map_preset
@@ -37,7 +36,6 @@ __all__ = [
     "RegistrationConfig",
     "RegistrationMethod",
     "Reloc",
-    "RetrievalConfig",
     "TrackingConfig",
     "config_of_map",
     "map_preset",

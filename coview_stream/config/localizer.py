@@ -79,7 +79,7 @@ class RegistrationConfig:
         gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
         weak_lever: metres; an angle counts like the shift that it makes at this distance.
         weak_from: metres; a direction that is known less well is one that the map hardly shows, and its sigma is
-            widened (:func:`coview_stream.localization.registration.covariance.registration_covariance`).
+            widened (:func:`coview_stream.localization.registration.register.registration_covariance`).
         weak_sigma: metres, the largest sigma that this gives.
     """
 
@@ -144,31 +144,10 @@ class KeyframeConfig:
 
 
 @dataclass(frozen=True)
-class RetrievalConfig:
-    """Retrieval: which stations are scored (paper, section 3.4); ``python -m bench ablation`` compares the two modes.
-
-    Attributes:
-        mode: ``exhaustive`` scores all stations at all shifts. ``ring_key`` is the paper's way, kept for comparison:
-            only the stations nearest in ring key are scored, all others count as worst.
-        candidates: how many those are.
-    """
-
-    mode: Literal["exhaustive", "ring_key"] = "exhaustive"
-    candidates: int = 200
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        require(self.mode in ("exhaustive", "ring_key"), self, "mode", "exhaustive or ring_key")
-        counts(self, "candidates")
-
-
-@dataclass(frozen=True)
 class ConsensusConfig:
     """Consensus: the votes of keyframes for one ``T_map_odom``.
 
     Attributes:
-        mode: ``consensus``; or ``single``, the paper's rule: the one smallest distance of all keyframes.
-            ``python -m bench ablation`` compares them.
         window: newest keyframes that vote; set by hand.
         peaks: best hypotheses that are scored by the likelihood field; more of the co-view descriptors on maps of
             more than 20,000 stations, by the fourth root. Set by hand.
@@ -176,7 +155,6 @@ class ConsensusConfig:
         distinct_yaw: radians; so is one turned by more than this; set by hand.
     """
 
-    mode: Literal["consensus", "single"] = "consensus"
     window: int = 10
     peaks: int = 184
     distinct_distance: float = 6.0
@@ -184,7 +162,6 @@ class ConsensusConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        require(self.mode in ("consensus", "single"), self, "mode", "consensus or single")
         counts(self, "window", "peaks")
         positive(self, "distinct_distance", "distinct_yaw")
 
@@ -316,7 +293,6 @@ class LocalizerConfig:
 
     Attributes:
         keyframe: selection of keyframes.
-        retrieval: comparison of a keyframe with the map's stations.
         consensus: votes of keyframes.
         registration: registration of scans to the map, and its covariance.
         acceptance: limits of a fix.
@@ -330,7 +306,6 @@ class LocalizerConfig:
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
-    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
     consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

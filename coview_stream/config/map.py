@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from coview_stream.config.checks import check_types, counts, positive, require
 from coview_stream.errors import ConfigError
 
-Channel = Literal["scan_context", "coview", "coview_strict"]
+Channel = Literal["scan_context", "coview"]
 Preset = Literal["slam", "tls"]
 
 
@@ -24,10 +24,9 @@ class DescriptorConfig:
         rings: bins along it.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together. ``scan_context`` is the maximum height of every bin, ``coview`` keeps
-            the parts that both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only the
-            horizontally visible ones. Seen once, no command prints it: unlike views (an airborne map) favour
-            co-visibility, like views Scan Context, and the two together are right on both. ``python -m bench
-            ablation`` compares them on simulated worlds.
+            the bins that both views can see (eqs 1-3: horizontally visible, or dense). Unlike views (an airborne map)
+            favour co-visibility, like views Scan Context, and the two together are right on both;
+            ``python -m bench ablation`` compares them on simulated worlds.
         voxel: metres; one point is kept in each cube of this size first.
         ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
             the sensor. ``python -m bench ablation`` compares the two.

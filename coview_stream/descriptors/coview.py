@@ -10,13 +10,13 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_kernels import PolarGrid
 from coview_stream.config import Channel, DescriptorConfig
-from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 
 Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
-_VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_strict": "off"}
+_VERTICAL: Literal["max", "off"] = "max"  # ``off`` is the strict reading of eq. 2; bench ablation compares them
 _GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows the ground
 
 
@@ -28,7 +28,7 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     if name == "scan_context":
         value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
         return value
-    return kernels.coview(*grid, vertical=_VERTICAL[name])
+    return kernels.coview(*grid, vertical=_VERTICAL)
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
@@ -39,17 +39,10 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
         centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
         config: bins and channels.
     """
-    first: Channel = "coview" if "coview" in config.channels else "coview_strict"
     grid, context, _ = kernels.describe_points(
-        points, centre, config.rings, config.sectors, config.radius, vertical=_VERTICAL[first]
+        points, centre, config.rings, config.sectors, config.radius, vertical=_VERTICAL
     )
-    return {name: context if name == first else channel(name, grid) for name in config.channels}
-
-
-def ring_key(descriptor: Descriptor) -> Floats32:
-    """Return the paper's rotation-invariant key (..., R): share of occupied (non-zero) sectors of every ring."""
-    key: Floats32 = (descriptor != 0).mean(axis=-1, dtype=np.float32)
-    return key
+    return {name: context if name == "coview" else channel(name, grid) for name in config.channels}
 
 
 def ground_below(points: Points, position: Floats) -> float:

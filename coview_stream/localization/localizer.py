@@ -19,7 +19,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.place_guess import PlaceGuess, has_ground
+from coview_stream.localization.search.hints import PlaceGuess, has_ground
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search_requests import NoSearch, SearchRequests
@@ -28,7 +28,6 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
-_BY_INDEX = ("exhaustive", "consensus")  # modes of retrieval and consensus
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred
 
 
@@ -195,7 +194,8 @@ class Localizer:
         if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
             return
         self._evidence = result.evidence
-        if result.accepted is None:
+        registration = None if result.accepted is None else result.accepted.registration
+        if registration is None:
             if result.T_map_cloud is not None and result.evidence.evidence is not None:  # it has been registered
                 probability = result.evidence.confidence or 0.0
                 leader = self._frames.learn_place(result.T_map_cloud, result.T_odom_body, probability)
@@ -208,7 +208,7 @@ class Localizer:
         self._confidence = result.evidence.confidence or 0.0
         assert result.T_map_cloud is not None  # the accepted place leads
         T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
-        registration = replace(result.accepted.registration, T_map_source=T_map_odom)
+        registration = replace(registration, T_map_source=T_map_odom)
         self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._requests.place_accepted()
@@ -277,16 +277,10 @@ class Localizer:
             check: refuse one of no use; without, nothing is found where the map has no ground in the circle.
 
         Raises:
-            InputError: it is no guess, the map has no ground there, or stations are not compared by their index, which
-                circles need.
+            InputError: it is no guess, or the map has no ground there.
         """
         if not isinstance(guess, PlaceGuess):
             raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
-        if guess.within is not None and (self.config.retrieval.mode, self.config.consensus.mode) != _BY_INDEX:
-            raise InputError(
-                "within: is for exhaustive retrieval and consensus, not for the paper's own modes; leave out one of "
-                "them (--within or --retrieval ring_key)"
-            )
         if check and not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
             around = guess.within or guess.distance
             raise InputError(

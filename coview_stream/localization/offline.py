@@ -25,7 +25,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.recordings.run import Frame, Run, SweepCorrection
 

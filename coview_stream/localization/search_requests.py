@@ -12,9 +12,8 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import RangeImage
 from coview_stream.localization.frame import Frame, FramePreparation
 from coview_stream.localization.registration.prepare_scan import thinned
+from coview_stream.localization.search.hints import PlaceGuess, PoseHints, robot_position
 from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
-from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.localization.search.pose_hints import PoseHints, robot_position
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
 from coview_stream.localization.tracking.monitor import RejectionReason
 

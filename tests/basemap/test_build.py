@@ -179,7 +179,7 @@ def test_missing_source_is_refused(tmp_path):
 
 def test_configuration_replaces_preset_and_options(cut, tmp_path):
     np.save(tmp_path / "site.npy", cut[::3])
-    config = map_preset("slam", block=4.0, channels=("coview_strict",), **SMALL)
+    config = map_preset("slam", block=4.0, channels=("coview",), **SMALL)
     built = BaseMap.build(tmp_path / "site.npy", config=config)
     assert built.config == config
     assert np.allclose((built.stations[:, :2] / 4.0) % 1.0, 0.5)

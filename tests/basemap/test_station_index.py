@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.accuracy.paper import TableVote
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
-from coview_stream.config import RetrievalConfig
 from coview_stream.errors import MapError
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.votes import TableVote
+from coview_stream.localization.search.retrieval import exact_distances
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +25,7 @@ def query(world_map):
 def test_scores_are_near_those_of_the_exact_distances(world_map, query):
     index = world_map.station_index
     asked = index.query(query)
-    exact = Retrieval(world_map, RetrievalConfig()).distances(query)
+    exact = {name: exact_distances(world_map.descriptors(name), query[name]) for name in query}
     expected = TableVote.of_distances(np.zeros(3), exact.values()).scores
     found = index.all_shifts(asked, np.arange(len(index)))
     assert (

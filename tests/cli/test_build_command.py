@@ -56,11 +56,11 @@ def test_last_line_tells_what_the_map_covers_and_warnings_are_one_line_each(map_
 def test_preset_channels_and_descriptor_options(cloud, tmp_path):
     target = tmp_path / "site.coview"
     options = ["--preset", "tls", "--rings", "5", "--sectors", "8"]
-    options += ["--channels", "coview_strict, scan_context"]
+    options += ["--channels", "coview, scan_context"]
     assert main(["build", str(cloud), "-o", str(target), *options]) == 0
     config = BaseMap.load(target).descriptor_config
     assert config.radius == 100.0
-    assert config.channels == ("coview_strict", "scan_context")
+    assert config.channels == ("coview", "scan_context")
     assert (config.rings, config.sectors) == (5, 8)
 
 

@@ -18,7 +18,6 @@ from coview_stream.config import (
     LocalizerConfig,
     MapConfig,
     RegistrationConfig,
-    RetrievalConfig,
     TrackingConfig,
     map_preset,
 )
@@ -29,7 +28,7 @@ from coview_stream.errors import ConfigError
 CONFIGS = [
     AcceptanceConfig, ConsensusConfig, DescriptorConfig, GraphConfig, KeyframeConfig, LearnedConfig,
     LidarOdometryConfig, LocalizerConfig, MapConfig, NodeConfig, RegistrationConfig,
-    RetrievalConfig, TrackingConfig,
+    TrackingConfig,
 ]  # fmt: skip
 
 BAD = [
@@ -51,13 +50,10 @@ BAD = [
     (KeyframeConfig, "distance", 0.0),
     (KeyframeConfig, "capacity", 0),
     (KeyframeConfig, "range_min", -0.5),
-    (RetrievalConfig, "mode", "guess"),
-    (RetrievalConfig, "candidates", 0),
     (LearnedConfig, "reach", float("nan")),
     (LearnedConfig, "reach", 33.0),
     (LearnedConfig, "yaws", 361),
     (LearnedConfig, "dense_area", 0.0),
-    (ConsensusConfig, "mode", "majority"),
     (ConsensusConfig, "window", 0),
     (ConsensusConfig, "peaks", 0),
     (ConsensusConfig, "distinct_yaw", 0.0),
@@ -115,7 +111,6 @@ def test_defaults_are_those_of_the_paper():
     assert (usual.block, usual.descriptor.radius) == (2.0, 50.0)
     assert (usual.descriptor.rings, usual.descriptor.sectors) == (20, 60)
     assert LocalizerConfig().keyframe.distance == 2.0
-    assert LocalizerConfig().retrieval.mode == "exhaustive"
 
 
 def test_configurations_are_frozen_and_equal_by_value():

@@ -7,9 +7,9 @@ import pytest
 
 from coview_stream.basemap.stations import aligned_corner, describe_stations, rasterise
 from coview_stream.config import DescriptorConfig
-from coview_stream.descriptors.coview import describe, ground_below, ring_key
+from coview_stream.descriptors.coview import describe, ground_below
 
-ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "coview_strict"))
+ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview"))
 
 
 def polar(r, degrees, z):
@@ -108,13 +108,3 @@ def test_without_ground_points_sensor_height_is_returned():
     sensor = np.array([0.0, 0.0, 2.0])
     assert ground_below(np.empty((0, 3), np.float32), sensor) == 2.0
     assert ground_below(polar(3.0, np.arange(0.0, 360, 5), 5.0), sensor) == 2.0
-
-
-def test_ring_key_is_occupied_share_and_rotation_invariant():
-    descriptor = np.zeros((4, 12), np.float32)
-    descriptor[0] = 2.0
-    descriptor[1, :3] = 7.0
-    descriptor[3, 5] = 0.1
-    np.testing.assert_allclose(ring_key(descriptor), [1.0, 0.25, 0.0, 1 / 12])
-    np.testing.assert_allclose(ring_key(np.roll(descriptor, 5, axis=1)), ring_key(descriptor))
-    assert ring_key(np.stack([descriptor] * 3)).shape == (3, 4)

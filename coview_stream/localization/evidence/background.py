@@ -3,6 +3,9 @@
 All but the places around the leader are chance places. Their mean shares are what an observation is worth at a wrong
 place, in a yard of equal boxes as much as 0.4. How far they scatter about that mean says how many independent
 observations a scan is: neighbouring points fall and rise together, and so do the scans of successive keyframes.
+
+A search has hundreds of wrong places to compare with. While tracking there is one place, so the background is measured
+in rings around it, where walls and ground are of the same kind (:func:`observe_with_background`).
 """
 
 from __future__ import annotations
@@ -12,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
+import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.localization.evidence.observation import Share
+from coview_stream.localization.evidence.observation import ObservedScan, Share
 
 # what is presumed before any place has been scored: as many chance places as these; set by hand
 _PSEUDO = 6.0  # chance places
@@ -27,6 +31,8 @@ _MANY = 20  # places, of which the second largest share tells something
 _CALIBRATED = 1.75
 """Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
 e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
+_RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
+_TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
 
 
@@ -148,3 +154,26 @@ def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:
     spread = float(np.clip(shares.var(), 1e-4, 0.9 * mean * (1.0 - mean)))
     size = mean * (1.0 - mean) / spread - 1.0
     return max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)
+
+
+def observe_with_background(
+    field: kernels.FieldMap, scan: ObservedScan, T_map_odom: Floats
+) -> tuple[Floats32, Background]:
+    """Observe the map from poses (P, 4, 4) as they are, and measure the background around the first of them.
+
+    Returns:
+        Observations (P, 7), see :class:`~coview_stream.localization.evidence.observation.Share`, and the background.
+    """
+    poses = scan.poses(T_map_odom)
+    observed = scan.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), kernels.Move.NONE).shares
+    places, chance = observed[: len(poses)], observed[len(poses) :]
+    return places, estimate_background(chance, scatter(chance), chance[:0], Most(*scan.patches))
+
+
+def chance_places(pose: Floats) -> Floats:
+    """Return poses (H, 4), x, y, z and heading, in rings around one (4,), turned a little."""
+    ring, spoke = (index.ravel() for index in np.indices((len(_RINGS), _SPOKES)))
+    angle = 2.0 * np.pi * (spoke + 0.5 * (ring % 2)) / _SPOKES
+    radius, turn = np.take(_RINGS, ring), np.take(_TURNS, (ring + spoke) % len(_TURNS))
+    zero = np.zeros_like(radius)
+    return np.asarray(pose + np.column_stack([radius * np.cos(angle), radius * np.sin(angle), zero, turn]))

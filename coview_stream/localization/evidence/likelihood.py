@@ -15,22 +15,28 @@ than chance cannot gain, as q >= 0. What the map does not cover adds nothing; a 
 The ground is one observation of a place, not many, for a road is level everywhere: its share is held against the Beta
 distribution of the chance places' shares. One chance place in a hundred is presumed to be as clear and as level as the
 right one.
+
+The prior of a place is even between "one of these" and "none of these" (outside the map, a wrong map, a rearranged
+site), and among these falls with its rank in the votes that named it. As likelihoods are against chance, "none of
+these" has the likelihood 1. Chance gives a ratio of R or more with a probability of at most 1 / R (Markov), so N places
+give at most N / R equally good ones by chance, in expectation.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betaln
 
-from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import Background, outcomes
 from coview_stream.localization.evidence.observation import Share
 
 # set by hand
-_KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over
-_KEPT_PRIOR = _KEPT / _KEPT.sum()
+KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over
+_KEPT_PRIOR = KEPT / KEPT.sum()
 _SURVEYS = np.array(
     [
         [0.1, 0.25, 0.6, 0.05],
@@ -51,24 +57,22 @@ _OPEN = 0.01  # share of chance places that are as clear of structure and as lev
 _EDGE = 0.02  # shares of the ground beyond it are not told apart
 
 
-NUISANCES = (len(_KEPT), len(_SURVEYS), len(_LEAKS))
+NUISANCES = (len(KEPT), len(_SURVEYS), len(_LEAKS))
 """Shape (Q, D, L) of a table over the nuisances: share kept, kind of survey, leaks."""
 
 
-def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[Floats, Floats]:
-    """Return log-likelihood ratios (P,) of places against chance, and the shares q (P,) that explain them best.
+def log_likelihood_ratios(observed: Floats32, background: Background) -> Floats:
+    """Return log-likelihood ratios (P,) of places against chance, summed over the nuisances.
 
     Args:
         observed: (P, 7) mean observations at the places, see :class:`Share`.
-        background: what chance explains.
+        background: the shares that chance explains.
     """
-    each = log_likelihoods(observed, background)
-    if not len(each):
-        return np.empty(0), np.empty(0)
-    best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
-    flat = each.reshape(len(each), -1)
-    top = flat.max(axis=1)
-    return np.log(np.exp(flat - top[:, None]) @ nuisance_prior(background).ravel()) + top, best
+    if not len(observed):
+        return np.empty(0)
+    table = log_likelihoods(observed, background).reshape(len(observed), -1)
+    top = table.max(axis=1)
+    return np.asarray(np.log(np.exp(table - top[:, None]) @ nuisance_prior(background).ravel()) + top)
 
 
 def nuisance_prior(background: Background) -> Floats:
@@ -86,10 +90,10 @@ def nuisance_prior(background: Background) -> Floats:
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     """Return log-likelihood ratios (P, Q, D, L) of places against chance, for each value of the nuisances."""
     counts = outcomes(observed)
-    q = _KEPT[:, None, None]
+    q = KEPT[:, None, None]
     explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
     structure = np.einsum("pc,qdc->pqd", counts, np.log(explained / background.structure)) * background.number[0]
-    passed = background.passed * (_KEPT[:, None] * _LEAKS + 1.0 - _KEPT[:, None])  # (Q, L)
+    passed = background.passed * (KEPT[:, None] * _LEAKS + 1.0 - KEPT[:, None])  # (Q, L)
     hit = observed[:, Share.PASSED].astype(np.float64)
     covered = np.maximum(observed[:, Share.COVERED], observed[:, Share.COVERED_GROUND])
     clear = np.maximum(covered - hit, 0.0)
@@ -100,11 +104,6 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     beside = free + _ground(observed, background)[:, None, None]
     beside -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + beside)  # chance, too, may stand on an open road
     return np.asarray(structure[:, :, :, None] + beside[:, :, None, :])
-
-
-def steps_of_kept() -> Floats:
-    """Return the shares q (Q,) that are summed over."""
-    return _KEPT.copy()
 
 
 def _ground(observed: Floats32, background: Background) -> Floats:
@@ -120,3 +119,44 @@ def _ground(observed: Floats32, background: Background) -> Floats:
 
 def _beta(x: Floats, a: float, b: float) -> Floats:
     return np.asarray((a - 1.0) * np.log(x) + (b - 1.0) * np.log1p(-x) - betaln(a, b))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probabilities of places.
+
+    Attributes:
+        place: (P,) that the robot is there.
+        none: that it is at none of them.
+    """
+
+    place: Floats
+    none: float
+
+    def error(self, same: Bools) -> float:
+        """Return the probability that the robot is at none of the places ``same`` (P,): summed, so that 1e-30 is."""
+        return float(self.place[~same].sum() + self.none)
+
+
+def posterior(ratios: Floats, votes: Ints, count: int, looks: int = 1) -> Posterior:
+    """Return the posterior of places.
+
+    Args:
+        ratios: (P,) log-likelihood ratios against chance.
+        votes: (P,) rank of each in the votes, from 0.
+        count: number N of places that were scored, these among them: the others have the likelihood of chance.
+        looks: how often a search has looked anew, on other keyframes than before: each is another chance of an error.
+    """
+    ranks = np.minimum(votes, max(count, 1) - 1)
+    # two recognizers rank places, and those that are followed keep theirs: the sum may be more than one list's
+    harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
+    total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
+    logs = np.append(ratios - np.log1p(ranks) - np.log(total * looks), 0.0)
+    odds = np.exp(logs - logs.max())
+    odds /= odds.sum()
+    return Posterior(odds[:-1], float(odds[-1]))
+
+
+def expected_by_chance(ratio: float, count: int) -> float:
+    """Return the expected number of chance places, of ``count``, with a log-likelihood ratio of ``ratio`` or more."""
+    return float(count * np.exp(-max(ratio, 0.0)))

@@ -23,7 +23,6 @@ never imports small_gicp.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +32,7 @@ import coview_kernels as kernels
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, norms, orthonormal, skew
-from coview_stream.localization.registration.result import MIN_PAIRS, Registration
+from coview_stream.localization.registration.local_map import MIN_PAIRS
 
 # set by hand
 _NEIGHBOURS = 10  # that a point's covariance is made of; small_gicp's own choice
@@ -96,7 +95,7 @@ def register_surfaces(
     keep: float,
     iterations: int,
     prior: kernels.Belief | None = None,
-) -> Registration | None:
+) -> kernels.Alignment | None:
     """Register the points of a scan, those above the ground and those on it.
 
     Args:
@@ -133,10 +132,10 @@ def register_surfaces(
             total += 1
             turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             converged = bool(shift < scale.shift and turn < scale.turn)
-            answer = Registration(T, information, pairs.rmse, pairs.kept, total, converged)
+            answer = kernels.Alignment(T, information, pairs.rmse, pairs.kept, total, converged)
             if converged:
                 break
-    return None if answer is None else replace(answer, T_map_source=orthonormal(T))
+    return None if answer is None else kernels.Alignment(orthonormal(T), *answer[1:])
 
 
 class _Pairs(NamedTuple):

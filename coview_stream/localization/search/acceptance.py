@@ -8,14 +8,13 @@ import numpy as np
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, pose_from
+from coview_stream.geometry.transforms import Pose, pose_from, yaw_of
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
-from coview_stream.localization.search.considered import Considered
-from coview_stream.localization.search.pose_hints import FROM_THERE
-from coview_stream.localization.search.refinement import Candidate
+from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.hints import FROM_THERE
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest
-from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
+from coview_stream.localization.search.scoring import Rivals, Scored
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
@@ -25,28 +24,56 @@ IN_CIRCLE = " (searched in the circle given)"
 """What a reason for no pose contains where nothing outside of a circle was searched."""
 
 
+MAX_PLACES = 20  # more cannot be told apart on a screen, and a message of them stays below 3 kB
+
+
+@dataclass(frozen=True)
+class Considered:
+    """The most probable places of a robot at a keyframe, for people to look at; nothing is decided by them.
+
+    Attributes:
+        stamp: seconds, of the keyframe.
+        places: (K, 6) float64, the most probable first: x, y, z and yaw of the body in the frame of the map's sources
+            (metres, radians), the posterior probability, and the log-likelihood ratio against chance.
+        none: probability that the robot is at no place of the map.
+    """
+
+    stamp: float
+    places: Floats
+    none: float
+
+    @classmethod
+    def of(cls, scored: Scored, request: SearchRequest, origin: Floats) -> Considered | None:
+        """Sum up a keyframe's places; ``origin`` (3,) is the map's; None without any place."""
+        rows = []
+        for place in sorted(scored.places, key=lambda place: -place.probability)[:MAX_PLACES]:
+            T_map_body = place.T_map_odom @ request.T_odom_body
+            rows.append([*(T_map_body[:3, 3] + origin), yaw_of(T_map_body), place.probability, place.ratio])
+        return cls(request.stamp, np.array(rows, dtype=np.float64), float(scored.none)) if rows else None
+
+
 @dataclass(frozen=True)
 class SearchResult:
     """Result of one keyframe's search.
 
     Attributes:
-        accepted: the place, once there is one.
+        accepted: the registered place, once there is one.
         evidence: of the most probable place, with the state it leads to and the reason.
         travelled: metres that odometry had driven at the keyframe.
         epoch: the request's.
         rivals: all places that the keyframe was scored at, the most probable among them.
-        T_odom_body: (4, 4) of the keyframe.
         leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
             without any place.
-        R_body_cloud: (3, 3) rotation that the keyframe's clouds have been levelled by.
+        T_odom_body: (4, 4) of the keyframe.
+        R_body_cloud: (3, 3) rotation that levelled the keyframe's clouds.
         considered: the most probable places, for people to look at; None where none was scored.
     """
 
-    accepted: Candidate | None
+    accepted: Hypothesis | None
     evidence: KeyframeEvidence
     travelled: float = 0.0
     epoch: Epoch = FIRST_EPOCH
-    rivals: Rivals = field(default_factory=Rivals.none)
+    rivals: Rivals = field(default_factory=Rivals)
     leader: Pose | None = None
     T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
     R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
@@ -61,13 +88,13 @@ class SearchResult:
 
 
 def decide(
-    scored: Scored, leader: Candidate | None, request: SearchRequest, rule: AcceptanceConfig, undecided: float = 0.0
+    scored: Scored, leader: Hypothesis | None, request: SearchRequest, rule: AcceptanceConfig, undecided: float = 0.0
 ) -> SearchResult:
     """Judge a keyframe.
 
     Args:
         scored: the places, the most probable first.
-        leader: the most probable place, registered and verified; None if that failed.
+        leader: the most probable place, registered; None if that failed.
         request: the keyframe.
         rule: the integrity risk.
         undecided: metres between poses of the first place that are as probable; 0 if one is more probable than all.
@@ -75,41 +102,33 @@ def decide(
     state, reason = _verdict(scored, leader, rule, undecided)
     if request.area is not None and state is not State.TRACKING:
         reason += IN_CIRCLE
-    if not scored.places:
-        evidence = KeyframeEvidence(request.stamp, state, reason)
-        return _result(request, None, evidence, scored.rivals)
-    best = scored.places[0]
-    own = best.hypothesis
-    if own.station is None and best.hinted:
-        reason += FROM_THERE
-    elif own.learned:
-        reason += BY_FEATURES
-    evidence = KeyframeEvidence(
-        request.stamp, state, reason, best.score if leader is None else leader.evidence.score,
-        0.0 if scored.second is None else scored.second.score, None if leader is None else leader.evidence,
-        own.station, None if own.learned else own.shift, confidence=1.0 - scored.error, by_chance=scored.by_chance,
-    )  # fmt: skip
-    accepted = leader if state is State.TRACKING else None
-    T_map_odom = own.T_map_odom if leader is None else leader.T_map_odom
-    return _result(request, accepted, evidence, scored.rivals, T_map_odom)
-
-
-def _result(
-    request: SearchRequest, accepted: Candidate | None, evidence: KeyframeEvidence, rivals: Rivals,
-    leader: Pose | None = None,
-) -> SearchResult:  # fmt: skip
+    evidence, T_map_odom = KeyframeEvidence(request.stamp, state, reason), None
+    if scored.places:
+        best, second = scored.places[0], scored.second
+        if best.station is None and best.hinted:
+            reason += FROM_THERE
+        elif best.learned:
+            reason += BY_FEATURES
+        shares = None if leader is None else leader.evidence
+        evidence = KeyframeEvidence(
+            request.stamp, state, reason, best.score if shares is None else shares.score,
+            0.0 if second is None else second.score, shares, best.station, None if best.learned else best.shift,
+            confidence=1.0 - scored.error, by_chance=scored.by_chance,
+        )  # fmt: skip
+        T_map_odom = (leader or best).T_map_odom
     return SearchResult(
-        accepted, evidence, request.travelled, request.epoch, rivals, leader, request.T_odom_body, request.R_body_cloud
-    )
+        leader if state is State.TRACKING else None, evidence, request.travelled, request.epoch, scored.rivals,
+        T_map_odom, request.T_odom_body, request.R_body_cloud,
+    )  # fmt: skip
 
 
-def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, undecided: float) -> tuple[State, str]:
+def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, undecided: float) -> tuple[State, str]:
     if not scored.places:
         return State.SEARCHING, "too few points to search with"
     if scored.error < rule.risk:
         if leader is None:
             return State.AMBIGUOUS, "the place that stands out does not register"
-        if all(place.hypothesis.station is None for place in scored.places):
+        if all(place.station is None for place in scored.places):
             return State.AMBIGUOUS, "no vote has named a place to compare it with"  # a hint is not trusted
         if undecided:
             return State.AMBIGUOUS, f"the place is found, but poses {undecided:.1f} m apart fit there equally"
@@ -132,7 +151,7 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, u
     return State.AMBIGUOUS, f"one place leads: wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
 
 
-def _apart(best: ScoredPlace, second: ScoredPlace) -> str:
+def _apart(best: Hypothesis, second: Hypothesis) -> str:
     times = best.probability / max(second.probability, 1e-300)
     if times < 1.5:
         return "equally"

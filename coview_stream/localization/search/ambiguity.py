@@ -1,9 +1,9 @@
 """Ambiguity of a map: at which of its stations the map itself would leave a robot undecided, and for how long.
 
-At a station the map is seen as a robot would see it (:mod:`coview_stream.localization.search.virtual_scan`), with a
-share of the site changed since the survey, and the place is searched for by the evidence of a search: among what the
-votes of the station's own descriptors name, and places around it. Where that leaves an error above the risk, the robot
-drives on, along the longest way that is open, and the keyframes there are added as a search adds them.
+At a station the map is seen as a robot would see it (:func:`virtual_scan`), with a share of the site changed since the
+survey, and the place is searched for by a search's evidence: among the places that the votes of the station's own
+descriptors name, and places around it. Where that leaves an error above the risk, the robot drives on, along the
+longest open way, and the keyframes there are added as a search adds them.
 """
 
 from __future__ import annotations
@@ -11,29 +11,27 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
-from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.arrays import Bools, Floats, Indices
-from coview_stream.geometry.transforms import yaw_of
+from coview_stream.config import LocalizerConfig, RegistrationConfig
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
+from coview_stream.geometry.rasters import min_filter
+from coview_stream.geometry.transforms import Points, norms, pose_from, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
+from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.scoring import PlaceScorer, Scored, ScoredPlace
-from coview_stream.localization.search.station_consensus import StationConsensus
-from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
+from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
+from coview_stream.localization.search.scoring import AROUND, PlaceScorer, Scored
 
-# set by hand
-STATIONS = 1000  # at most so many are looked at, a twentieth of a second each
-_DRIVES = 100  # from so many of those that are not found at once a robot drives; the others have the nearest one's
+STATIONS = 1000  # looked at, at most; a twentieth of a second each
+_DRIVES = 100  # simulated drives from stations that are not found at once; the rest copy their nearest neighbour
 _CHANGED = 0.3  # share of the site that has changed since the survey
 _KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
 FARTHEST = _KEYFRAMES[-1]
 """Metres that a robot drives at most."""
-_AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
-"""Shifts of a station, metres, that are its rivals as well, as a search tries those of its leader."""
 _RIGHT_DISTANCE, _RIGHT_ANGLE = 2.0, np.radians(15.0)  # metres, radians: the place itself
 _HEADINGS = 16  # in which a robot may set out, or go on
 _SHARPEST = np.radians(100.0)  # turn on its way
@@ -42,6 +40,21 @@ _SHORTEST = 3  # steps; it does not set out for less
 _TALL, _HALF_WIDTH = 2.0, 0.8  # metres: what stands in its way
 _STOREY = 2.5  # metres
 _KEPT_SCANS = 8
+
+# of a virtual scan
+EYE = 1.7
+"""Metres of the sensor above the ground; set by hand."""
+_RANGE = 40.0  # metres
+_NEAREST = 1.0  # metres
+_BEAM = np.radians(1.0)  # cell of the range image that hides what lies behind
+_UP, _DOWN = 22, 22  # cells above and below the horizon: the field of view of common lidars
+_COLUMNS = 360  # cells around
+_HOLES = ((7.0, 5), (16.0, 3))  # metres up to which a surface of quarter-metre voxels has gaps so many cells wide
+_SLACK, _SLACK_SLOPE = 0.4, 0.03  # metres, plus so many per metre of range, behind the nearest: still in view
+_NOISE = 0.03  # metres
+_CHANGE_PATCH = 4.0  # metres: what stands in one of them changes together
+_MOVED = (3.0, 6.0)  # metres by which it does
+_TABLE = 64  # patches until their draws repeat
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -163,7 +176,7 @@ class _Rehearsal:
         self.base_map = base_map
         self.config = config
         self.changed = changed
-        self._retrieval = Retrieval(base_map, config.retrieval)
+        self._retrieval = Retrieval(base_map)
         self._scorer = PlaceScorer(base_map)
         self._scans: OrderedDict[tuple[float, ...], ObservedScan | None] = OrderedDict()
         self._clear()
@@ -195,8 +208,8 @@ class _Rehearsal:
         query = {name: own.astype(np.float32) for name, own in station_descriptors(self.base_map, station).items()}
         self._consensus.vote(self.base_map.stations[station].astype(np.float64), query)
         named = self._consensus.hypotheses()
-        beside = np.tile(np.eye(4), (len(_AROUND), 1, 1))
-        beside[:, :2, 3] = _AROUND
+        beside = np.tile(np.eye(4), (len(AROUND), 1, 1))
+        beside[:, :2, 3] = AROUND
         others = [*named, *(Hypothesis(T, station, 0, 0.0) for T in beside)]
         scored = self._scorer.score([Hypothesis(np.eye(4), station, 0, 0.0), *others], range(len(others) + 1), 0, scan)
         return _judged(scored, scan.T_odom_body[:3, 3], self.config.acceptance.risk)
@@ -270,7 +283,77 @@ def _judged(scored: Scored, body: Floats, risk: float) -> _Seen:
     return _Seen(sure and right[0], sure and not right[0], own, own - max(rival, 0.0), error)
 
 
-def _is_right(place: ScoredPlace, body: Floats) -> bool:
-    T = place.hypothesis.T_map_odom
+def _is_right(place: Hypothesis, body: Floats) -> bool:
+    T = place.T_map_odom
     apart = float(np.linalg.norm(T[:3, :3] @ body + T[:3, 3] - body))
     return apart < _RIGHT_DISTANCE and abs(yaw_of(T)) < _RIGHT_ANGLE
+
+
+def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: RegistrationConfig) -> ObservedScan | None:
+    """Return what a sensor at ``eye`` (3,) sees of a map; odometry frame = map frame. None where it sees nothing.
+
+    The map's points within 40 m are seen where nothing stands before them in cells of a degree, 22 degrees up and down.
+    A share of the site has changed: in so many of its patches of 4 m, the same ones whenever they are seen, what is
+    there stands 3 to 6 m beside where the map has it.
+
+    Args:
+        base_map: the map.
+        eye: position, map frame, metres.
+        changed: share of the patches, in [0, 1].
+        config: how scans are thinned.
+    """
+    near = base_map.crop(eye, _RANGE + _MOVED[1])[0]
+    seen = _in_view(_rearranged(near, changed) - eye.astype(np.float32))
+    if not len(seen):
+        return None
+    seen += np.random.default_rng(0).normal(0.0, _NOISE, seen.shape).astype(np.float32)
+    cloud = prepare_scan(seen + eye.astype(np.float32), eye, config)
+    # a single return says nothing about a direction, where a lidar would have several
+    return ObservedScan.of(cloud, np.repeat(seen, 2, axis=0), pose_from(np.eye(3), eye))
+
+
+def _rearranged(points: Points, changed: float) -> Points:
+    """Move what is in the changed patches: the same ones in every scan."""
+    if changed <= 0.0:
+        return points
+    x, y = np.floor(points[:, :2] * np.float32(1.0 / _CHANGE_PATCH)).astype(np.int64).T
+    draw, shift = _draws()
+    patch = (x % _TABLE) * _TABLE + y % _TABLE
+    moved = np.array(points)
+    moved[:, :2] += shift[patch] * (draw[patch] < changed)[:, None]
+    return moved
+
+
+@lru_cache(maxsize=1)
+def _draws() -> tuple[Floats32, Floats32]:
+    """Return for each patch a number (P,) in [0, 1) and a shift (P, 2), metres."""
+    rng = np.random.default_rng(20240)
+    draw, turn = rng.random(_TABLE**2), rng.uniform(0.0, 2.0 * np.pi, _TABLE**2)
+    distance = rng.uniform(*_MOVED, _TABLE**2)
+    shift = np.column_stack([distance * np.cos(turn), distance * np.sin(turn)])
+    return draw.astype(np.float32), shift.astype(np.float32)
+
+
+def _in_view(points: Points) -> Points:
+    """Return those of (N, 3) points, relative to the sensor, that it sees."""
+    flat = np.hypot(points[:, 0], points[:, 1])
+    steep = np.abs(points[:, 2]) < flat * np.float32(np.tan(_BEAM * max(_UP, _DOWN)))
+    points = points[steep & (flat < _RANGE)]
+    ranges = norms(points).astype(np.float32)
+    row = np.floor(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])) / _BEAM).astype(np.int64) + _DOWN
+    column = np.floor(np.arctan2(points[:, 1], points[:, 0]) / _BEAM).astype(np.int64) % _COLUMNS
+    inside: Bools = (ranges > _NEAREST) & (row >= 0) & (row < _UP + _DOWN)
+    points, ranges, cell = points[inside], ranges[inside], (row * _COLUMNS + column)[inside]
+    nearest = np.full((_UP + _DOWN) * _COLUMNS, np.inf, dtype=np.float32)
+    np.minimum.at(nearest, cell, ranges)
+    limit = _without_holes(nearest.reshape(-1, _COLUMNS)).ravel()[cell]
+    return np.asarray(points[ranges < limit + _SLACK + _SLACK_SLOPE * ranges])
+
+
+def _without_holes(nearest: Floats32) -> Floats32:
+    """Let near surfaces, of which a cell may have no point, hide what is behind them."""
+    out = nearest
+    for reach, window in _HOLES:
+        near = np.where(nearest < reach, nearest, np.float32(np.inf))
+        out = np.minimum(out, min_filter(near, window))
+    return out

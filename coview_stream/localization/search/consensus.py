@@ -1,15 +1,16 @@
 """Consensus: every keyframe votes for one ``T_map_odom``.
 
-A keyframe names places: stations and shifts at which it may have been taken. Each is a hypothesis of the same unknown
-transform. Odometry says where the other keyframes stood, so that each of them is asked for its vote on the station and
-shift that the hypothesis predicts for it, and the votes are added. What no keyframe names is never scored; what one
-names is scored by all.
+A keyframe names stations and shifts where it may have been taken; each is a hypothesis of the same unknown transform.
+Odometry predicts the station and shift of the other keyframes under it, and their votes there are added. Places that no
+keyframe names are never scored; a place that one names is scored by all.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,39 +20,93 @@ from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.search.votes import Request, Vote
+from coview_stream.localization.evidence.observation import Evidence
+from coview_stream.localization.registration.register import Registration
 
-_KEPT = 8  # places are kept from keyframe to keyframe for each hypothesis that is asked for: the best; set by hand
-_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of what makes places distinct: bins that keep the best place each; set by hand
+_KEPT = 8  # places per requested hypothesis that stay from keyframe to keyframe
+_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of the distances that make places distinct: bins that keep the best place each
+
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A coarse ``T_map_odom`` to register from.
+    """A hypothesis of ``T_map_odom``, from the votes that name it to its registration.
 
     Attributes:
         T_map_odom: (4, 4).
         station: index of its station; None for a pose hint, which has no votes.
         shift: its number of sectors; None for a pose hint.
-        score: sum of its votes, lower is better.
+        votes: sum of its votes, lower is better.
         learned: whether the votes are those of learned features.
+        hinted: whether a pose hint came to this place.
+        score: of the newest keyframe, in [0, 1], by the field.
+        ratio: log-likelihood ratio of the keyframes so far against chance.
+        probability: posterior probability that the robot is here.
+        registration: of the newest keyframe, once registered; ``T_map_odom`` is its pose then.
+        evidence: for the registered pose.
     """
 
     T_map_odom: Pose
-    station: int | None
-    shift: int | None
-    score: float
+    station: int | None = None
+    shift: int | None = None
+    votes: float = 0.0
     learned: bool = False
+    hinted: bool = False
+    score: float = 0.0
+    ratio: float = 0.0
+    probability: float = 0.0
+    registration: Registration | None = None
+    evidence: Evidence | None = None
+
+    def registered(self, registration: Registration, evidence: Evidence) -> Hypothesis:
+        """Return the hypothesis at its registered pose."""
+        T = registration.T_map_source
+        return replace(self, T_map_odom=T, registration=registration, evidence=evidence)
+
+
+class Request(NamedTuple, Generic[V]):
+    """A question to a vote: its z-scores of ``stations`` (K,), -1 for none, at ``shifts`` (K,)."""
+
+    vote: V
+    stations: Ints
+    shifts: Ints
+
+
+class Vote(Protocol):
+    """One keyframe's scores of the stations at every shift; shift n means yaw -2 pi n / ``sectors`` (eq. 9)."""
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) zero of its descriptor, z on the ground; odometry frame, metres."""
+        ...
+
+    @property
+    def sectors(self) -> int:
+        """Number of shifts S."""
+        ...
+
+    def candidates(self) -> tuple[Ints, Ints]:
+        """Return distinct stations and shifts (K,) where it may have been taken."""
+        ...
+
+    def at(self, stations: Ints, shifts: Ints) -> Floats32:
+        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1, no station."""
+        ...
+
+    def at_all(self, requests: Sequence[Request[Self]]) -> list[Floats32]:
+        """Return :meth:`at` of each request's vote; all votes are of the same kind and map as this one."""
+        ...
 
 
 @dataclass(frozen=True)
 class _Places:
-    """N hypotheses of ``T_map_odom``, level, and the votes on them.
+    """N level hypotheses of ``T_map_odom`` and the votes on them.
 
     Attributes:
         shift: (N,) their headings.
-        offset: (N, 3) float64 where they put the odometry frame's origin; map frame, metres.
-        station: (N,) at which they put the newest keyframe, -1 for none.
+        offset: (N, 3) float64 position of the odometry frame's origin; map frame, metres.
+        station: (N,) of the newest keyframe, -1 for none.
         votes: (N, W) float32 z-scores of the keyframes in the window, 0 of those that have not voted yet.
     """
 
@@ -72,12 +127,8 @@ class _Places:
         return _Places(self.shift[chosen], self.offset[chosen], self.station[chosen], self.votes[chosen])
 
     def __add__(self, other: _Places) -> _Places:
-        return _Places(
-            *(
-                np.concatenate([getattr(self, name), getattr(other, name)])
-                for name in ("shift", "offset", "station", "votes")
-            )
-        )
+        both = (np.concatenate([getattr(p, name) for p in (self, other)]) for name in self.__dataclass_fields__)
+        return _Places(*both)
 
 
 class Consensus:
@@ -99,17 +150,17 @@ class Consensus:
         self._places = _Places.none(self.config.window)
 
     def vote(self, vote: Vote) -> None:
-        """Add one keyframe's vote: on the places that are known, and with all older votes on those that it names."""
+        """Add one keyframe's vote: on the known places, and with all older votes on the places that it names."""
         column = (self._votes[-1][0] + 1) % self.config.window if self._votes else 0
         self._votes.append((column, vote))
         known, named = self._moved(self._places, vote), self._named(vote)
-        asked = [Request(vote, each.station, each.shift) for each in (known, named)]
-        into = [each.votes[:, column] for each in (known, named)]
+        requests = [Request(vote, places.station, places.shift) for places in (known, named)]
+        targets = [places.votes[:, column] for places in (known, named)]
         for other, older in list(self._votes)[:-1]:
-            asked.append(Request(older, self.grid.at(self._seen(named, older)), named.shift))
-            into.append(named.votes[:, other])
-        for votes, found in zip(into, vote.at_all(asked), strict=True):
-            votes[:] = found
+            requests.append(Request(older, self.grid.at(self._positions(named, older)), named.shift))
+            targets.append(named.votes[:, other])
+        for target, scores in zip(targets, vote.at_all(requests), strict=True):
+            target[:] = scores
         places = known + named
         order = np.argsort(places.votes.sum(axis=1), kind="stable")
         _, first = np.unique(self._bins(places, vote)[order], return_index=True)
@@ -121,49 +172,49 @@ class Consensus:
         if not len(places):
             return []
         newest = self._votes[-1][1]
-        scores = places.votes.sum(axis=1) * np.float32(1.0 / np.sqrt(len(self._votes)))
+        votes = places.votes.sum(axis=1) * np.float32(1.0 / np.sqrt(len(self._votes)))
         yaw = yaw_of_shift(places.shift, newest.sectors)
         rule = self.config
         chosen = kernels.distinct_poses(
-            self._seen(places, newest), yaw, rule.peaks, rule.distinct_distance, rule.distinct_yaw
+            self._positions(places, newest), yaw, rule.peaks, rule.distinct_distance, rule.distinct_yaw
         )
         poses = np.tile(np.eye(4), (len(chosen), 1, 1))
         cos, sin = np.cos(yaw[chosen]), np.sin(yaw[chosen])
         poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
         poses[:, :3, 3] = places.offset[chosen]
-        numbers = (values[chosen].tolist() for values in (places.station, places.shift, scores))
-        return [Hypothesis(*each) for each in zip(poses, *numbers, strict=True)]
+        numbers = (values[chosen].tolist() for values in (places.station, places.shift, votes))
+        return [Hypothesis(*row) for row in zip(poses, *numbers, strict=True)]
 
     def _bins(self, places: _Places, vote: Vote) -> Ints:
-        """Give places (N,) numbers by where they put a keyframe; those that share one are not distinct."""
-        rule, there = self.config, self._seen(places, vote)
+        """Return the bin (N,) of a keyframe's pose under each place; places in one bin are not distinct."""
+        rule, position = self.config, self._positions(places, vote)
         edge = np.array([_BIN * rule.distinct_distance] * 2 + [0.5 * rule.distinct_distance])
         sectors = max(1, int(_BIN_YAW * rule.distinct_yaw * vote.sectors / (2.0 * np.pi)))
-        x, y, z = np.floor(there / edge).astype(np.int64).T % 2**18  # more than any map has
+        x, y, z = np.floor(position / edge).astype(np.int64).T % 2**18  # more than any map has
         return np.asarray(((x * 2**18 + y) * 2**18 + z) * 2**9 + places.shift // sectors)
 
-    def _seen(self, places: _Places, vote: Vote) -> Floats:
-        """Return where the places put a keyframe, (N, 3) in the map's frame."""
+    def _positions(self, places: _Places, vote: Vote) -> Floats:
+        """Return a keyframe's position (N, 3) under each place, map frame."""
         yaw = yaw_of_shift(np.arange(vote.sectors), vote.sectors)
         (x, y, z), cos, sin = vote.centre, np.cos(yaw), np.sin(yaw)
         turned = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(yaw), z)], axis=1)
         return np.asarray(places.offset + turned[places.shift])
 
     def _moved(self, places: _Places, vote: Vote) -> _Places:
-        """Return known places at the stations at which they put a keyframe, whose height they follow."""
-        there = self._seen(places, vote)
-        station = self.grid.at(there)
-        found = station >= 0
-        places.offset[found, 2] += self.grid.stations[station[found], 2] - there[found, 2]
+        """Return known places at the stations of a new keyframe, whose height they follow."""
+        position = self._positions(places, vote)
+        station = self.grid.at(position)
+        known = station >= 0
+        places.offset[known, 2] += self.grid.stations[station[known], 2] - position[known, 2]
         return _Places(places.shift, places.offset, station, places.votes)
 
     def _named(self, vote: Vote) -> _Places:
-        """Return the places that a keyframe names (eq. 12, corrected: the yaw turns about it), no votes on them yet."""
+        """Return the places that a keyframe names (eq. 12, corrected: the yaw turns about it), without votes yet."""
         station, shift = vote.candidates()
         offset = np.zeros((len(station), 3))
         votes = np.zeros((len(station), self.config.window), dtype=np.float32)
         places = _Places(shift, offset, station, votes)
-        offset[:] = self.grid.stations[station] - self._seen(places, vote)
+        offset[:] = self.grid.stations[station] - self._positions(places, vote)
         return places
 
 

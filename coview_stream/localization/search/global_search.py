@@ -1,4 +1,4 @@
-"""Global search: from the ring buffer's newest keyframe to scored and verified hypotheses, and when to believe one."""
+"""Global search: from the newest keyframe to scored hypotheses, and the decision when to believe one."""
 
 from __future__ import annotations
 
@@ -15,19 +15,16 @@ from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.search.acceptance import SearchResult, decide
+from coview_stream.localization.search.acceptance import Considered, SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.considered import Considered
-from coview_stream.localization.search.modes import find_modes
-from coview_stream.localization.search.place_guess import on_the_ground
-from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
+from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
-from coview_stream.localization.search.refinement import Candidate, register_place
+from coview_stream.localization.search.refinement import find_modes, register_place
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
-_ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
-_GUESSES = 12  # places of a guess that are tried at a keyframe; set by hand
+_ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
+_GUESSES = 12  # places of a guess that are tried at a keyframe
 
 
 class GlobalSearch:
@@ -47,9 +44,9 @@ class GlobalSearch:
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, index: SearchIndex | None = None
     ) -> None:
-        """Search a map; searches of one map may share ``index``. Raises what :meth:`SearchIndex.of` does."""
+        """Search a map; searches of one map may share ``index``. Raises as :meth:`SearchIndex.of`."""
         self.base_map = base_map
-        # many places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
+        # GICP would have to prepare the map at each of many places, and tracking starts with it anyway
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         index = index or SearchIndex.of(base_map, config)
         self.coview, self.learned = _recognizers(base_map, config, index)
@@ -81,7 +78,7 @@ class GlobalSearch:
         return {} if self.coview is None else self.coview.last_query
 
     def prepare(self) -> None:
-        """Make now what the first update would: of the stations' index, of the learned features, of the field.
+        """Load and compute now what the first update would wait for.
 
         Raises:
             InputError, DependencyError: the network of the learned features cannot be loaded.
@@ -90,7 +87,7 @@ class GlobalSearch:
         _ = self.base_map.field.layers
 
     def clear(self) -> None:
-        """Forget all votes and what the keyframes have observed."""
+        """Forget all votes and observations."""
         for recognizer in self._recognizers:
             recognizer.clear()
         self._hints = HintSchedule()
@@ -104,7 +101,7 @@ class GlobalSearch:
             self.coview.last_query = {}
 
     def update(self, request: SearchRequest) -> SearchResult:
-        """Search the map for one keyframe; a request of another epoch, or one after an acceptance, starts anew."""
+        """Search the map for one keyframe; another epoch, or an acceptance, begins a new search."""
         if request.epoch != self._epoch:
             self.clear()
             self._epoch = request.epoch
@@ -120,7 +117,8 @@ class GlobalSearch:
         self._note_hints(scored, hints, request)
         undecided = 0.0
         if leader is not None and scored.error < self.config.acceptance.risk:
-            modes = find_modes(leader, scan, request, self.base_map, self.config, self._local_maps)
+            place = scored.places[0]
+            modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
             leader, undecided = modes.best, modes.undecided
             scored = scored.doubted(find_moved_part(self.base_map.field, self._scorer.scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
@@ -134,14 +132,14 @@ class GlobalSearch:
             recognizer.vote(request)
 
     def _propose(self) -> tuple[list[Hypothesis], list[int]]:
-        """Return what the votes name, and the rank of each in its recognizer's votes."""
-        each = [recognizer.hypotheses() for recognizer in self._recognizers]
-        return [own for some in each for own in some], [rank for some in each for rank in range(len(some))]
+        """Return the hypotheses of the votes, and the rank of each in its recognizer's votes."""
+        lists = [recognizer.hypotheses() for recognizer in self._recognizers]
+        return [place for named in lists for place in named], [rank for named in lists for rank in range(len(named))]
 
     def _guessed(self, request: SearchRequest, scan: ObservedScan) -> list[Hypothesis]:
-        """Return the best of the places that somebody named, on the ground; seldom, once they have been tried.
+        """Return the best few poses of a guess, on the ground; seldom, once they have been tried.
 
-        Only a few: all of them, around one place, would be taken for what chance finds on this map.
+        All of them, around one place, would be taken for the chance places of this map.
         """
         due = self._guesses.due(request.guesses)
         if not due:
@@ -155,16 +153,15 @@ class GlobalSearch:
         scores = scan.few.look_up(self.base_map.field, poses, Move.FAR).scores
         return [named[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
-    def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Candidate | None:
-        """Register the most probable place and verify it there; None if it comes to another one, or leans."""
+    def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Hypothesis | None:
+        """Register the most probable place; None if it comes to another one, or leans."""
         if not scored.places:
             return None
         best = scored.places[0]
-        found = register_place(best, scan, self.base_map, self.config, self._local_maps)
-        start = best.hypothesis.T_map_odom
-        if found is None or not same_place(found.T_map_odom, start, request, BASIN_DISTANCE, BASIN_ANGLE):
+        leader = register_place(best, scan, self.base_map, self.config, self._local_maps)
+        if leader is None or not same_place(leader.T_map_odom, best.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
             return None
-        return found
+        return leader
 
     def _note_hints(self, scored: Scored, hints: list[Hypothesis], request: SearchRequest) -> None:
         """Note whether the keyframe spoke against the hints that it tried."""
@@ -191,7 +188,7 @@ def _recognizers(
     """Return the recognizers by descriptors and by learned features, each None where it is not used."""
     learned: PlaceRecognizer | None = None
     if index.learned is not None:
-        from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
+        from coview_stream.localization.search.learned.matcher import LearnedRecognizer
 
         learned = LearnedRecognizer(base_map, config, index.learned)
     peaks = coview_peaks(config.consensus.peaks, len(base_map))

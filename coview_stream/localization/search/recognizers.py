@@ -1,4 +1,4 @@
-"""Place recognizers: keyframes vote for places of the map, and the best places are the search's hypotheses."""
+"""Place recognizers: keyframes vote for places of the map; the best places are the search's hypotheses."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.smallest_distance import SmallestDistance
-from coview_stream.localization.search.station_consensus import StationConsensus
+from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
 
 if TYPE_CHECKING:  # imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
 class PlaceRecognizer(Protocol):
-    """Interface of a way to recognise places: keyframes vote, and the votes name places."""
+    """Interface of place recognition: keyframes vote, and the votes name places."""
 
     def vote(self, request: SearchRequest) -> None:
         """Add the votes of one keyframe; one with too few points has none."""
@@ -41,7 +39,7 @@ class PlaceRecognizer(Protocol):
 
 @dataclass(frozen=True)
 class SearchIndex:
-    """The part of the recognizers that all searches of one map share; None for what is not used.
+    """The part of the recognizers that all searches of one map share; None for a recognizer that is not used.
 
     Attributes:
         retrieval: comparison with the stations' co-view descriptors.
@@ -60,7 +58,7 @@ class SearchIndex:
         Raises:
             MapError, InputError, DependencyError: as :meth:`BaseMap.require_features`.
         """
-        retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
+        retrieval = None if config.reloc == "learned" else Retrieval(base_map)
         missing = base_map.require_features(config.reloc, load)
         if missing is not None:
             warnings.warn(missing, stacklevel=2)
@@ -72,7 +70,7 @@ class SearchIndex:
         return cls(retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
-        """Load and compute what the first query would; raises :class:`CoViewError` if something is missing."""
+        """Load and compute what the first query would wait for; CoViewError if something is missing."""
         if self.retrieval is not None:
             self.retrieval.prepare()
         if self.learned is not None:
@@ -89,13 +87,7 @@ class CoViewRecognizer:
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, retrieval: Retrieval, peaks: int) -> None:
         self.base_map = base_map
         self.config = config
-        self.retrieval = retrieval
-        consensus = replace(config.consensus, peaks=peaks)
-        self.consensus: StationConsensus | SmallestDistance = (
-            SmallestDistance(base_map.stations, consensus)
-            if consensus.mode == "single"
-            else StationConsensus(retrieval, consensus)
-        )
+        self.consensus = StationConsensus(retrieval, replace(config.consensus, peaks=peaks))
         self.last_query: dict[Channel, Descriptor] = {}
 
     def vote(self, request: SearchRequest) -> None:
@@ -105,10 +97,7 @@ class CoViewRecognizer:
             return
         centre = on_ground(request.scan, request.position) if descriptor.ground_zero else request.position
         self.last_query = describe(request.scan, centre, descriptor)
-        if isinstance(self.consensus, SmallestDistance):
-            self.consensus.vote(centre, self.retrieval.distances(self.last_query).values())
-        else:
-            self.consensus.vote(centre, self.last_query, request.area)
+        self.consensus.vote(centre, self.last_query, request.area)
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks."""

@@ -1,4 +1,9 @@
-"""Candidates: the most probable place made exact, registered (eq. 13) and verified."""
+"""Refinement: the most probable place registered (eq. 13), and the modes of an accepted one.
+
+A place is all poses within two metres of its best. Registration leads to the nearest pose that fits, and where there is
+little to see, or much has changed, that may be a wall's neighbour a metre away. So an accepted place is registered from
+poses all around, and the results are weighed by the log-likelihood ratio of the scan, as places are.
+"""
 
 from __future__ import annotations
 
@@ -6,64 +11,107 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
-from coview_stream.localization.evidence.observation import Evidence, ObservedScan
+from coview_stream.geometry.protection import ALERT_METRES
+from coview_stream.geometry.transforms import Pose, boxminus, pose_from, rot_z, tilt_of, transform, yaw_of
+from coview_stream.localization.evidence.background import observe_with_background
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.result import Prior, Registration
+from coview_stream.localization.registration.register import Prior, register
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.scoring import ScoredPlace
+from coview_stream.localization.search.request import SearchRequest, same_place
+from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 
-_WIDEST = 1.0  # metres: coarser scales are spared, as places are scored at the best pose near them; set by hand
-_EVERY = 3  # of the scan's points is registered: the score is the same to 0.002 and the pose to a centimetre; by hand
+_WIDEST = 1.0  # metres: coarser scales are spared, as places are scored at the best pose near them
+_EVERY = 3  # of the scan's points is registered: the score is the same to 0.002 and the pose to a centimetre
+_AROUND = 1.2  # metres between a place and the poses around it: a little more than registration reaches
+_DIRECTIONS = 8
+_SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # nearer poses are one mode
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A registered and verified hypothesis of ``T_map_odom``.
+class Modes:
+    """The modes of a place.
 
     Attributes:
-        place: where it began.
-        registration: what came of it.
-        evidence: shares of the scan that fit the map there.
+        best: the most probable one.
+        distances: (M,) metres of each from that.
+        probabilities: (M,) of each; they add up to one.
     """
 
-    place: ScoredPlace
-    registration: Registration
-    evidence: Evidence
+    best: Hypothesis
+    distances: Floats
+    probabilities: Floats
 
     @property
-    def hypothesis(self) -> Hypothesis:
-        """The hypothesis that named the place."""
-        return self.place.hypothesis
-
-    @property
-    def T_map_odom(self) -> Pose:
-        """(4, 4) map <- odometry."""
-        return self.registration.T_map_source
+    def undecided(self) -> float:
+        """Metres to the most probable mode elsewhere, if those elsewhere are together more probable than the best's."""
+        elsewhere = self.distances > 0.5 * ALERT_METRES
+        if self.probabilities[elsewhere].sum() < 0.5:
+            return 0.0
+        return float(self.distances[elsewhere][self.probabilities[elsewhere].argmax()])
 
 
 def register_place(
-    place: ScoredPlace, scan: ObservedScan, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps
-) -> Candidate | None:
-    """Register a scan at a place and verify it; None off the map, with too few pairs, or if the result leans."""
-    settings = config.registration
+    place: Hypothesis, scan: ObservedScan, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps,
+    start: Pose | None = None,
+) -> Hypothesis | None:  # fmt: skip
+    """Register a scan at a place; None off the map, with too few pairs, or if the result leans.
+
+    ``start`` (4, 4) is the ``T_map_odom`` that registration begins at, by default the place's.
+    """
+    settings, T = config.registration, place.T_map_odom if start is None else start
     scales = tuple(scale for scale in settings.search if scale <= _WIDEST) or settings.search[-1:]
-    start = place.hypothesis.T_map_odom
-    target = local_maps.around(transform(start, scan.T_odom_body[None, :3, 3])[0])
+    target = local_maps.around(transform(T, scan.body[None])[0])
     if target is None:
         return None
-    level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
-    upright = Prior(level, gravity_information(settings.gravity_sigma))
-    registration = register(scan.cloud.every(_EVERY), start, target, settings, scales, upright, scan.body)
+    upright = Prior(pose_from(rot_z(yaw_of(T)), T[:3, 3]), gravity_information(settings.gravity_sigma))
+    registration = register(scan.cloud.every(_EVERY), T, target, settings, scales, upright, scan.body)
     if registration is None or tilt_of(registration.T_map_source) > config.acceptance.max_tilt:
         return None
-    return Candidate(place, registration, scan.evidence(base_map.field, registration.T_map_source))
+    return place.registered(registration, scan.evidence(base_map.field, registration.T_map_source))
 
 
 def gravity_information(sigma: float) -> Floats:
     """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
     return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
+
+
+def find_modes(
+    place: Hypothesis, leader: Hypothesis, scan: ObservedScan, request: SearchRequest, base_map: BaseMap,
+    config: LocalizerConfig, local_maps: LocalMaps,
+) -> Modes:  # fmt: skip
+    """Register a scan from poses around ``leader``, the registered ``place``, and weigh the results within it."""
+    candidates = [leader]
+    for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+        start = leader.T_map_odom.copy()
+        start[:2, 3] += _AROUND * np.cos(angle), _AROUND * np.sin(angle)
+        other = register_place(place, scan, base_map, config, local_maps, start)
+        if other is not None and same_place(other.T_map_odom, place.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
+            candidates.append(other)
+    poses = np.array([candidate.T_map_odom for candidate in candidates])
+    _, background = observe_with_background(base_map.field, scan, poses[:1])
+    observed = scan.many.look_up(base_map.field, scan.poses(poses), Move.NONE)
+    ratios = log_likelihood_ratios(observed.shares, background)
+    modes: list[int] = []
+    for k in np.argsort(-ratios, kind="stable"):
+        if not any(_same(poses[k], poses[j], scan.T_odom_body) for j in modes):
+            modes.append(int(k))
+    weights = np.exp(ratios[modes] - ratios[modes[0]])
+    metres = [_apart(poses[k], poses[modes[0]], scan.T_odom_body)[0] for k in modes]
+    return Modes(candidates[modes[0]], np.array(metres), weights / weights.sum())
+
+
+def _same(T_map_odom: Pose, T_other: Pose, T_odom_body: Pose) -> bool:
+    metres, radians = _apart(T_map_odom, T_other, T_odom_body)
+    return metres < _SAME_METRES and radians < _SAME_RADIANS
+
+
+def _apart(T_map_odom: Pose, T_other: Pose, T_odom_body: Pose) -> tuple[float, float]:
+    """Return the distance between the robot's poses: metres, radians."""
+    gap = boxminus(T_map_odom @ T_odom_body, T_other @ T_odom_body)
+    return float(np.linalg.norm(gap[3:])), float(np.linalg.norm(gap[:3]))

@@ -14,10 +14,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.evidence.observation import Evidence, ObservedScan
-from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
 from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.result import Prior
+from coview_stream.localization.registration.register import Prior, register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate

@@ -18,7 +18,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, tilt_variance
-from coview_stream.localization.registration.covariance import swap_rotation_translation
+from coview_stream.localization.registration.register import swap_rotation_translation
 
 MAX_FRAMES = 40
 """Frames whose points are held."""

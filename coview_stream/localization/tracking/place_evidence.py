@@ -20,9 +20,8 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.evidence.background import Background
-from coview_stream.localization.evidence.chance_places import observe_with_background
-from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
+from coview_stream.localization.evidence.background import Background, observe_with_background
+from coview_stream.localization.evidence.likelihood import KEPT, NUISANCES, log_likelihoods
 from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
@@ -122,8 +121,7 @@ class PlaceEvidence:
 
 def _steps() -> Floats:
     """Return the probabilities (Q, Q) that one share q becomes another."""
-    kept = steps_of_kept()
-    weight = np.exp(-0.5 * ((kept[:, None] - kept) / _SPREAD) ** 2)
+    weight = np.exp(-0.5 * ((KEPT[:, None] - KEPT) / _SPREAD) ** 2)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 

@@ -159,9 +159,9 @@ class PoseGraph:
 
         Args:
             T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
-                twice (see :func:`coview_stream.localization.registration.covariance.remove_prior`).
+                twice (see :func:`coview_stream.localization.registration.register.remove_prior`).
             covariance: of that measurement alone (see
-                :func:`coview_stream.localization.registration.covariance.registration_covariance`).
+                :func:`coview_stream.localization.registration.register.registration_covariance`).
         """
         T = check_rigid(T_map_body, "T_map_body")
         spread = check_covariance(covariance, "covariance")

@@ -15,14 +15,14 @@ from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.covariance import (
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.register import (
+    Registration,
     propagate,
     registration_covariance,
     swap_rotation_translation,
 )
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer

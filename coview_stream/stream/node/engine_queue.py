@@ -10,9 +10,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import Fix
-from coview_stream.localization.search.acceptance import SearchResult
-from coview_stream.localization.search.considered import Considered
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.acceptance import Considered, SearchResult
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment

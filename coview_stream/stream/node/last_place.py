@@ -27,7 +27,7 @@ import numpy as np
 from coview_stream.errors import ConfigError, InputError, MessageError
 from coview_stream.geometry.transforms import Pose, is_pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.search.place_guess import MAX_DISTANCE, PlaceGuess
+from coview_stream.localization.search.hints import MAX_DISTANCE, PlaceGuess
 from coview_stream.messages import decode_pose
 from coview_stream.messages.types import Sample
 

@@ -17,7 +17,7 @@ from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
 from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import CoViewError, InputError, MapError
 from coview_stream.geometry.transforms import yaw_of
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages import encode_location, encode_pose
 from coview_stream.messages.types import Encoded, LocationMessage, PoseMessage, Sample
 from coview_stream.stream.node.last_place import decode_guess, guess_of_fields

@@ -11,7 +11,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
+from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.motion import Drift

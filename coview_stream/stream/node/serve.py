@@ -28,7 +28,7 @@ from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjo
 
 if TYPE_CHECKING:
     from coview_stream.basemap.site.fetch import Mirror
-    from coview_stream.localization.search.place_guess import PlaceGuess
+    from coview_stream.localization.search.hints import PlaceGuess
     from coview_stream.stream.node.node import Node, OpenedMap, Service
     from coview_stream.stream.node.systemd import Notifier
     from coview_stream.stream.transport.transport import Transport

@@ -14,7 +14,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MessageError
 from coview_stream.localization.search.acceptance import SearchResult
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.node.counters import Counters, ErrorLog

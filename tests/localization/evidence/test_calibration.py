@@ -14,8 +14,7 @@ from scipy.stats import binom
 
 from coview_stream.localization.evidence import background
 from coview_stream.localization.evidence.background import estimate_background, left_in_mean, scatter
-from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
-from coview_stream.localization.evidence.posterior import posterior
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios, posterior
 
 ERRORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 PLACES = 250  # of a search
@@ -32,7 +31,7 @@ def smallest_error(places, rng):
         for last in (False, True):
             spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
             known = estimate_background(now[others], spread, mean[others])
-            ratios, _ = log_likelihood_ratios(mean, known)
+            ratios = log_likelihood_ratios(mean, known)
             if not last:  # the leader is not among what it is compared with
                 others = np.arange(count) != np.argmin(np.log1p(votes) - ratios)
                 spreads[-1] = scatter(now[others])

@@ -8,8 +8,13 @@ import pytest
 from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.evidence.background import Most, estimate_background, scatter
-from coview_stream.localization.evidence.chance_places import chance_places, observe_with_background
+from coview_stream.localization.evidence.background import (
+    Most,
+    chance_places,
+    estimate_background,
+    observe_with_background,
+    scatter,
+)
 from coview_stream.localization.evidence.observation import ObservedScan, Share
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coview_stream.localization.evidence.posterior import expected_by_chance, posterior
+from coview_stream.localization.evidence.likelihood import expected_by_chance, posterior
 
 FIRST = np.array([True])
 

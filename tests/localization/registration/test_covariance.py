@@ -10,16 +10,16 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import boxminus, boxplus, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.registration.covariance import (
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.register import (
+    Prior,
     propagate,
+    register,
     registration_covariance,
     remove_prior,
     swap_rotation_translation,
 )
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.result import Prior
 
 CONFIG = RegistrationConfig()
 TRUTH = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])

@@ -12,8 +12,7 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.result import Prior
+from coview_stream.localization.registration.register import Prior, register
 
 CONFIG = RegistrationConfig()
 TRUTH = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])

@@ -7,12 +7,11 @@ import numpy as np
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import Evidence
-from coview_stream.localization.registration.result import Registration
+from coview_stream.localization.registration.register import Registration
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
+from coview_stream.localization.search.scoring import Rivals, Scored
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)
@@ -28,14 +27,14 @@ def moved(forward=0.0, degrees=0.0):
 
 
 def place(probability, T_map_odom=HERE, score=0.7, hinted=False, **hypothesis):
-    own = Hypothesis(T_map_odom, **({"station": 5, "shift": 2, "score": -3.0} | hypothesis))
-    return ScoredPlace(own, score, 0.9, hinted, probability=probability)
+    given = {"station": 5, "shift": 2, "votes": -3.0} | hypothesis
+    return Hypothesis(T_map_odom, hinted=hinted, score=score, probability=probability, **given)
 
 
 def candidate(at, score=0.8):
     """What comes of a place once it is registered."""
-    found = Registration(at.hypothesis.T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(at, found, Evidence(score, score, 1.0, 1.0, 0.9))
+    found = Registration(at.T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
+    return at.registered(found, Evidence(score, score, 1.0, 1.0, 0.9))
 
 
 def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk, undecided=0.0) -> SearchResult:
@@ -44,7 +43,7 @@ def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk, und
     if error is None:
         error = 1.0 - places[0].probability if places else 1.0
     some = np.array([each.score for each in places], dtype=np.float32)
-    T = np.array([each.hypothesis.T_map_odom for each in places]).reshape(-1, 4, 4)
+    T = np.array([each.T_map_odom for each in places]).reshape(-1, 4, 4)
     second = places[1] if len(places) > 1 else None
     scored = Scored(Rivals(T, some, some), list(places), error, none, by_chance, second)
     best = candidate(places[0]) if leader and places else None

@@ -12,7 +12,7 @@ from made_up_places import REQUEST, RULE, candidate, judged, moved, place
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, decide
-from coview_stream.localization.search.pose_hints import FROM_THERE
+from coview_stream.localization.search.hints import FROM_THERE
 from coview_stream.localization.search.scoring import Rivals, Scored
 from coview_stream.localization.state import State
 
@@ -26,7 +26,7 @@ def test_place_is_accepted_only_below_the_integrity_risk(risk, share, accepted):
     assert (result.accepted is not None) == accepted
     assert result.evidence.state is (State.TRACKING if accepted else State.AMBIGUOUS)
     if accepted:
-        assert result.accepted.place is best
+        assert result.accepted.station == best.station
 
 
 @pytest.mark.parametrize("score", [0.05, 0.3, 0.99])
@@ -134,10 +134,10 @@ def test_hint_alone_is_not_accepted_before_votes_have_named_rivals():
 
 def test_reason_says_that_a_circle_was_searched_unless_there_is_a_pose():
     request = replace(REQUEST, area=Circle(0.0, 0.0, 80.0))
-    scored = Scored(Rivals.none(), [], error=1.0)
+    scored = Scored(Rivals(), [], error=1.0)
     assert decide(scored, None, request, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
     assert not decide(scored, None, REQUEST, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
     best = place(1.0)
-    found = decide(Scored(Rivals.none(), [best], error=1e-9, none=0.0), candidate(best), request, AcceptanceConfig())
+    found = decide(Scored(Rivals(), [best], error=1e-9, none=0.0), candidate(best), request, AcceptanceConfig())
     assert found.evidence.state is State.TRACKING
     assert IN_CIRCLE not in found.evidence.reason

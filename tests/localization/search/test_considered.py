@@ -7,25 +7,25 @@ from fake_robot import search_request
 
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.search.acceptance import MAX_PLACES, Considered
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.considered import MAX_PLACES, Considered
-from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
+from coview_stream.localization.search.scoring import Rivals, Scored
 
 
 def place(x, probability):
     T = pose_from(rot_z(0.5), [x, 2.0, 3.0])
-    return ScoredPlace(Hypothesis(T, 1, 1, 0.0), 0.5, 1.0, ratio=7.0, probability=probability)
+    return Hypothesis(T, 1, 1, score=0.5, ratio=7.0, probability=probability)
 
 
 def test_the_most_probable_come_first_in_the_frame_of_the_sources():
-    scored = Scored(Rivals.none(), [place(float(k), 0.01 * k) for k in range(30)], none=0.25)
+    scored = Scored(Rivals(), [place(float(k), 0.01 * k) for k in range(30)], none=0.25)
     found = Considered.of(scored, search_request(4.0), np.array([1000.0, 0.0, 50.0]))
     assert (found.stamp, found.none, len(found.places)) == (4.0, 0.25, MAX_PLACES)
     assert np.allclose(found.places[0], [1029.0, 2.0, 53.0, 0.5, 0.29, 7.0])
 
 
 def test_no_place_is_nothing():
-    assert Considered.of(Scored(Rivals.none(), []), search_request(), np.zeros(3)) is None
+    assert Considered.of(Scored(Rivals(), []), search_request(), np.zeros(3)) is None
 
 
 def test_a_search_brings_the_right_place_along(world_map, world_drive):

@@ -10,8 +10,8 @@ from small_world import pose_error
 
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.search import pose_hints
-from coview_stream.localization.search.pose_hints import HintSchedule, PoseHints
+from coview_stream.localization.search import hints
+from coview_stream.localization.search.hints import HintSchedule, PoseHints
 from coview_stream.localization.state import State
 
 # ---- what a localizer keeps
@@ -90,14 +90,14 @@ def test_hint_is_tried_at_once_then_periodically():
         tried.append(bool(due))
         if due:
             schedule.tried(refuted=True)
-    assert tried[: pose_hints._TRIES] == [True] * pose_hints._TRIES
-    gaps = np.diff(np.flatnonzero(tried))[pose_hints._TRIES - 1 :]
-    assert set(gaps) == {pose_hints._PAUSE + 1}
+    assert tried[: hints._TRIES] == [True] * hints._TRIES
+    gaps = np.diff(np.flatnonzero(tried))[hints._TRIES - 1 :]
+    assert set(gaps) == {hints._PAUSE + 1}
 
 
 def test_unrefuted_keyframe_resets_hint_tries():
     schedule = HintSchedule()
-    for refuted in [*[True] * (pose_hints._TRIES - 1), False] * 3:
+    for refuted in [*[True] * (hints._TRIES - 1), False] * 3:
         assert schedule.due((np.eye(4),))
         schedule.tried(refuted)
     assert schedule.due((np.eye(4),))
@@ -105,7 +105,7 @@ def test_unrefuted_keyframe_resets_hint_tries():
 
 def test_new_hint_is_tried_at_once():
     schedule = HintSchedule()
-    for _ in range(pose_hints._TRIES):
+    for _ in range(hints._TRIES):
         schedule.due((np.eye(4),))
         schedule.tried(refuted=True)
     assert not schedule.due((np.eye(4),))
@@ -130,7 +130,7 @@ def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch)
     made = counted(localizer, monkeypatch)
     localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     follow(localizer, world_drive, 10)
-    assert made == [1] * pose_hints._TRIES + [0] * 4 + [1]
+    assert made == [1] * hints._TRIES + [0] * 4 + [1]
 
 
 def test_hint_outside_the_map_is_not_refuted(world_map, world_drive, monkeypatch):

@@ -17,8 +17,8 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transfo
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.search import modes
-from coview_stream.localization.search.modes import Modes, find_modes
+from coview_stream.localization.search import refinement
+from coview_stream.localization.search.refinement import Modes, find_modes
 from coview_stream.localization.search.request import SearchRequest
 
 CONFIG = LocalizerConfig()
@@ -52,8 +52,8 @@ def look(row_map, points, x, reach, start):
         cloud, T_odom_body,
     )  # fmt: skip
     request = SearchRequest(0.0, T_odom_body, NOTHING, NOTHING, NOTHING, 0.0, (0, 0))
-    leader = candidate(place(1.0, pose_from(np.eye(3), [start, 0.0, 0.0]) @ T_MAP_ODOM))
-    return find_modes(leader, scan, request, row_map, CONFIG, LocalMaps(row_map, 50.0))
+    named = place(1.0, pose_from(np.eye(3), [start, 0.0, 0.0]) @ T_MAP_ODOM)
+    return find_modes(named, candidate(named), scan, request, row_map, CONFIG, LocalMaps(row_map, 50.0))
 
 
 def off(found: Modes) -> float:
@@ -90,15 +90,15 @@ def test_only_modes_within_the_place_count(row_map, points, monkeypatch):
     """Registration that runs away is of no mode here; nor is one that fails."""
     started = []
 
-    def elsewhere(place, *_):
-        started.append(place.hypothesis.T_map_odom[:2, 3] - T_MAP_ODOM[:2, 3])
+    def elsewhere(place, scan, base_map, config, local_maps, start):
+        started.append(start[:2, 3] - T_MAP_ODOM[:2, 3])
         if len(started) % 2:
             return None
-        away = place.hypothesis.T_map_odom.copy()
+        away = start.copy()
         away[0, 3] += 4.0
-        return candidate(replace(place, hypothesis=replace(place.hypothesis, T_map_odom=away)))
+        return candidate(replace(place, T_map_odom=away))
 
-    monkeypatch.setattr(modes, "register_place", elsewhere)
+    monkeypatch.setattr(refinement, "register_place", elsewhere)
     found = look(row_map, points, 11.0, 12.0, 0.0)
     assert found.distances.tolist() == [0.0]
     assert found.probabilities.tolist() == [1.0]

@@ -8,7 +8,7 @@ import pytest
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z, yaw_of
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
 
 

@@ -14,7 +14,7 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.errors import RunError
 from coview_stream.geometry.transforms import pose_from, rot_z, tilt_of
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.search.pose_hints import FROM_THERE, PoseHints
+from coview_stream.localization.search.hints import FROM_THERE, PoseHints
 from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import small_world
 
+from bench.accuracy.paper import TableVote
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.transforms import inverse, pose_from, transform, yaw_of
@@ -14,7 +15,6 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
-from coview_stream.localization.search.votes import TableVote
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_queue import SearchJob
 from coview_stream.stream.node.engines import SearchEngine

@@ -1,4 +1,4 @@
-"""Retrieval: distances equal brute force, votes nearly so, and ring keys score their candidates only."""
+"""Retrieval: distances equal brute force, votes nearly so."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 import pytest
 
+from bench.accuracy.paper import TableVote
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import DescriptorConfig, RetrievalConfig
-from coview_stream.descriptors.coview import describe, ring_key
+from coview_stream.config import DescriptorConfig
+from coview_stream.descriptors.coview import describe
 from coview_stream.localization.search import retrieval
 from coview_stream.localization.search.consensus import yaw_of_shift
-from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.localization.search.votes import TableVote
+from coview_stream.localization.search.retrieval import CoViewVote, Retrieval, exact_distances
 
 M, R, S = 40, 8, 12
 
@@ -75,9 +75,8 @@ def brute(q, c):
 
 
 def test_exhaustive_retrieval_equals_brute_force(stations, query):
-    found = Retrieval(stations, RetrievalConfig()).distances(query)
-    assert list(found) == list(query)
-    for name, volume in found.items():
+    for name, descriptor in query.items():
+        volume = exact_distances(stations.full[name], descriptor)
         assert volume.shape == (M, S)
         np.testing.assert_allclose(volume, brute(query[name], stations.full[name]), atol=2e-4)
         np.testing.assert_allclose(volume[7], 1.0, atol=1e-5)
@@ -85,23 +84,14 @@ def test_exhaustive_retrieval_equals_brute_force(stations, query):
 
 @pytest.mark.parametrize("block", [1, 7, M])
 def test_distances_are_the_same_in_blocks(stations, query, monkeypatch, block):
-    expected = Retrieval(stations, RetrievalConfig()).distances(query)
+    expected = exact_distances(stations.full["coview"], query["coview"])
     monkeypatch.setattr(retrieval, "_BLOCK", block)
-    for name, volume in Retrieval(stations, RetrievalConfig()).distances(query).items():
-        np.testing.assert_allclose(volume, expected[name], atol=1e-5)
-
-
-def test_vote_needs_no_descriptors_of_all_stations(stations, query, monkeypatch):
-    known = Retrieval(stations, RetrievalConfig())
-    known.prepare()
-    monkeypatch.setattr(Stations, "descriptors", None)
-    vote = known.vote(np.zeros(3), query)
-    assert len(vote.candidates()[0])
+    np.testing.assert_allclose(exact_distances(stations.full["coview"], query["coview"]), expected, atol=1e-5)
 
 
 def test_vote_is_that_of_the_exact_distances(stations, query):
-    vote = Retrieval(stations, RetrievalConfig()).vote(np.zeros(3), query)
-    exact = TableVote.of_distances(np.zeros(3), Retrieval(stations, RetrievalConfig()).distances(query).values())
+    vote = CoViewVote(np.zeros(3), Retrieval(stations).compared().index, query)
+    exact = TableVote.of_distances(np.zeros(3), [exact_distances(stations.full[name], query[name]) for name in query])
     station, shift = (each.ravel() for each in np.indices((M, S)))
     found, expected = vote.at(station, shift), exact.at(station, shift)
     assert np.abs(found - expected).max() < 1.0
@@ -111,7 +101,7 @@ def test_vote_is_that_of_the_exact_distances(stations, query):
 
 
 def test_candidates_are_the_best_headings_of_the_best_stations(stations, query):
-    vote = Retrieval(stations, RetrievalConfig()).vote(np.zeros(3), query)
+    vote = CoViewVote(np.zeros(3), Retrieval(stations).compared().index, query)
     station, shift = vote.candidates()
     scores = stations.station_index.all_shifts(stations.station_index.query(query), np.arange(M))
     assert len(set(zip(station.tolist(), shift.tolist(), strict=True))) == len(station)
@@ -120,33 +110,6 @@ def test_candidates_are_the_best_headings_of_the_best_stations(stations, query):
     assert (best <= scores[station, (shift + 1) % S]).all()
     assert (best < scores[station, shift - 1]).all()
     assert best[0] == scores.min()
-
-
-def test_ring_key_votes_only_for_its_candidates(stations, query):
-    vote = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=1)).vote(np.zeros(3), query)
-    exact = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=1)).distances(query)
-    scored = [np.flatnonzero((volume != 1.0).any(axis=1)) for volume in exact.values()]
-    assert vote.candidates()[0][0] in np.concatenate(scored)
-
-
-def test_ring_key_retrieval_scores_only_its_candidates(stations, query):
-    exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
-    found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=6)).distances(query)
-    for name, volume in found.items():
-        keys = ring_key(stations.full[name].astype(np.float32))
-        gap = np.linalg.norm(keys - ring_key(query[name]), axis=1)
-        nearest = np.argsort(gap, kind="stable")[:6]
-        others = np.setdiff1d(np.arange(M), nearest)
-        np.testing.assert_allclose(volume[nearest], exhaustive[name][nearest], atol=1e-5)
-        assert (volume[others] == 1.0).all()
-        assert (volume[nearest] < 0.999).any(axis=1).all()
-
-
-def test_ring_key_with_more_candidates_than_stations_is_exhaustive(stations, query):
-    exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
-    found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=10 * M)).distances(query)
-    for name in query:
-        np.testing.assert_allclose(found[name], exhaustive[name], atol=1e-5)
 
 
 @pytest.mark.parametrize("turn", [0, 1, 5, 11])
@@ -162,7 +125,8 @@ def test_robot_turned_left_is_found_at_its_heading(turn):
     yaw = 2 * np.pi * turn / S
     c, s = np.cos(yaw), np.sin(yaw)
     seen = places[8].astype(np.float64) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # map -> body: inverse turn
-    volume = Retrieval(there, RetrievalConfig()).distances(describe(seen.astype(np.float32), np.zeros(3), config))
-    station, shift = np.unravel_index(volume["scan_context"].argmin(), volume["scan_context"].shape)
+    query = describe(seen.astype(np.float32), np.zeros(3), config)["scan_context"]
+    volume = exact_distances(there.full["scan_context"], query)
+    station, shift = np.unravel_index(volume.argmin(), volume.shape)
     assert station == 8
     assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)

@@ -57,7 +57,7 @@ def some_places(scan, count=40, seed=4):
 
 
 def is_right(place, scan, metres=0.4):
-    gap = inverse(ODOM @ scan.T_odom_body) @ place.hypothesis.T_map_odom @ scan.T_odom_body
+    gap = inverse(ODOM @ scan.T_odom_body) @ place.T_map_odom @ scan.T_odom_body
     return np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < np.radians(1.5)
 
 
@@ -75,10 +75,10 @@ def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan)
     assert len(found.rivals) == len(found.places) == 2
     best, other = found.places
     assert is_right(best, scan)
-    assert (best.hypothesis.station, other.hypothesis.station) == (3, 8)
+    assert (best.station, other.station) == (3, 8)
     assert best.ratio > other.ratio
     assert found.second is other
-    np.testing.assert_array_equal(found.rivals.T_map_odom[0], best.hypothesis.T_map_odom)
+    np.testing.assert_array_equal(found.rivals.T_map_odom[0], best.T_map_odom)
     assert found.rivals.scores.tolist() == pytest.approx([best.score, other.score])
 
 
@@ -97,11 +97,11 @@ def test_hint_is_found_again_among_the_places(world_map, scan):
     wrong = [hypothesis(off(x, y, 90.0, scan)) for x in (-9.0, 9.0) for y in (-8.0, 8.0)]
     alone = scored(PlaceScorer(world_map), [*wrong, hint], scan, hints=1).places
     assert [place.hinted for place in alone] == [True, False, False, False, False]
-    assert alone[0].hypothesis.station is None
+    assert alone[0].station is None
     supported = [*wrong, hypothesis(off(0.0, 0.0, 0.0, scan)), hint]
     first = scored(PlaceScorer(world_map), supported, scan, hints=1).places[0]
     assert first.hinted
-    assert first.hypothesis.station == 3
+    assert first.station == 3
     lost = [hypothesis(ODOM), replace(hint, T_map_odom=off(9.0, 8.0, 90.0, scan))]
     places = scored(PlaceScorer(world_map), lost, scan, hints=1).places
     assert [place.hinted for place in places] == [False, True]

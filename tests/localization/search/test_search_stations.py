@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import ConsensusConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import Circle, pose_from
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.search import search_stations
+from coview_stream.localization.search import retrieval
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.place_guess import PlaceGuess
-from coview_stream.localization.search.pose_hints import PoseHints
-from coview_stream.localization.search.search_stations import SearchStations
+from coview_stream.localization.search.hints import PlaceGuess, PoseHints
+from coview_stream.localization.search.retrieval import SearchStations
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_queue import FrameJob
 from coview_stream.stream.node.engines import TrackEngine
@@ -23,7 +21,7 @@ from coview_stream.stream.node.engines import TrackEngine
 
 @pytest.fixture
 def few_are_many(monkeypatch):
-    monkeypatch.setattr(search_stations, "_ORDINARY", 50)
+    monkeypatch.setattr(retrieval, "_ORDINARY", 50)
 
 
 def test_ordinary_maps_are_compared_whole(world_map):
@@ -50,7 +48,7 @@ def test_storeys_have_squares_of_their_own(few_are_many, world_map):
     above = ground + np.array([0, 0, 6], dtype=np.float32)
     for lower, upper in ((ground, above[::2]), (ground[::2], above), (ground[::3], above[1::2])):
         grid = StationGrid(np.concatenate([lower, upper]), world_map.config.block)
-        members = search_stations._members(grid, np.arange(len(grid)), 3)
+        members = retrieval._members(grid, np.arange(len(grid)), 3)
         heights = np.where(members < 0, np.nan, grid.stations[members, 2])
         assert np.nanmax(np.nanmax(heights, axis=1) - np.nanmin(heights, axis=1)) < 3.0
         np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(grid)))
@@ -69,7 +67,7 @@ def test_blocks_of_a_square_s_size_stand_for_themselves(few_are_many, world_map)
 @pytest.mark.parametrize("many", [False, True])
 def test_circle_has_the_scores_of_the_map(world_map, monkeypatch, many):
     if many:
-        monkeypatch.setattr(search_stations, "_ORDINARY", 20)
+        monkeypatch.setattr(retrieval, "_ORDINARY", 20)
     index, grid = world_map.station_index, world_map.station_grid
     chosen = np.flatnonzero(Circle(*world_map.stations[40, :2].tolist(), 12.0).holds(world_map.stations))
     compared = SearchStations.of(index, grid, chosen)
@@ -174,16 +172,3 @@ def test_result_of_a_search_from_before_the_circle_is_not_taken(world_map, world
     for result in results:
         localizer.apply_search_result(result)
     assert localizer.state is not State.TRACKING
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        LocalizerConfig(retrieval=RetrievalConfig(mode="ring_key")),
-        LocalizerConfig(consensus=ConsensusConfig(mode="single")),
-    ],
-)
-def test_circle_in_the_paper_s_modes_is_refused(world_map, config):
-    x, y = (world_map.stations[0] + world_map.origin)[:2].tolist()
-    with pytest.raises(InputError, match="exhaustive"):
-        Localizer(world_map, config).guess_place(PlaceGuess(x, y, within=60.0))

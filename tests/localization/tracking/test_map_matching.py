@@ -13,8 +13,7 @@ from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.result import Prior
+from coview_stream.localization.registration.register import Prior, register
 from coview_stream.localization.tracking import map_matching
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import RejectionReason

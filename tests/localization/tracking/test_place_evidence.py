@@ -10,14 +10,13 @@ from scipy.special import logsumexp
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.evidence.chance_places import observe_with_background
-from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
+from coview_stream.localization.evidence.background import observe_with_background
+from coview_stream.localization.evidence.likelihood import KEPT, NUISANCES, log_likelihoods
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 
 T_MAP_ODOM = pose_from(rot_z(1.3), [-4.0, 11.0, 0.6])
-KEPT = steps_of_kept()
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig,
 from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.registration.covariance import registration_covariance
+from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.tracking.monitor import RejectionReason
 
 RULE = AcceptanceConfig()

@@ -9,7 +9,7 @@ from trackers import Ride, add_frame, match_and_update, registration, tracker_of
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.registration.covariance import swap_rotation_translation
+from coview_stream.localization.registration.register import swap_rotation_translation
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 SETTINGS = TrackingConfig()

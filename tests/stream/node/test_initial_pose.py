@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from coview_stream.errors import InputError, TransportError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.node.last_place import decode_guess, guess_of_fields

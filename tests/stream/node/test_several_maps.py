@@ -11,8 +11,8 @@ from fake_robot import SHA, T_MAP_ODOM, Robot, pose, search_request, search_resu
 
 from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.errors import InputError
-from coview_stream.localization.search.considered import Considered
-from coview_stream.localization.search.place_guess import PlaceGuess
+from coview_stream.localization.search.acceptance import Considered
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages.json_messages import decode_hypotheses, encode_hypotheses
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.last_place import guess_of_fields

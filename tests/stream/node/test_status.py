@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import TransportError
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.search.considered import Considered
+from coview_stream.localization.search.acceptance import Considered
 from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.stream.node.robot_endpoints import MapViewAnswer
 from coview_stream.stream.node.status import (

@@ -9,23 +9,32 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import warm_up
-from coview_stream.config import LearnedConfig
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
+from coview_stream.descriptors.coview import on_ground
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.rasters import argsmallest
-from coview_stream.geometry.transforms import Circle, Points
-from coview_stream.localization.search.consensus import yaw_of_shift
+from coview_stream.geometry.transforms import Circle, Points, transform
+from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.learned.correlation import correlate_turned
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
-from coview_stream.localization.search.learned.feature_vote import FeatureVote, StationCells
-from coview_stream.localization.search.learned.rasters import FeatureRasters, TurnedQuery, turn_query
+from coview_stream.localization.search.learned.rasters import (
+    FeatureRasters,
+    FeatureVote,
+    StationCells,
+    TurnedQuery,
+    turn_query,
+)
+from coview_stream.localization.search.request import SearchRequest
 
 _SIZE = 64.0
 """Metres along the edge of a query's image."""
 
 _ROUNDING = 1e-6  # cells
+_MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other
 _NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are looked at closely, at least and of all; set by hand
 _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its corners, metres
 
@@ -211,3 +220,52 @@ class FeatureMatcher:
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
         middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])
         return self.index.blocks_near(middles, _TILE_RADIUS)
+
+
+class LearnedRecognizer:
+    """Recognizer by learned features."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: FeatureMatcher) -> None:
+        self.config = config
+        self.learned = learned
+        peaks = replace(config.consensus, peaks=config.learned.peaks)
+        self.consensus = Consensus(base_map.station_grid, peaks)
+
+    def vote(self, request: SearchRequest) -> None:
+        """Compare the ground network's features around the robot with the map's."""
+        if len(request.surroundings) < self.config.keyframe.min_points:
+            return
+        centre = on_ground(request.surroundings, request.position)
+        query = self.learned.encode(request.surroundings, centre)
+        hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
+        self.consensus.vote(self.learned.vote(query, hinted, request.area))
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the consensus' peaks on every storey that they may be on: from above these look alike."""
+        found: dict[tuple[int | None, int | None], Hypothesis] = {}
+        for peak in self.consensus.hypotheses():
+            for each in self._storeys(replace(peak, learned=True)):
+                found.setdefault((each.station, each.shift), each)
+        return list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
+
+    def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
+        """Return a peak, and the same at the stations above and below."""
+        grid = self.consensus.grid
+        storeys = [] if peak.station is None else grid.storeys(peak.station)
+        if len(storeys) < 2:
+            return [peak]
+        out = [peak]
+        for station in storeys:
+            if station != peak.station:
+                T = peak.T_map_odom.copy()
+                T[2, 3] += float(grid.stations[station, 2] - grid.stations[peak.station, 2])
+                out.append(replace(peak, T_map_odom=T, station=station))
+        return out
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        self.consensus.clear()
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        return len(self.consensus)

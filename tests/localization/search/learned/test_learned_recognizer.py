@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bench.accuracy.paper import TableVote
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.geometry.transforms import transform
-from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
+from coview_stream.localization.search.learned.matcher import LearnedRecognizer
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.votes import TableVote
 
 HERE, THERE, SHIFT = (5.0, -7.0), (-15.0, 11.0), 7
 

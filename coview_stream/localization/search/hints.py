@@ -1,0 +1,262 @@
+"""Hints and guesses of the robot's place from before the search: more hypotheses to try, none of them trusted.
+
+Only the circle of a guess is: nothing outside of it is searched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coview_stream.basemap.stations import StationGrid
+from coview_stream.config.checks import require
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Circle, Pose, inverse, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.validation import MAX_COORDINATE
+from coview_stream.localization.search.consensus import Hypothesis
+
+# poses of a guess: scoring moves a hypothesis by up to three metres and seven degrees
+_SPACING = 3.0  # metres
+_TURN = np.radians(13.0)
+_MAX_POSES = 400
+
+_TRIES = 5  # keyframes in a row that must refute all hints before they are tried less often
+_PAUSE = 4  # keyframes between two tries then
+_GROWTH = 1.25  # of a circle's radius from step to step and at first, so that no step is within a quarter of it
+
+MAX_DISTANCE = 20.0
+"""Metres around a guess that are tried at most."""
+
+MIN_WITHIN = 50.0
+"""Metres, least radius of a circle that is searched alone: evidence is judged against the other places in it.
+
+The radius of a virtual scan; no robot came to a pose in one that it was not in (``python -m bench city``).
+"""
+
+FROM_THERE = " (from the last known place)"
+"""End of an evidence's reason where the best hypothesis began as a hint."""
+
+
+@dataclass(frozen=True)
+class PlaceGuess:
+    """Somebody's guess of a robot's place.
+
+    Attributes:
+        x, y: in the frame of the map's sources, metres.
+        yaw: heading of the body's x axis, radians, counter-clockwise from the map's x axis; None: any.
+        distance: metres around it that are tried as well, up to :data:`MAX_DISTANCE`.
+        angle: radians to either side of ``yaw`` that are tried as well.
+        map: name of the one of several maps in whose frame it is; None of one map.
+        within: metres around it outside of which nothing is searched; None: all of the map is. Unlike the rest this
+            is trusted: of a robot that is elsewhere no place is found.
+        begin, end: of x, beyond which ``within`` does not reach: where one of several maps ends.
+    """
+
+    x: float
+    y: float
+    yaw: float | None = None
+    distance: float = 5.0
+    angle: float = float(np.radians(30.0))
+    map: str | None = None
+    within: float | None = None
+    begin: float = -math.inf
+    end: float = math.inf
+
+    def __post_init__(self) -> None:
+        numbers = (self.x, self.y, 0.0 if self.yaw is None else self.yaw)
+        plain = all(isinstance(number, float | int) and not isinstance(number, bool) for number in numbers)
+        require(plain and bool(np.isfinite(numbers).all()), self, "x", "x, y and yaw as finite numbers")
+        require(max(abs(self.x), abs(self.y)) < MAX_COORDINATE, self, "x", "map coordinates in metres")
+        require(0.0 < self.distance <= MAX_DISTANCE, self, "distance", f"above 0, at most {MAX_DISTANCE:g} m")
+        require(0.0 <= self.angle <= np.pi, self, "angle", "0 to pi radians")
+        if self.within is not None:
+            plain = isinstance(self.within, float | int) and not isinstance(self.within, bool)
+            require(plain and MIN_WITHIN <= self.within < MAX_COORDINATE, self, "within", f"{MIN_WITHIN:g} m or more")
+
+    def poses(self) -> Floats:
+        """Return (K, 3) x, y and yaw to try, the nearest to the guess first."""
+        steps = np.arange(-np.ceil(self.distance / _SPACING), np.ceil(self.distance / _SPACING) + 1) * _SPACING
+        xy = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        far = np.linalg.norm(xy, axis=1)
+        xy, far = xy[far <= self.distance], far[far <= self.distance]
+        reach = np.pi if self.yaw is None else self.angle
+        count = int(np.ceil(reach / _TURN))
+        turns = np.arange(-count, count + 1) * (reach / max(count, 1))
+        if reach == np.pi:
+            turns = turns[1:]  # both ends are one
+        poses = np.array([(x, y, turn) for x, y in xy for turn in turns])
+        unlikely = np.repeat(far / self.distance, len(turns)) + np.tile(np.abs(turns) / max(reach, 1e-9), len(xy))
+        poses = poses[np.argsort(unlikely, kind="stable")][:_MAX_POSES]
+        return np.asarray(np.add(poses, (self.x, self.y, self.yaw or 0.0)))
+
+    def area(self, origin: Floats) -> Circle | None:
+        """Return the circle, about the map's ``origin`` (3,), outside of which nothing is searched; None for none."""
+        if self.within is None:
+            return None
+        x, y = float(origin[0]), float(origin[1])
+        return Circle(self.x - x, self.y - y, self.within, self.begin - x, self.end - x)
+
+    def transforms(self, origin: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
+        """Return the poses as level ``T_map_odom`` (4, 4) about the map's ``origin`` (3,), heights left open (0).
+
+        ``T_odom_body`` (4, 4) is of the frame at which the robot is there.
+        """
+        out = []
+        for x, y, yaw in self.poses():
+            turn = rot_z(yaw - yaw_of(T_odom_body))
+            at = np.array([x - origin[0], y - origin[1], 0.0])
+            out.append(pose_from(turn, at - turn @ T_odom_body[:3, 3]))
+        return tuple(out)
+
+
+def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) -> list[Hypothesis]:
+    """Put guesses on the map's ground, on each of its levels; those off the map are left out.
+
+    Args:
+        guesses: of ``T_map_odom``, whose height is open.
+        ground: (3,) the ground below the robot, odometry frame, metres.
+        grid: of the map's stations.
+    """
+    out = []
+    for guess in guesses:
+        T = guess.T_map_odom
+        there = transform(T, ground[None])
+        for station in grid.levels_at(there)[:, 0]:
+            if station >= 0:
+                lift = grid.stations[station, 2] - there[0, 2]
+                out.append(Hypothesis(pose_from(T[:3, :3], T[:3, 3] + (0.0, 0.0, lift))))
+    return out
+
+
+def has_ground(guess: PlaceGuess, origin: Floats, grid: StationGrid) -> bool:
+    """Tell whether the map has ground anywhere near a guess, or within its circle if it has one."""
+    area = guess.area(origin)
+    if area is not None:
+        return bool(area.holds(grid.stations).any())
+    poses = guess.poses()
+    return bool((grid.levels_at(poses[:, :2] - origin[:2]) >= 0).any())
+
+
+class PoseHints:
+    """Hints of a localizer to its search: ``T_map_odom`` in an odometry frame that keeps its origin.
+
+    The localizer moves the origin of its own odometry frame to an anchor, another one after each loss; here it is
+    undone. Map coordinates are the map's own.
+
+    Attributes:
+        circle: of the map, metres from its zero, that the robot was said to be in; None for none.
+    """
+
+    def __init__(self) -> None:
+        self._awaited: Pose | None = None  # T_map_body at the next frame
+        self._known: tuple[Pose, ...] = ()
+        self._leader: Pose | None = None  # of the search so far
+        self._led: tuple[Pose, ...] = ()
+        self._guess: PlaceGuess | None = None  # of the place at the next frame
+        self._guessed: tuple[Pose, ...] = ()
+        self.circle: Circle | None = None
+        self._circle_at = np.zeros(3)  # position by odometry then
+
+    def clear(self) -> None:
+        """Forget them all: a place has been accepted."""
+        self._awaited, self._known = None, ()
+        self.forget_leader()
+        self._guess, self._guessed, self.circle = None, (), None
+
+    def guess(self, guess: PlaceGuess) -> None:
+        """Have a guess of the place at the next frame tried, in place of an earlier one."""
+        self._guess = guess
+
+    def guessed(self, origin: Floats, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
+        """Return the guess as ``T_map_odom`` about ``anchor``, heights open.
+
+        Args:
+            origin: (3,) of the map.
+            anchor: (3,) as of :meth:`about`.
+            T_odom_body: (4, 4) likewise.
+        """
+        if self._guess is not None:
+            guess, self._guess = self._guess, None
+            away = pose_from(np.eye(3), -anchor)
+            self._guessed = tuple(T @ away for T in guess.transforms(origin, T_odom_body))
+            self.circle, self._circle_at = guess.area(origin), anchor + T_odom_body[:3, 3]
+        return tuple(T @ pose_from(np.eye(3), anchor) for T in self._guessed)
+
+    def area(self, anchor: Floats, T_odom_body: Pose) -> Circle | None:
+        """Return the given circle, wider by the distance driven since then; the arguments are as for :meth:`about`.
+
+        It grows in steps, as each step discards the votes so far.
+        """
+        if self.circle is None:
+            return None
+        moved = float(np.linalg.norm(anchor + T_odom_body[:3, 3] - self._circle_at))
+        steps = math.ceil(math.log(1.0 + moved / self.circle.radius, _GROWTH))
+        return replace(self.circle, radius=self.circle.radius * _GROWTH ** max(1, steps))
+
+    def robot_at(self, T_map_body: Pose) -> None:
+        """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
+        self._awaited = T_map_body
+
+    def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
+        """Hint, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
+        self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
+        self.forget_leader()
+
+    def place_leads(self, T_map_odom: Pose, anchor: Floats) -> None:
+        """Note that ``T_map_odom`` (4, 4) about ``anchor`` (3,) leads the search; no hint until a new search begins."""
+        self._leader = T_map_odom @ pose_from(np.eye(3), -anchor)
+
+    def search_begins_anew(self) -> None:
+        """Hint at the place that has led the search so far, if any."""
+        if self._leader is not None:
+            self._led = (self._leader,)
+
+    def forget_leader(self) -> None:
+        """Forget the place that led: the odometry that it is tied to has been contradicted."""
+        self._leader, self._led = None, ()
+
+    def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
+        """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
+        if self._awaited is not None:
+            T_map_body, self._awaited = self._awaited, None
+            # level, for both frames are: the robot's lean has changed since
+            turn = rot_z(yaw_of(T_map_body @ inverse(T_odom_body)))
+            T = pose_from(turn, T_map_body[:3, 3] - turn @ T_odom_body[:3, 3])
+            self._known = (*self._known, T @ pose_from(np.eye(3), -anchor))
+        return tuple(T @ pose_from(np.eye(3), anchor) for T in (*self._known, *self._led))
+
+
+class HintSchedule:
+    """Schedule of hints: all are tried at every keyframe, until a few in a row have refuted them.
+
+    Then at every fifth, not never: the sensor may only have been covered.
+    """
+
+    def __init__(self) -> None:
+        self._hints: tuple[bytes, ...] = ()
+        self._refuted = 0
+        self._wait = 0
+
+    def due(self, hints: Sequence[Pose]) -> list[Hypothesis]:
+        """Return the hints to try at this keyframe, as hypotheses without a station."""
+        hashes = tuple(T.tobytes() for T in hints)
+        if hashes != self._hints:
+            self._hints, self._refuted, self._wait = hashes, 0, 0
+        if self._wait:
+            self._wait -= 1
+            return []
+        return [Hypothesis(T) for T in hints]
+
+    def tried(self, refuted: bool) -> None:
+        """Count a keyframe at which they were tried, and whether it spoke against all of them."""
+        self._refuted = self._refuted + 1 if refuted else 0
+        if self._refuted >= _TRIES:
+            self._wait = _PAUSE
+
+
+def robot_position(T_map_odom: Pose, T_odom_body: Pose) -> Floats:
+    """Return the robot's position (1, 2) in the map under a hint."""
+    return transform(T_map_odom, T_odom_body[None, :3, 3])[:, :2]
