@@ -19,9 +19,9 @@ from pathlib import Path
 import coview_stream
 from coview_stream import config
 from coview_stream.cli import PROGRAM, build_parser
+from coview_stream.cli.options import documented_fields
 
 HERE = Path(__file__).resolve().parent
-_FIELD = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
 _NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
@@ -73,13 +73,6 @@ def commands() -> Iterator[str]:
         yield f"## {PROGRAM} {name}\n\n{cell(parser.description or '')}{table}{also}"
     table = [f"| {option[1]} | {option[2]} | {', '.join(by)} |" for option, by in users.items() if option in common]
     yield "## Shared options\n\n| | | commands |\n|---|---|---|\n" + "\n".join(table)
-
-
-def documented_fields(kind: type) -> dict[str, str]:
-    """Return the text of each field in the docstring of a configuration."""
-    _, _, attributes = inspect.getdoc(kind).partition("\nAttributes:\n")
-    attributes = re.split(r"^\S", attributes, maxsplit=1, flags=re.MULTILINE)[0]
-    return {name: " ".join(text.split()) for name, text in _FIELD.findall(attributes)}
 
 
 def default_of(field: dataclasses.Field[object]) -> str:

@@ -43,6 +43,18 @@ _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "
 class _Parser(argparse.ArgumentParser):
     """Parser that raises bad usage as an error, like any other bad input, instead of printing it and exiting."""
 
+    def format_help(self, everything: bool = False) -> str:
+        """Return the help, without the rare options unless ``everything`` is asked for."""
+        hidden = [] if everything else [action for action in self._actions if getattr(action, "rare", False)]
+        texts = [action.help for action in hidden]
+        for action in hidden:
+            action.help = argparse.SUPPRESS
+        try:
+            return super().format_help()
+        finally:
+            for action, text in zip(hidden, texts, strict=True):
+                action.help = text
+
     def error(self, message: str) -> NoReturn:
         # prog includes the subcommand, whose help is the one to read
         raise ConfigError(f"{message}; see `{self.prog} --help`")

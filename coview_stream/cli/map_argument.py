@@ -28,13 +28,13 @@ def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bo
     """Declare the map's argument, and ``--around``; ``several``: or more than one."""
     parser.add_argument(
         "map",
-        nargs="+" if several else "?" if optional else None,
+        nargs="*" if several else "?" if optional else None,
         metavar="SITE",
-        help="SITE.coview, a site's directory, or its address: zenoh://SITE, https://..., s3://..."
-        + ("; several (storeys, sites) are searched together, by name: FLOOR=SITE.coview" if several else ""),
+        help="SITE.coview, a directory of tiles, or zenoh://SITE, https://..., s3://..."
+        + ("; several: FLOOR=SITE" if several else ""),
     )
     parser.add_argument(
-        "--around", metavar="X,Y,RADIUS", help="load only the tiles within RADIUS of X,Y, of a directory or an address"
+        "--around", metavar="X,Y,RADIUS", help="load only the tiles of a directory or address within RADIUS of X,Y"
     )
 
 
@@ -93,7 +93,7 @@ def open_map_argument(args: argparse.Namespace) -> LocalMap:
     from coview_stream.basemap.signature import read_verify_key
 
     key = None if getattr(args, "verify_key", None) is None else read_verify_key(args.verify_key)
-    connect, config = getattr(args, "connect", None) or (), getattr(args, "config", None)
+    connect, config = getattr(args, "connect", None) or (), getattr(args, "zenoh_config", None)
     base = getattr(args, "base", "coview")
     given = args.map if isinstance(args.map, list) else [args.map]
     if len(given) == 1:

@@ -3,16 +3,108 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
     from coview_stream.config.mount import Mount
     from coview_stream.config.odometry import LidarOdometryConfig
     from coview_stream.localization.search.hints import PlaceGuess
+
+
+def documented_fields(kind: type[Any]) -> dict[str, str]:
+    """Return the text of each field in the docstring of a configuration."""
+    _, _, attributes = (inspect.getdoc(kind) or "").partition("\nAttributes:\n")
+    attributes = re.split(r"^\S", attributes, maxsplit=1, flags=re.MULTILINE)[0]
+    field = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
+    return {name: " ".join(text.split()) for name, text in field.findall(attributes)}
+
+
+class HelpAll(argparse.Action):
+    """Print the help with the rare options, and end."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        """Print and end."""
+        print(parser.format_help(everything=True), end="")  # type: ignore[call-arg]  # the command's own parser
+        parser.exit()
+
+
+def hide_rare(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Leave options out of ``--help`` by their destinations, and declare ``--help-all``."""
+    for action in parser._actions:
+        if action.dest in names:
+            action.rare = True  # type: ignore[attr-defined]  # read by the command's parser
+    parser.add_argument("--help-all", action=HelpAll, nargs=0, help="show every option")
+
+
+def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mapping[str, str]) -> None:
+    """Declare fields of a configuration as options, with its documentation and defaults; None where not given."""
+    defaults, texts = kind(), documented_fields(kind)
+    for name, unit in units.items():
+        default = getattr(defaults, name)
+        group.add_argument(
+            f"--{_SHORT.get(name, name).replace('_', '-')}", dest=name, type=type(default), metavar=unit,
+            help=f"{texts[name].rstrip('.')} ({default:g})",
+        )  # fmt: skip
+
+
+_SHORT = {"dead_reckoning_timeout": "coast"}
+"""Options that are called otherwise than their field."""
+
+
+def fill_from_file(
+    args: argparse.Namespace, path: Path, parser: argparse.ArgumentParser, tables: Collection[str]
+) -> dict[str, dict[str, Any]]:
+    """Set the options that were not given to the values of a TOML file, by their names, and return its tables.
+
+    Raises:
+        ConfigError: an unknown key, or a value that the option does not take.
+    """
+    from coview_stream.config.settings_file import read_settings, unknown_key
+    from coview_stream.errors import ConfigError
+
+    settings = read_settings(path)
+    actions = {action.dest: action for action in parser._actions if action.dest not in ("help", "help_all", "config")}
+    for key, value in settings.items():
+        name = key.replace("-", "_")
+        if name in tables:
+            if not isinstance(value, dict):
+                raise ConfigError(f"{path}: {key} is {value!r}; write a table [{key}]")
+        elif name not in actions:
+            raise ConfigError(f"{path}: {unknown_key(key, [*tables, *actions])}")
+        elif getattr(args, name) in (None, False, []):
+            setattr(args, name, _value_of(actions[name], value, f"{path}: {key}"))
+    return {name: settings[name] for name in tables if name in settings}
+
+
+def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
+    """Return a value of a settings file as the command line would give it."""
+    from coview_stream.errors import ConfigError
+
+    if action.nargs == 0 or (action.nargs == "?" and value is True):
+        if not isinstance(value, bool):
+            raise ConfigError(f"{where} is {value!r}; write true or false")
+        return (True if action.nargs == 0 else action.const) if value else action.default
+    several = action.nargs in ("+", "*") or isinstance(action, argparse._AppendAction)
+    items = value if isinstance(value, list) and several else [value]
+    out = []
+    for item in items:
+        kind = action.type if callable(action.type) else str
+        if isinstance(item, dict | list | bool):
+            raise ConfigError(f"{where} is {value!r}; write {'texts' if several else 'one value'}")
+        try:
+            out.append(kind(str(item)))
+        except (argparse.ArgumentTypeError, ValueError) as error:
+            raise ConfigError(f"{where} is {item!r}: {error}") from error
+        if action.choices is not None and out[-1] not in action.choices:
+            raise ConfigError(f"{where} is {item!r}; choose one of {', '.join(map(str, action.choices))}")
+    return out if several else out[0]
+
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
@@ -86,15 +178,10 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
         action="append" if of_robots else "store",
         default=[] if of_robots else None,
         metavar="NAME=X,Y[,YAW]" if of_robots else "X,Y[,YAW]",
-        help="where the robot may be at first (map coordinates, degrees): tried, never trusted; write "
-        + ("--initial=..." if not of_robots else "one for each robot"),
+        help="a guess of the place (map coordinates, degrees): tried, never trusted",
     )
     parser.add_argument(
-        "--within",
-        type=float,
-        metavar="METRES",
-        help="radius of a circle around --initial, 50 or more, that surely holds the robot: nothing outside is "
-        "searched until it is found; it is taken a quarter wider and grows with the drive (all of the map)",
+        "--within", type=float, metavar="METRES", help="metres around --initial that are searched, 50 or more"
     )
 
 
@@ -158,7 +245,7 @@ def add_registration(parser: argparse.ArgumentParser) -> None:
         "--registration",
         choices=("trimmed-icp", "gicp"),
         default="trimmed-icp",
-        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
+        help="of scans to the map while tracking; gicp is slower, extra gicp (trimmed-icp)",
     )
 
 
@@ -168,8 +255,7 @@ def add_reloc(parser: argparse.ArgumentParser) -> None:
         "--reloc",
         choices=("auto", "coview", "learned"),
         default="auto",
-        help="source of the places to look at: co-view descriptors, learned features, or both on maps that have "
-        "features (auto)",
+        help="place recognition: co-view descriptors, learned features, or both where the map has them (auto)",
     )
 
 
@@ -179,8 +265,7 @@ def add_risk(parser: argparse.ArgumentParser) -> None:
         "--risk",
         default=1e-4,
         metavar="P",
-        help="probability of a wrong place below which a search gives one, from 1e-6 to below 0.5; the smaller, the "
-        "farther a robot may drive before it is found (1e-4)",
+        help="probability of a wrong place below which a pose is given, 1e-6 to 0.5 (1e-4)",
     )
 
 
@@ -223,8 +308,7 @@ def add_mount(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--mount",
         metavar="R,P,Y[,X,Y,Z]",
-        help="where the lidar sits on the body whose odometry it is: roll, pitch, yaw in degrees, and metres, as in "
-        "--mount=180,0,0 for upside down (the body's frame is the lidar's)",
+        help="pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down",
     )
 
 
@@ -242,10 +326,7 @@ def mount_of(args: argparse.Namespace) -> Mount:
 def add_verify_key(parser: argparse._ActionsContainer) -> None:
     """Declare ``--verify-key``."""
     parser.add_argument(
-        "--verify-key",
-        type=Path,
-        metavar="NAME.pub",
-        help="refuse a map that is not signed with this key (build --sign), or has been changed since",
+        "--verify-key", type=Path, metavar="NAME.pub", help="refuse a map that this key has not signed (build --sign)"
     )
 
 
@@ -280,13 +361,9 @@ def lidar_config(odometry: str, gravity: str | None, max_speed: float = 50.0) ->
 
 def add_state(parser: argparse.ArgumentParser) -> None:
     """Declare ``--state`` and ``--no-state``."""
-    group = parser.add_argument_group("from one start to the next")
-    either = group.add_mutually_exclusive_group()
+    either = parser.add_mutually_exclusive_group()
     either.add_argument(
-        "--state",
-        metavar="DIR",
-        help="keep each robot's last pose here, to be tried first at the next start, and verified like any other "
-        "place (the user's state directory, such as ~/.local/state/coview-stream)",
+        "--state", metavar="DIR", help="directory of the robots' last poses, tried first at the next start (the user's)"
     )
     either.add_argument("--no-state", action="store_true", help="keep nothing, read nothing")
 

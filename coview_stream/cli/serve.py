@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import (
     KISS_ICP,
     ROBOT,
     acceptance_config,
+    add_fields,
     add_gravity,
     add_initial,
     add_mount,
+    add_network,
+    add_preset,
+    add_quiet,
     add_registration,
     add_reloc,
     add_risk,
     add_state,
     add_verify_key,
     check_codec,
+    fill_from_file,
+    hide_rare,
     initial_guesses,
     lidar_config,
     mount_of,
     writable_state_folder,
 )
 from coview_stream.cli.view import add_view
-from coview_stream.config.node import METRICS_ADDRESS
+from coview_stream.config.node import METRICS_ADDRESS, NodeConfig
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,22 +49,55 @@ if TYPE_CHECKING:
 
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
 
+_LIMITS = {
+    "pose_rate": "HZ",
+    "odometry_timeout": "S",
+    "max_outage": "S",
+    "max_speed": "M/S",
+    "dead_reckoning_timeout": "S",
+    "max_payload": "BYTES",
+}
+"""Fields of NodeConfig that are options, with their units."""
+
+_TABLES = ("node", "localizer", "lidar_odometry")
+"""Tables of ``--config``: fields of NodeConfig, LocalizerConfig and LidarOdometryConfig; all other keys are options."""
+
+_DEFAULTS = {
+    "preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "registration": None, "reloc": None,
+    "risk": None,
+}  # fmt: skip
+"""Options whose defaults --config may replace; None: the configuration's."""
+
+_RARE = (
+    *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
+    *(
+        "pose_encoding",
+        "geo",
+        "gravity",
+        "no_deskew",
+        "registration",
+        "reloc",
+        "log_json",
+        "around",
+        "foxglove",
+        "record",
+        "rerun",
+        *_LIMITS,
+    ),
+)
+"""Options that are left to --help-all."""
+
 _MAX_SHUTDOWN = 1.5  # seconds after a signal: docs/operate.md promises two
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; values are checked where they are used."""
     add_map(parser, several=True)
-    parser.add_argument(
-        "--robot", nargs="+", action="extend", required=True, metavar="NAME", help="one or several robots"
-    )
-    network = parser.add_argument_group("network (with none of these: --listen tcp/127.0.0.1:7447)")
-    network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router")
-    network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for peers here")
-    network.add_argument("--config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ...")
+    parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="one or several robots")
+    parser.add_argument("--config", type=Path, metavar="node.toml", help="settings; options given here replace them")
+    add_network(parser, "--listen tcp/127.0.0.1:7447")
     keys = parser.add_argument_group("keys and encodings")
-    keys.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
-    keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
+    add_preset(parser)
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument(
         "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
@@ -71,31 +112,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--geo", nargs="?", const="json", choices=("json", "cdr", "foxglove"),
         help="publish latitude, longitude and height as well: JSON, NavSatFix or foxglove.LocationFix (json)",
     )  # fmt: skip
-    source = parser.add_argument_group("odometry")
-    source.add_argument(
-        "--odometry",
-        choices=(ROBOT, KISS_ICP),
-        default=ROBOT,
-        help="who makes it: the robot, or this node out of the clouds (robot)",
+    parser.add_argument(
+        "--odometry", choices=(ROBOT, KISS_ICP), help="from the robot, or computed from its clouds (robot)"
     )
-    add_gravity(source)
+    add_gravity(parser)
     limits = parser.add_argument_group("rates and limits")
-    limits.add_argument("--pose-rate", type=float, default=10.0, metavar="HZ", help="(10)")
-    limits.add_argument("--odometry-timeout", type=float, default=0.5, metavar="S", help="older: no pose (0.5)")
-    limits.add_argument(
-        "--max-outage", type=float, default=2.0, metavar="S", help="after longer without: search anew (2)"
-    )
-    limits.add_argument(
-        "--max-speed", type=float, default=50.0, metavar="M/S", help="odometry that is faster has jumped (50)"
-    )
-    limits.add_argument(
-        "--coast", type=float, default=5.0, metavar="S", help="poses go on this long without frames (5)"
-    )
-    limits.add_argument(
-        "--max-payload", type=int, default=16 << 20, metavar="BYTES", help="larger is not looked at (16 MiB)"
-    )
+    add_fields(limits, NodeConfig, _LIMITS)
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
-    add_mount(limits)
+    add_mount(parser)
     add_initial(parser, of_robots=True)
     add_registration(parser)
     add_reloc(parser)
@@ -104,24 +128,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operate.md)")
     operation.add_argument(
-        "--node",
-        metavar="NAME",
-        help="the node's own name in its keys (the first robot's; of a fleet the host's and a number)",
+        "--node", dest="node_name", metavar="NAME", help="name of the node in its keys (the first robot's)"
     )
-    operation.add_argument(
-        "--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet, each on one of them"
-    )
+    operation.add_argument("--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet")
     operation.add_argument(
         "--metrics",
         nargs="?",
         const=METRICS_ADDRESS,
         type=_host_port,
         metavar="HOST:PORT",
-        help=f"answer GET /metrics and /health there (no port is opened; {METRICS_ADDRESS} if none is named)",
+        help=f"serve GET /metrics and /health ({METRICS_ADDRESS} if no address is named)",
     )
     add_view(operation)
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
-    operation.add_argument("--quiet", action="store_true", help="log errors only")
+    add_quiet(operation)
+    parser.formatter_class = functools.partial(argparse.HelpFormatter, max_help_position=20)
+    parser.usage = "%(prog)s SITE --robot NAME [options]"
+    parser.set_defaults(**dict.fromkeys(_DEFAULTS))  # None: not given, --config decides
+    hide_rare(parser, *_RARE)
 
 
 def _host_port(text: str) -> str:
@@ -134,16 +158,37 @@ def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
     from coview_stream.stream.node.engine_process import start_children
 
+    tables = _settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)
     try:
-        return _run(args, children)
+        return _run(args, tables, children)
     finally:
         for child in children.values():
             child.close()
 
 
-def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
+def _settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Complete the arguments from ``--config`` and the defaults, and return the file's tables.
+
+    Raises:
+        ConfigError: the file has a mistake, or map or robots are missing in both.
+    """
+    tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
+    if args.config is not None:
+        declared = argparse.ArgumentParser()
+        add_arguments(declared)
+        tables |= fill_from_file(args, args.config, declared, _TABLES)
+    for name, value in _DEFAULTS.items():
+        if getattr(args, name) is None:
+            setattr(args, name, value)
+    for name, value in (("SITE", args.map), ("--robot", args.robot)):
+        if not value:
+            raise ConfigError(f"{name} is missing: give it here or in --config; see `coview-stream serve --help`")
+    return tables
+
+
+def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:
     import logging
     import os
     import socket
@@ -152,8 +197,8 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.cli.view import open_sinks
-    from coview_stream.config import LocalizerConfig, RegistrationConfig
-    from coview_stream.config.node import NodeConfig
+    from coview_stream.config import LocalizerConfig
+    from coview_stream.config.settings_file import with_table
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import CodecOptions, NetworkOptions, ServeOptions
     from coview_stream.stream.transport.keys import check_chunk, node_keys, robot_keys
@@ -164,12 +209,27 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
     verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
-    localizer = LocalizerConfig(
-        registration=RegistrationConfig(method=args.registration),
-        acceptance=acceptance_config(args.risk),
-        reloc=args.reloc,
+    localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
+    localizer = replace(
+        localizer,
+        registration=localizer.registration
+        if args.registration is None
+        else replace(localizer.registration, method=args.registration),
+        acceptance=localizer.acceptance if args.risk is None else acceptance_config(args.risk),
+        reloc=args.reloc or localizer.reloc,
     )
-    lidar = lidar_config(args.odometry, args.gravity, args.max_speed)
+    node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")
+    node = replace(
+        node,
+        **{name: value for name in _LIMITS if (value := getattr(args, name)) is not None},
+        deskew=node.deskew and not args.no_deskew,
+        mount=node.mount if args.mount is None else mount_of(args),
+    )
+    # a pause that keeps the pose up keeps its frames as well
+    node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
+    lidar = lidar_config(args.odometry, args.gravity, node.max_speed)
+    if lidar is not None:
+        lidar = with_table(lidar, tables["lidar_odometry"], f"{args.config}: [lidar_odometry]")
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
@@ -177,25 +237,12 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     fleet = None if args.fleet is None else f"{args.base}/fleet/{check_chunk(args.fleet, '--fleet')}"
     # nodes of a fleet have the same robots
     default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
-    if not 0 < args.coast < float("inf"):  # the configuration names the field otherwise
-        raise ConfigError(f"--coast is {args.coast}; it must be a positive, finite number of seconds")
-    by_default = not (args.connect or args.listen or args.config)
-    node = NodeConfig(
-        pose_rate=args.pose_rate,
-        odometry_timeout=args.odometry_timeout,
-        max_gap=max(0.5, args.odometry_timeout),  # a pause that keeps the pose up keeps its frames as well
-        max_outage=args.max_outage,
-        max_speed=args.max_speed,
-        dead_reckoning_timeout=args.coast,
-        max_payload=args.max_payload,
-        deskew=not args.no_deskew,
-        mount=mount_of(args),
-    )
+    by_default = not (args.connect or args.listen or args.zenoh_config)
     opened = open_map_argument(args)
     options = ServeOptions(
         map_path=opened.path,
         keys=keys,
-        network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config),
+        network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.zenoh_config),
         codecs=CodecOptions(args.cloud_encoding, args.odometry_encoding, args.pose_encoding, args.geo),
         node=node,
         localizer=localizer,
@@ -205,7 +252,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         mirrors=opened.mirrors,
         verify_key=verify_key,
         fleet=fleet,
-        node_keys=node_keys(args.base, args.node or default_node),
+        node_keys=node_keys(args.base, args.node_name or default_node),
         metrics=args.metrics,
     )
     sinks = open_sinks(args)

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.errors import ConfigError
+
 if TYPE_CHECKING:
     from coview_stream.basemap.summary import MapView
     from coview_stream.config.mount import Mount
@@ -29,7 +31,7 @@ def add_view(parser: argparse._ActionsContainer) -> None:
         const=_WEB,
         type=_host_port,
         metavar="HOST:PORT",
-        help=f"show map and robots as a web page there (no page; {_WEB} if no address is named)",
+        help=f"show map and robots on a web page ({_WEB} if no address is named)",
     )
     parser.add_argument(
         "--foxglove",
@@ -37,11 +39,12 @@ def add_view(parser: argparse._ActionsContainer) -> None:
         const=_FOXGLOVE,
         type=_host_port,
         metavar="HOST:PORT",
-        help=f"serve the same to the Foxglove app there (extra: foxglove; {_FOXGLOVE} if no address is named)",
+        help=f"serve the same to Foxglove ({_FOXGLOVE}; extra foxglove)",
     )
-    parser.add_argument("--record", type=Path, metavar="F.mcap", help="record the same as MCAP (extra: foxglove)")
-    parser.add_argument("--rerun", action="store_true", help="show the same in the rerun viewer (extra: viz)")
-    parser.add_argument("--save", type=Path, metavar="F.rrd", help="write it for rerun to a file, without a viewer")
+    parser.add_argument(
+        "--record", type=Path, metavar="FILE", help="record the same: F.mcap (extra foxglove), F.rrd (viz)"
+    )
+    parser.add_argument("--rerun", action="store_true", help="show the same in rerun (extra viz)")
 
 
 def _host_port(text: str) -> str:
@@ -58,16 +61,19 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
         DependencyError: a library is missing.
     """
     sinks: list[Sink] = []
-    if args.rerun or args.save is not None:
+    mcap, rrd = (args.record if args.record and args.record.suffix == suffix else None for suffix in (".mcap", ".rrd"))
+    if args.record is not None and not (mcap or rrd):
+        raise ConfigError(f"--record {args.record}: name a file .mcap (Foxglove) or .rrd (rerun)")
+    if args.rerun or rrd is not None:
         from coview_stream.viewers.rerun_sink import RerunSink
 
-        sinks.append(RerunSink(args.save))
-    if args.foxglove is not None or args.record is not None:
+        sinks.append(RerunSink(rrd))
+    if args.foxglove is not None or mcap is not None:
         from coview_stream.viewers.foxglove_sink import FoxgloveSink
 
         foxglove = FoxgloveSink()
-        if args.record is not None:
-            foxglove.record(args.record)
+        if mcap is not None:
+            foxglove.record(mcap)
         if args.foxglove is not None:
             host, _, port = args.foxglove.rpartition(":")
             host = host.strip("[]") or "127.0.0.1"

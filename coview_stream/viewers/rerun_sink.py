@@ -136,7 +136,9 @@ class RerunSink(Sink):
 def _start_viewer() -> int:
     """Start the viewer that the library brings, on the loopback interface, and return its port."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError("--rerun: there is no display here; write a file with --save FILE.rrd, and open it elsewhere")
+        raise ConfigError(
+            "--rerun: there is no display here; write a file with --record FILE.rrd, and open it elsewhere"
+        )
     with socket.socket() as probe:
         probe.bind((_HOST, 0))
         port = int(probe.getsockname()[1])
@@ -156,10 +158,12 @@ def _start_viewer() -> int:
     deadline = time.monotonic() + _MAX_START
     while time.monotonic() < deadline:
         if process.poll() is not None:
-            raise ConfigError(f"--rerun: the viewer ended with code {process.returncode}; --save FILE.rrd does without")
+            raise ConfigError(
+                f"--rerun: the viewer ended with code {process.returncode}; --record FILE.rrd does without"
+            )
         with socket.socket() as probe:
             if probe.connect_ex((_HOST, port)) == 0:
                 return port
         time.sleep(0.1)
     process.terminate()
-    raise ConfigError(f"--rerun: the viewer did not start within {_MAX_START:g} s; --save FILE.rrd does without")
+    raise ConfigError(f"--rerun: the viewer did not start within {_MAX_START:g} s; --record FILE.rrd does without")

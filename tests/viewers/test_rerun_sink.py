@@ -29,7 +29,7 @@ def test_no_display_is_one_line(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ConfigError, match="no display here; write a file with --save"):
+    with pytest.raises(ConfigError, match="no display here; write a file with --record"):
         RerunSink()
 
 
