@@ -1,1 +1,1 @@
-"""Registration of a scan to the map, its verification and its covariance."""
+"""Registration of a scan to the map, and its covariance."""

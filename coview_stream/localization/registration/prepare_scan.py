@@ -1,4 +1,4 @@
-"""The part of the robot's recent points that is registered and verified."""
+"""The part of the robot's recent points that is registered."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SEED = 20240  # of the choice among too many points
 
 @dataclass(frozen=True)
 class RegistrationCloud:
-    """A local scan that is registered and verified.
+    """A local scan to register.
 
     Attributes:
         points: (N, 3) float32, gravity-aligned frame, metres.

@@ -8,7 +8,7 @@ from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
 
 import coview_kernels as kernels
-from coview_stream.config import RegistrationConfig
+from coview_stream.config import MapConfig, RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
@@ -127,14 +127,22 @@ def test_thinning_keeps_ground_and_structure_points(scan):
 
 
 class FakeMap:
-    """Counts the crops asked for."""
+    """A map of one cloud that counts the crops asked for."""
+
+    config = MapConfig()
 
     def __init__(self, points, normals):
+        self.arrays = self
         self.cloud, self.asked = (points, np.rint(127 * normals).astype(np.int8)), []
 
-    def cut(self, cut):
-        self.asked.append(cut)
-        return kernels.crop_points(*self.cloud, [[0, len(self.cloud[0])]], cut)
+
+@pytest.fixture(autouse=True)
+def cut_from_the_whole_cloud(monkeypatch):
+    def cut_points(fake, tile, cut):
+        fake.asked.append(cut)
+        return kernels.crop_points(*fake.cloud, [[0, len(fake.cloud[0])]], cut)
+
+    monkeypatch.setattr("coview_stream.localization.registration.local_map.cut_points", cut_points)
 
 
 def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
