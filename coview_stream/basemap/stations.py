@@ -268,13 +268,13 @@ def describe_stations(
         grid = kernels.station_bins(
             raster.top,
             raster.count,
-            raster.cell,
-            rows[part],
-            columns[part],
-            stations[part, 2],
-            config.rings,
-            config.sectors,
-            config.radius,
+            cell=raster.cell,
+            rows=rows[part],
+            cols=columns[part],
+            ground=stations[part, 2],
+            rings=config.rings,
+            sectors=config.sectors,
+            r_max=config.radius,
         )
         for name in config.channels:
             described[name][part] = channel(name, grid)

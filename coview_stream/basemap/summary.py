@@ -119,13 +119,13 @@ def summary(base_map: SummarizedMap) -> MapSummary:
     return MapSummary(
         float(high[0] - low[0]),
         float(high[1] - low[1]),
-        area,
-        float(lowest),
-        float(highest),
-        density,
-        short_name(base_map.crs),
-        base_map.nbytes,
-        tuple(filter(None, (
+        area=area,
+        lowest=float(lowest),
+        highest=float(highest),
+        density=density,
+        crs=short_name(base_map.crs),
+        bytes=base_map.nbytes,
+        warnings=tuple(filter(None, (
             _upright(base_map),
             _dense(density),
             _structured(points, index, covered),

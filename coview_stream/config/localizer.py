@@ -8,6 +8,9 @@ from typing import Literal, get_args
 
 from coview_stream.config.checks import all_positive, check_types, counts, fraction, positive, require
 
+MIN_PAIRS = 50
+"""Pairs that a registration needs, and points that a crop of the map needs."""
+
 LEAST_RISK = 1e-6
 """Smallest risk: the model of the evidence does not tell smaller errors apart."""
 

@@ -210,9 +210,16 @@ def fuse(
         for k, (run, frames) in enumerate(zip(runs, taken, strict=True), start=1)
     )
     return Fused(
-        base_map, base_change, points[keep], source, np.where(new, NEW, SAME)[keep].astype(np.uint8),
-        rows["stamp"][keep], added, float(blind.sum()) * config.voxel**2, int((moving & (to_map > config.voxel)).sum()),
-    )  # fmt: skip
+        base_map,
+        base_change,
+        points=points[keep],
+        source=source,
+        change=np.where(new, NEW, SAME)[keep].astype(np.uint8),
+        stamp=rows["stamp"][keep],
+        added=added,
+        filled=float(blind.sum()) * config.voxel**2,
+        moving=int((moving & (to_map > config.voxel)).sum()),
+    )
 
 
 def _surfaces(

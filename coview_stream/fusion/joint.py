@@ -174,9 +174,17 @@ def adjust(
     loops = sum(submaps[pair.source].run == submaps[pair.target].run for pair in used)
     residuals = (_residual(used, before), _residual(used, after))
     return Joint(
-        tuple(run.poses for run in runs), adjusted, len(submaps), len(on_map), len(steps), len(used) - loops, loops,
-        len(held_out), residuals, judgement,
-    )  # fmt: skip
+        tuple(run.poses for run in runs),
+        adjusted,
+        keyframes=len(submaps),
+        on_map=len(on_map),
+        odometry=len(steps),
+        between=len(used) - loops,
+        loops=loops,
+        held_out=len(held_out),
+        residuals=residuals,
+        judgement=judgement,
+    )
 
 
 def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:

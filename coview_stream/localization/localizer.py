@@ -232,14 +232,14 @@ class Localizer:
         return Fix(
             newest.stamp,
             self.state,
-            T_map_body,
-            T_map_body @ inverse(newest.T_odom_raw),
-            self._tracker.reported_covariance(),
-            min(self._confidence, 1.0 - self._wrong),
-            evidence,
-            self._tracker.odometry.drift,
-            self._tracker.protection_level(),
-            calibration,
+            T_map_body=T_map_body,
+            T_map_odom=T_map_body @ inverse(newest.T_odom_raw),
+            covariance=self._tracker.reported_covariance(),
+            confidence=min(self._confidence, 1.0 - self._wrong),
+            evidence=evidence,
+            drift=self._tracker.odometry.drift,
+            protection=self._tracker.protection_level(),
+            calibration=calibration,
         )
 
     def take_events(self) -> tuple[Event, ...]:

@@ -88,11 +88,19 @@ class KeyframeEvidence:
         known = data.get(_SHARES[0]) is not None
         parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
         return cls(
-            float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
-            float(data["rival"]), parts, data["station"], data["shift"],
-            None if data.get("cause") is None else RejectionReason(data["cause"]), data.get("innovation"),
-            data.get("confidence"), data.get("by_chance"),
-        )  # fmt: skip
+            float(data["stamp"]),
+            State(data["state"]),
+            reason=str(data["reason"]),
+            score=float(data["score"]),
+            rival=float(data["rival"]),
+            evidence=parts,
+            station=data["station"],
+            shift=data["shift"],
+            cause=None if data.get("cause") is None else RejectionReason(data["cause"]),
+            innovation=data.get("innovation"),
+            confidence=data.get("confidence"),
+            by_chance=data.get("by_chance"),
+        )
 
 
 def _number(value: float | None, form: str) -> float | None:

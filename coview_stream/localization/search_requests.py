@@ -82,8 +82,16 @@ class SearchRequests:
             return NoSearch("nothing is searched: the map has no ground in the circle that the robot is said to be in")
         rays = RangeImage.rays(calibration.level(frame.cloud))
         request = SearchRequest.of(
-            self._buffer, keyframe, rays, self._spec, travelled, self.epoch, hints, guesses, area
-        )  # fmt: skip
+            self._buffer,
+            keyframe,
+            cloud=rays,
+            spec=self._spec,
+            travelled=travelled,
+            epoch=self.epoch,
+            hints=hints,
+            guesses=guesses,
+            area=area,
+        )
         # thinned as the search would: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self._config.registration))
 

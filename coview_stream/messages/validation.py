@@ -104,4 +104,14 @@ def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
 def bare_pose(stamp_ns: int, T: Pose, frame_id: str, covariance: Floats | None = None) -> PoseMessage:
     """Return the message of a format that carries little but a pose; missing fields are NaN or empty."""
     unknown = np.full((6, 6), np.nan) if covariance is None else covariance
-    return PoseMessage(stamp_ns, "", "TRACKING", T, unknown, math.nan, "", math.nan, frame_id)
+    return PoseMessage(
+        stamp_ns,
+        "",
+        state="TRACKING",
+        T_map_body=T,
+        covariance=unknown,
+        confidence=math.nan,
+        map_sha256="",
+        age=math.nan,
+        frame_id=frame_id,
+    )

@@ -29,10 +29,10 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, norms, orthonormal, skew
-from coview_stream.localization.registration.local_map import MIN_PAIRS
 
 # set by hand
 _NEIGHBOURS = 10  # that a point's covariance is made of; small_gicp's own choice

@@ -13,6 +13,7 @@ import coview_kernels as kernels
 from coview_kernels.cells import Cells
 from coview_stream.basemap.tiles import cut_points
 from coview_stream.config import RegistrationMethod
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, norms
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.localization.registration.gicp import Surfaces
 
-MIN_PAIRS = 50
-"""Pairs that a registration needs, and points that a crop of the map needs."""
 
 _MAX_CROPS = 12  # cached
 _CROP_STEP = 16.0  # metres between the centres of cached crops

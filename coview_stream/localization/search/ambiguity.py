@@ -132,8 +132,17 @@ def ambiguity(
     evidence, lead, error = values.T
     driven = ~np.isin(np.arange(len(station)), np.setdiff1d(waiting, tried))
     return Ambiguity(
-        station, position, drive, driven, evidence, lead, error, wrong, rehearsal.config.acceptance.risk, changed
-    )  # fmt: skip
+        station,
+        position,
+        drive=drive,
+        driven=driven,
+        evidence=evidence,
+        lead=lead,
+        error=error,
+        wrong=wrong,
+        risk=rehearsal.config.acceptance.risk,
+        changed=changed,
+    )
 
 
 def sample(base_map: BaseMap, count: int) -> Indices:

@@ -108,11 +108,19 @@ class SearchRequest:
             surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, guesses,
-            surroundings,
-            buffer.R_body_cloud,
-            area,
-        )  # fmt: skip
+            keyframe.stamp,
+            keyframe.T_odom_body,
+            scan=scan,
+            submap=submap,
+            cloud=cloud,
+            travelled=travelled,
+            epoch=epoch,
+            hints=hints,
+            guesses=guesses,
+            surroundings=surroundings,
+            R_body_cloud=buffer.R_body_cloud,
+            area=area,
+        )
 
 
 def same_place(
