@@ -14,12 +14,13 @@ import coview_kernels as kernels
 from coview_stream.basemap.tiles import scaled_normals
 from coview_stream.clouds.filters import estimate_normals
 from coview_stream.config import RegistrationConfig
-from coview_stream.config.localizer import MIN_PAIRS, RegistrationCloud, prepare_scan
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, along_body, boxminus, inverse, pose_from, yaw_of
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import Prior, register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 

@@ -21,12 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from coview_stream.config import RegistrationConfig
-from coview_stream.config.localizer import MIN_PAIRS, prepare_scan
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
 from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import Prior, register
 
 # set by hand

@@ -13,11 +13,12 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.config.localizer import MIN_PAIRS, RegistrationCloud
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, boxminus, boxplus, skew
 from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _MIN_SHARE = 0.01  # of the knowledge of a direction; where the pairs have less, their minimum is noise
