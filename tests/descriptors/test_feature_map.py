@@ -162,7 +162,7 @@ def test_feature_map_size_is_bounded(features):
 
 def with_features(base_map, built):
     arrays, parameters = built
-    return BaseMap({**base_map._arrays, **arrays}, {**base_map.parameters, "learned": parameters})
+    return BaseMap({**base_map.arrays, **arrays}, {**base_map.parameters, "learned": parameters})
 
 
 def test_map_file_keeps_features(world_map, built, tmp_path):
