@@ -237,8 +237,8 @@ def metres_until_due(tracker, T):
 def test_noisy_odometry_is_estimated_and_registered_more_often(world_map, slow_drive):
     good, bad = (ridden(world_map, slow_drive, scale) for scale in (1.0, 1.08))
     known = SETTINGS.position_drift
-    assert good[0].drift.position < known
-    assert bad[0].drift.position > 1.5 * known
+    assert good[0].odometry.drift.position < known
+    assert bad[0].odometry.drift.position > 1.5 * known
     ahead = pose_from(np.eye(3), [0.9, 0.0, 0.0])
     for tracker, T in (good, bad):
         match_and_update(tracker, slow_drive.clouds[-1], T)
