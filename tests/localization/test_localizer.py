@@ -1,6 +1,14 @@
-"""The localizer on a small world: correct poses, none where it cannot know, and bad frames that do no harm."""
+"""The localizer on a small world: correct poses, none where it cannot know, refusals with a remedy."""
 
 from __future__ import annotations
+
+import ast
+import copy
+import inspect
+import pickle
+import re
+import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +18,12 @@ from trackers import garbage
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, RegistrationConfig
-from coview_stream.errors import CloudError, RunError
+from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.errors import CloudError, ConfigError, InputError, MapError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -339,3 +348,103 @@ def test_standing_robot_keeps_tracking_without_shrinking_covariance(world_map, w
     assert degrees < 0.3
     early, late = (np.sqrt(np.diag(fixes[k].covariance))[:2].max() for k in (20, -1))
     assert late > 0.8 * early
+
+
+def test_localizer_of_a_path_loads_the_map(world_file):
+    assert Localizer(str(world_file)).base_map.sha256 == Localizer(world_file).base_map.sha256 != ""
+    with pytest.raises(MapError, match=r"nowhere\.coview"):
+        Localizer("nowhere.coview")
+
+
+@pytest.mark.parametrize("config", [{}, {"reloc": "coview"}, "coview"])
+def test_config_that_is_none_is_refused_with_what_to_give(world_map, config):
+    with pytest.raises(ConfigError, match=r"give a LocalizerConfig, such as LocalizerConfig\(reloc='coview'\)"):
+        Localizer(world_map, config)
+
+
+def test_map_that_is_none_is_refused_with_what_to_give():
+    with pytest.raises(InputError, match=r"base_map is a ndarray; give a BaseMap or the path of a \.coview file"):
+        Localizer(np.zeros((9, 3)))
+
+
+def test_intensities_do_not_change_a_fix(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    for k, known in enumerate(world_fixes[:3]):
+        cloud = world_drive.clouds[k]
+        rows = np.column_stack([cloud, np.arange(len(cloud))])
+        fix = localizer.step(rows, world_drive.T_odom_body[k], known.stamp)
+        assert fix.to_json() == known.to_json()
+    with pytest.raises(CloudError, match=r"give cloud\[:, :3\]"):
+        localizer.step(np.zeros((99, 6)), np.eye(4), 99.0)
+
+
+def test_relocalize_searches_again_and_finds(world_map, world_drive, world_fixes):
+    config = LocalizerConfig(reloc="coview")
+    localizer = Localizer(world_map, config)
+    frames = list(zip(world_drive.clouds, world_drive.T_odom_body, strict=True))
+    states = [localizer.step(*frame, 0.5 * k).state for k, frame in enumerate(frames)]
+    assert states[-1] is State.TRACKING
+    localizer.relocalize()
+    assert localizer.state is State.SEARCHING
+    again = [localizer.step(*frame, 100.0 + 0.5 * k).state for k, frame in enumerate(frames)]
+    assert State.TRACKING in again
+
+
+def test_localizer_says_its_state_and_map(world_map, world_drive):
+    localizer = Localizer(world_map)
+    assert repr(localizer).startswith("Localizer(SEARCHING, no frame yet, on BaseMap(")
+    localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], 12.0)
+    assert "frame of 12.000 s" in repr(localizer)
+
+
+@pytest.mark.parametrize("take", [pickle.dumps, copy.copy, copy.deepcopy])
+def test_localizer_cannot_be_copied_and_says_what_to_do(world_map, take):
+    with pytest.raises(TypeError, match=r"make one in each process, Localizer\(base_map\)"):
+        take(Localizer(world_map))
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "method.md"
+MAX_LINES = 40
+STEPS = {
+    Localizer.step: ["predict", "search", "match to map", "verify", "update"],
+    GlobalSearch.update: ["vote", "propose", "score", "register", "decide"],
+}
+
+
+def lines_without_docstring(function):
+    source = textwrap.dedent(inspect.getsource(function))
+    (tree,) = ast.parse(source).body
+    docstring = tree.body[0]
+    assert ast.get_docstring(tree)
+    return len(source.splitlines()) - (docstring.end_lineno - docstring.lineno + 1)
+
+
+def headings():
+    """Headings of the page, lower case, without what is in brackets."""
+    text = PAGE.read_text(encoding="utf-8")
+    return [heading.strip().lower() for heading in re.findall(r"^##+ ([^(\n]+)", text, re.MULTILINE)]
+
+
+@pytest.mark.parametrize("function", STEPS, ids=lambda function: function.__qualname__)
+def test_algorithm_fits_on_one_screen(function):
+    assert lines_without_docstring(function) <= MAX_LINES
+
+
+@pytest.mark.parametrize("function", STEPS, ids=lambda function: function.__qualname__)
+def test_steps_are_called_in_order_and_are_headings_of_the_method_page(function):
+    source, there = inspect.getsource(function), headings()
+    for step in STEPS[function]:
+        assert re.search(rf"\b_?{step.replace(' ', '_')}\b", source), step
+        assert step in there
+    if function is GlobalSearch.update:
+        called = [name for name in re.findall(r"\b_?(\w+?)\(", source) if name in STEPS[function]]
+        assert called == STEPS[function]
+
+
+def test_headings_of_the_method_page_are_in_the_order_of_the_steps():
+    there = headings()
+    first = there.index("predict")
+    assert there[first : first + 11] == [
+        "predict", "search", "vote", "propose", "score", "register", "verify", "decide",
+        "match to map", "verify", "update",
+    ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""States of a robot: the transition table, its page, and a localizer that moves along it."""
+"""States of a localizer: the transition table, its page, and DOUBTED and LOST on real frames."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+import small_world
 from any_risk import NEVER
+from small_world import pose_error
 from trackers import garbage
 
+from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import TRANSITIONS, Event, State, next_state, transition_table
+from coview_stream.localization.tracking.monitor import RejectionReason
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tracking.md"
 
@@ -139,3 +145,285 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
     localizer.reset()
     assert localizer.moves[-1][1:] == (None, State.SEARCHING)
     assert localizer.take_events() == ()
+
+
+RULE = AcceptanceConfig()
+
+
+def follow(localizer, drive, frames, start=0.0):
+    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], start + 0.5 * k) for k in frames]
+
+
+@pytest.fixture
+def found(world_map, world_drive):
+    """A localizer that tracks, after the drive's first five frames."""
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, range(5))[-1].state is State.TRACKING
+    return localizer
+
+
+def right(fix, truth, metres=0.08):
+    return fix.T_map_body is not None and pose_error(fix.T_map_body, truth)[0] < metres
+
+
+def carried(drive, frm, to):
+    """The drive's odometry after the robot was put from one frame's place to another's: it felt nothing."""
+    return drive.seen_from(drive.T_odom_body[frm] @ inverse(drive.T_map_body[to]))
+
+
+# ---- DOUBTED
+
+
+def dusty(drive, k):
+    """A frame of which half is dust."""
+    some = np.random.default_rng(0).permutation(len(drive.clouds[k]))[: len(drive.clouds[k]) * 6 // 10]
+    return np.concatenate([drive.clouds[k][some], garbage()])
+
+
+def covered(seed):
+    """A sack over the sensor: a few returns from within it."""
+    return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
+
+
+def test_rejected_registration_gives_doubted_state_without_pose(found, world_drive):
+    doubtful = found.step(dusty(world_drive, 5), world_drive.T_odom_body[5], 2.5)
+    assert doubtful.state is State.DOUBTED
+    assert doubtful.T_map_body is None
+    assert doubtful.T_map_odom is None
+    assert doubtful.covariance is None
+    assert doubtful.drift is None
+    assert doubtful.confidence == 0.0
+    assert doubtful.evidence.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
+    assert 0.5 < doubtful.evidence.confidence < 1.0 - RULE.risk
+    assert "wrong 1 in " in doubtful.evidence.reason
+    known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
+    assert known.state is State.TRACKING
+    assert right(known, world_drive.T_map_body[6])
+
+
+def test_doubted_state_is_rechecked_while_standing(found, world_drive):
+    """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
+    fixes = [found.step(covered(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
+    assert [fix.state for fix in fixes] == [State.DOUBTED] * 6
+    assert [fix.T_map_body for fix in fixes] == [None] * 6
+    assert fixes[-1].evidence.stamp == 8.0
+    again = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 9.0)
+    assert again.state is State.TRACKING
+    assert right(again, world_drive.T_map_body[5])
+
+
+def test_evidence_reports_cause_reason_and_innovation(found, world_drive):
+    fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
+    assert fix.evidence.cause is RejectionReason.VERIFIED
+    assert fix.evidence.reason == "verified"
+    assert 0.0 < fix.evidence.innovation < RULE.max_innovation
+    assert fix.evidence.stamp == 2.5
+    assert fix.drift is not None
+    assert fix.evidence.confidence > 1.0 - RULE.risk
+    doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
+    assert doubtful.evidence.cause is not RejectionReason.VERIFIED
+    assert doubtful.evidence.reason != "verified"
+
+
+def test_search_evidence_has_no_cause_or_innovation(world_fixes):
+    assert world_fixes[0].evidence.cause is None
+    assert world_fixes[0].evidence.innovation is None
+
+
+# ---- carried to another place
+
+
+@pytest.mark.slow
+def test_search_after_loss_starts_from_scratch(found, world_drive):
+    """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
+    anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
+    lost = follow(found, anew, range(2), 2.5)
+    assert [fix.T_map_body for fix in lost] == [None] * 2
+    assert [fix.state for fix in lost] == [State.DOUBTED, State.LOST]  # one frame may be garbage
+    frames = range(2, 5)
+    again = follow(found, anew, frames, 2.5)
+    assert {fix.state for fix in again} <= {State.LOST, State.TRACKING}
+    assert again[-1].state is State.TRACKING
+    assert min(fix.evidence.score for fix in again) > 0.8
+    assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in zip(frames, again, strict=True))
+
+
+def found_frame(drive):
+    """odometry <- map of a drive."""
+    return drive.T_odom_body[0] @ inverse(drive.T_map_body[0])
+
+
+@pytest.mark.slow
+def test_restarted_odometry_far_away_is_lost_and_relocalized(found, world_drive):
+    """A place without a map may lie at the map's edge, but no robot drives 6,000 km between two frames."""
+    anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
+    lost = found.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
+    assert lost.evidence.cause is RejectionReason.OFF_MAP
+    assert lost.state is State.LOST
+    assert lost.T_map_body is None
+    again = follow(found, anew, range(1, 5), 3.5)
+    assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in enumerate(again, start=1))
+    assert again[-1].state is State.TRACKING
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("to", [0, 1])
+def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
+    """Odometry says that it stands; the very first frame of the other place takes the pose away."""
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, range(9))[-1].state is State.TRACKING
+    drive = carried(world_drive, 8, to)
+    stood = [localizer.step(drive.clouds[to], drive.T_odom_body[to], 4.1 + 0.1 * k) for k in range(5)]
+    went = follow(localizer, drive, range(to + 1, 10), 5.0)
+    fixes = stood + went
+    truths = [drive.T_map_body[to]] * 5 + drive.T_map_body[to + 1 :]
+    assert stood[0].T_map_body is None
+    for fix, truth in zip(fixes, truths, strict=True):
+        assert fix.T_map_body is None or right(fix, truth)
+    lost = [fix for fix in fixes if fix.state is State.LOST]
+    assert lost
+    assert lost[0].evidence.reason.startswith("more probably elsewhere: ")
+    assert lost[0].evidence.confidence < 0.5
+    assert lost[0].evidence.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE, RejectionReason.GROUND)
+    assert went[-1].state is State.TRACKING
+
+
+@pytest.mark.slow
+def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
+    elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
+    fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert {fix.state for fix in fixes} <= {State.DOUBTED, State.LOST}
+    assert fixes[0].state is State.DOUBTED
+    assert fixes[11].state is State.LOST  # after five seconds
+
+
+# ---- carried with open eyes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begin", [12, 20])
+def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive, begin):
+    """A ferry, a lift truck, ice: 0.2 m at every frame, of which odometry feels nothing."""
+    localizer = Localizer(world_map)
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    known = [localizer.step(clouds[k], slow_drive.T_odom_body[k], 0.1 * k) for k in range(begin)]
+    while known[-1].state is not State.TRACKING:
+        begin += 1
+        known.append(localizer.step(clouds[begin - 1], slow_drive.T_odom_body[begin - 1], 0.1 * begin))
+    fixes = [
+        localizer.step(clouds[k], slow_drive.T_odom_body[begin - 1], 0.1 * k + 0.1) for k in range(begin, len(clouds))
+    ]
+    assert len(fixes) > 8
+    for fix, T in zip(fixes, truth[begin:], strict=True):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, T)[0] < 0.3
+    assert any(fix.evidence.cause is RejectionReason.ODOMETRY for fix in fixes)
+    # it is set down: the lidar has followed it all the way
+    still = localizer.step(clouds[-1], slow_drive.T_odom_body[begin - 1], 0.1 * len(clouds) + 0.1)
+    assert still.state is State.TRACKING
+    assert right(still, truth[-1], 0.05)
+
+
+# ---- covered, and beyond the edge
+
+
+@pytest.mark.slow
+def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive):
+    """As soon as any place could be: the first keyframe that sees anything counts already."""
+    seconds = np.arange(2.5, 2.5 + RULE.max_blind_s + 2.0, 1.0)
+    fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert fixes[0].evidence.cause is RejectionReason.BLIND
+    blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.max_blind_s]
+    assert {fix.state for fix in blind} == {State.DOUBTED}
+    assert fixes[-1].state is State.LOST
+    again = follow(found, world_drive, range(6, 10), 100.0)
+    posed = [k for k, fix in enumerate(again) if fix.T_map_body is not None]
+    assert posed[0] < 3
+    for k in posed:
+        assert right(again[k], world_drive.T_map_body[6 + k])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [2.0, 40.0])
+def test_after_a_cover_the_pose_returns_with_the_first_frame_that_is_certain(world_map, world_drive, seconds):
+    """Meanwhile it may have been carried, and after a long cover one that fits only in part is not certain."""
+    for dust in (False, True):
+        localizer = Localizer(world_map)
+        follow(localizer, world_drive, range(5))
+        for t in np.arange(2.5, 2.5 + seconds, 0.5):
+            assert localizer.step(covered(1), world_drive.T_odom_body[5], t).T_map_body is None
+        if dust:
+            first = localizer.step(dusty(world_drive, 5), world_drive.T_odom_body[5], 2.5 + seconds)
+            assert first.T_map_body is None
+        after = follow(localizer, world_drive, range(5, 8), 0.5 + seconds)
+        posed = [
+            right(fix, world_drive.T_map_body[k]) for k, fix in enumerate(after, start=5) if fix.T_map_body is not None
+        ]
+        assert all(posed)
+        assert len(posed) == len(after) or dust
+
+
+def test_driving_with_covered_sensor_is_doubted(found, world_drive):
+    """What was seen before is no evidence of where the robot is now."""
+    first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
+    assert first.state is State.DOUBTED
+    assert first.evidence.cause is RejectionReason.BLIND
+    assert found.step(covered(1), world_drive.T_odom_body[6], 3.0).T_map_body is None
+    known = found.step(world_drive.clouds[7], world_drive.T_odom_body[7], 3.5)
+    assert right(known, world_drive.T_map_body[7])
+
+
+@pytest.mark.slow
+def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene):
+    """Straight over the edge and back again; no pose is wrong, and none is given 10 m after the map was last seen."""
+    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-14.0, 110.0)]
+    out = small_world.record_along(scene, way, 2.6)
+    localizer, fixes = Localizer(world_map), []
+    frames = [*range(len(out.clouds)), *reversed(range(len(out.clouds)))]
+    for n, k in enumerate(frames):
+        fixes.append(localizer.step(out.clouds[k], out.T_odom_body[k], 0.5 * n))
+    for fix, k in zip(fixes, frames, strict=True):
+        assert fix.T_map_body is None or right(fix, out.T_map_body[k], 0.15)
+        # the map's edge is seen from 45 m
+        if out.T_map_body[k][0, 3] > small_world.HALF + 45.0 + 10.0:
+            assert fix.T_map_body is None
+    assert any(fix.evidence.cause is RejectionReason.OFF_MAP for fix in fixes)
+    assert any(fix.state is State.LOST for fix in fixes)
+    assert fixes[-1].state is State.TRACKING
+
+
+@pytest.mark.slow
+def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
+    """What came before the pause is no doubt that has lasted: one good frame is enough."""
+    frames = (world_drive.clouds[5], State.TRACKING), (dusty(world_drive, 5), State.DOUBTED), (garbage(), State.DOUBTED)
+    for cloud, expected in frames:
+        localizer = Localizer(world_map)
+        for k in range(5):
+            fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert fix.state is State.TRACKING
+        localizer.require_verification()
+        fix = localizer.step(cloud, world_drive.T_odom_body[5], 60.0)
+        assert fix.state is expected
+        assert fix.evidence.state is expected
+        assert fix.evidence.cause is not None
+
+
+@pytest.mark.slow
+def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(world_map, world_drive):
+    """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
+    localizer = Localizer(world_map)
+    for k in range(6):
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    localizer.require_verification()
+    fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[5], 2.6)]
+    ahead = world_drive.T_odom_body[5]
+    for k in range(1, 4):
+        ahead = ahead @ pose_from(np.eye(3), [2.1, 0.0, 0.0])
+        fixes.append(localizer.step(world_drive.clouds[k], ahead, 2.6 + 0.5 * k))
+    assert fixes[0].T_map_body is None
+    off = [
+        pose_error(f.T_map_body, world_drive.T_map_body[k])[0] for k, f in enumerate(fixes) if f.T_map_body is not None
+    ]
+    assert all(metres < 0.08 for metres in off), f"poses wrong by {off} m"

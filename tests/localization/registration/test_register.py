@@ -1,4 +1,4 @@
-"""Registration: finds a known offset through outliers, refuses emptiness, lets a prior decide the rest."""
+"""Registration: finds a known offset through outliers, states its covariance, lets a prior decide the rest."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from se3 import exp_se3
 
 import coview_kernels as kernels
 from coview_stream.config import MapConfig, RegistrationConfig
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.errors import ConfigError, InputError
+from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z, rotation_angle, transform
+from coview_stream.geometry.validation import check_covariance
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
-from coview_stream.localization.registration.register import Prior, register
+from coview_stream.localization.registration.register import (
+    Prior,
+    propagate,
+    register,
+    registration_covariance,
+    remove_prior,
+    swap_rotation_translation,
+)
 
 CONFIG = RegistrationConfig()
 TRUTH = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
@@ -177,3 +186,187 @@ def test_T_map_source_maps_scan_points_into_map(target, scan):
     """The scan's points, moved by the truth, are map points: the convention of T_map_source."""
     distance, _ = kernels.nearest(target.grid, transform(TRUTH, scan.points), 1.0)
     assert distance.max() < 1e-3
+
+
+FLOOR = np.array([CONFIG.sigma_floor_angle] * 3 + [CONFIG.sigma_floor] * 3)
+
+
+# ---- orders and motions
+
+
+def test_swap_rotation_translation_reorders_the_same_covariance():
+    C = np.arange(36.0).reshape(6, 6)
+    np.testing.assert_array_equal(swap_rotation_translation(swap_rotation_translation(C)), C)
+    assert swap_rotation_translation(C)[0, 3] == C[3, 0]
+
+
+@pytest.mark.slow
+def test_propagated_heading_error_becomes_position_error():
+    """Each of many poses drawn from a covariance drives 10 m ahead: their spread is the covariance carried along."""
+    sigma = np.radians([0.1, 0.2, 1.0])
+    C = np.diag([*sigma**2, 0.02**2, 0.03**2, 0.01**2])
+    C[2, 3] = C[3, 2] = 0.5 * sigma[2] * 0.02
+    step = pose_from(rot_z(0.3), [10.0, 2.0, 0.5])
+    shift = (TRUTH @ step)[:3, 3] - TRUTH[:3, 3]
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(6), C, 4000)
+    ends = np.array([boxminus(boxplus(TRUTH, d) @ step, TRUTH @ step) for d in drawn])
+    expected = propagate(C, shift)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(np.cov(ends.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06)
+    across = np.array([0.0, 0.0, 0.0, -shift[1], shift[0], 0.0]) / np.hypot(*shift[:2])
+    sideways = np.hypot(*shift[:2]) * sigma[2]  # 0.18 m, and what the place was off by before
+    assert np.sqrt(across @ expected @ across) == pytest.approx(sideways, rel=0.1)
+    ahead = np.array([0.0, 0.0, 0.0, *shift[:2], 0.0]) / np.hypot(*shift[:2])
+    assert np.sqrt(ahead @ expected @ ahead) < 0.2 * sideways
+
+
+# ---- a registration's
+
+
+def information_of(sigma):
+    """What a registration would report that is sure to ``sigma`` (6,) after inflation."""
+    return np.diag((np.asarray(sigma) / CONFIG.inflation) ** -2.0)
+
+
+def widened(sigma):
+    """What becomes of a sigma (metres) that the map shows badly."""
+    return sigma * np.hypot(1.0, sigma / CONFIG.weak_from)
+
+
+def test_well_observed_directions_are_inflated_and_floored():
+    sigma = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
+    found = registration_covariance(information_of(sigma), CONFIG)
+    np.testing.assert_allclose(found, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
+
+
+def test_covariance_is_never_below_the_floor():
+    found = registration_covariance(1e14 * np.eye(6), CONFIG)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), FLOOR, rtol=1e-3)
+
+
+def test_weak_direction_is_widened_alone():
+    """Along a tunnel that runs diagonally: the Hessian claims 0.3 m there, which noise in the normals can feign."""
+    along = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)
+    strong = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
+    weak = (CONFIG.inflation / 0.3) ** 2
+    tunnel = strong + (weak - along @ strong @ along) * np.outer(along, along)
+    found = registration_covariance(tunnel, CONFIG)
+    assert np.sqrt(along @ found @ along) == pytest.approx(widened(0.3), rel=0.02)
+    across = np.array([0.0, 0.0, 0.0, 1.0, -1.0, 0.0]) / np.sqrt(2)
+    assert np.sqrt(across @ found @ across) < 0.025
+    assert np.sqrt(found[2, 2]) < 1.5e-3
+
+
+def test_angle_is_weak_by_displacement_at_the_lever_arm():
+    """A degree moves 0.17 m at 10 m, which is weak; a twentieth of that hardly matters."""
+    sigma = np.full(6, 0.001)
+    sigma[2], sigma[0] = np.radians(1.0), np.radians(0.05)
+    found = np.sqrt(np.diag(registration_covariance(information_of(sigma), CONFIG)))
+    lever = CONFIG.weak_lever
+    assert found[2] == pytest.approx(widened(sigma[2] * lever) / lever, rel=0.01)
+    assert found[2] > 1.5 * sigma[2]
+    assert found[0] == pytest.approx(np.hypot(sigma[0], FLOOR[0]), rel=0.05)
+
+
+@pytest.mark.parametrize("weakest", [0.0, -1e-3, 1e-9])
+def test_zero_information_gives_the_max_sigma(weakest):
+    """Also where a subtraction has left a little less than nothing."""
+    information = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
+    information[4, 4] = weakest
+    found = registration_covariance(information, CONFIG)
+    check_covariance(found, "found")
+    assert np.sqrt(found[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
+
+
+def test_sigma_grows_continuously_as_information_falls():
+    sigmas = np.geomspace(0.01, 30.0, 60)
+    found = [
+        np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3]) for s in sigmas
+    ]
+    steps = np.diff(np.log(found))
+    assert (steps >= -1e-9).all()
+    assert steps.max() < 0.3  # twice the step of the sigmas at most
+    assert (np.array(found) >= np.minimum(sigmas, CONFIG.weak_sigma) * 0.999).all()
+
+
+@pytest.mark.parametrize("bad", [np.eye(5), np.full((6, 6), np.nan)])
+def test_invalid_information_matrix_is_refused(bad):
+    with pytest.raises(InputError, match="information"):
+        registration_covariance(bad, CONFIG)
+
+
+@pytest.mark.parametrize("name", ["weak_lever", "weak_from", "weak_sigma"])
+def test_covariance_settings_must_be_positive(name):
+    with pytest.raises(ConfigError, match=name):
+        RegistrationConfig(**{name: 0.0})
+
+
+# ---- the measurement without the prior
+
+
+@pytest.fixture(scope="module")
+def noisy_scan(target):
+    some = np.random.default_rng(1).permutation(len(target.points))[:3000]
+    exact = source_of(target.points[np.sort(some)], TRUTH)
+    noise = np.random.default_rng(2).normal(0, 0.02, exact.points.shape).astype(np.float32)
+    return RegistrationCloud(exact.points + noise, exact.above, exact.height)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tight", [1.0, 0.1])
+def test_remove_prior_equals_registration_without_prior(target, noisy_scan, tight):
+    """The prior is off by centimetres and, at its tightest, knows more than the pairs do."""
+    config = RegistrationConfig(inflation=8.0)
+    sigma = tight * np.array([0.003, 0.003, 0.005, 0.05, 0.05, 0.05])
+    mean = boxplus(TRUTH, np.array([0.002, -0.001, 0.004, 0.04, -0.03, 0.02]))
+    prior = Prior(mean, np.diag(sigma**-2))
+    alone = register(noisy_scan, mean, target, config, config.track, centre=np.zeros(3), iterations=40)
+    fused = register(noisy_scan, mean, target, config, config.track, prior, np.zeros(3), iterations=40)
+    found = remove_prior(fused.T_map_source, fused.information, mean, prior.information, config)
+    pulled = np.linalg.norm(boxminus(fused.T_map_source, alone.T_map_source)[3:])
+    left = np.linalg.norm(boxminus(found.T_map_body, alone.T_map_source)[3:])
+    ratio = np.diag(found.information) / np.diag(alone.information)
+    if tight == 1.0:
+        assert left < 0.001
+        np.testing.assert_allclose(ratio, 1.0, atol=0.02)
+    else:
+        assert pulled > 0.03
+        assert left < 0.25 * pulled
+        assert (ratio < 1.0).all()  # residuals are larger at a place that is pulled off: less sure, not surer
+        assert (ratio > 0.1).all()
+
+
+def test_remove_prior_is_undone_by_fusing_the_prior():
+    """The subtraction is exact where nothing is weak."""
+    rng = np.random.default_rng(3)
+    A, B = (m @ m.T + 50 * np.eye(6) for m in rng.standard_normal((2, 6, 6)) * 10)
+    a = CONFIG.inflation**2
+    mean, gap = TRUTH, np.array([0.0, 0.0, 1e-5, 0.03, -0.02, 0.05])
+    measured = boxplus(mean, gap)
+    total = A + a * B
+    T = boxplus(mean, np.linalg.solve(total, A @ gap))
+    found = remove_prior(T, total, mean, B, CONFIG)
+    np.testing.assert_allclose(found.information, A, rtol=1e-6, atol=1e-6 * np.abs(A).max())
+    share = np.linalg.eigvals(np.linalg.solve(total, A)).real.min()
+    slack = (0.01 / share) ** 2 * np.linalg.norm(gap) * np.linalg.cond(total)
+    assert np.abs(boxminus(found.T_map_body, measured)).max() < slack
+
+
+def test_unobserved_directions_stay_unobserved_after_remove_prior():
+    """A bare floor: heading and place come from the prior alone, and must not come back as measured."""
+    side = np.arange(-15, 15, 0.25)
+    floor = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    points = np.column_stack([floor, np.zeros(len(floor))]).astype(np.float32)
+    target = LocalMap(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
+    noisy_scan = RegistrationCloud(points[::7], np.zeros(len(points[::7]), bool), points[::7, 2])
+    mean = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.1, -0.1, 0.03]))
+    prior = Prior(mean, np.diag(np.array([0.01, 0.01, 0.02, 0.2, 0.3, 0.1]) ** -2))
+    fused = register(noisy_scan, mean, target, CONFIG, (0.4,), prior, np.zeros(3))
+    found = remove_prior(fused.T_map_source, fused.information, mean, prior.information, CONFIG)
+    sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
+    assert (sigma[[0, 1, 5]] < 2 * FLOOR[[0, 1, 5]]).all()
+    assert (sigma[3:5] > 9.0).all()
+    assert sigma[2] > 0.9 * CONFIG.weak_sigma / CONFIG.weak_lever
+    gap = boxminus(found.T_map_body, mean)
+    assert abs(gap[5] + 0.03) < 0.005  # the floor is where it is
+    assert np.abs(gap[2:5]).max() < 0.01  # the rest stays with the prior

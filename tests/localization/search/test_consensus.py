@@ -1,10 +1,9 @@
-"""Consensus: what all keyframes agree on beats the one smallest distance, also far from the origin."""
+"""Consensus: the places on which all keyframes agree beat the smallest single distance, also far from the origin."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from dense_consensus import dense_scores
 
 from bench.accuracy.paper import TableVote, robust_zscore
 from coview_stream.basemap.stations import StationGrid
@@ -12,6 +11,25 @@ from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
+
+
+def dense_scores(grid, votes):
+    """Sum of z-scores (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe).
+
+    Args:
+        grid: the stations' grid.
+        votes: of each keyframe, oldest first, its centre (3,) and z-scores (M, S).
+    """
+    centre, newest = votes[-1]
+    total = newest.astype(np.float64)
+    for other, scores in votes[:-1]:
+        step = other - centre
+        for n, yaw in enumerate(yaw_of_shift(np.arange(total.shape[1]), total.shape[1])):
+            turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+            there = grid.at(grid.stations + turn @ step)
+            total[:, n] += np.where(there < 0, 0.0, scores[there, n])
+    return total / np.sqrt(len(votes))
+
 
 BLOCK, S, SIDE = 2.0, 12, 12
 SHIFT = 2  # yaw of odometry in the map: -60 degrees

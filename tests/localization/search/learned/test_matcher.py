@@ -2,19 +2,98 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from planted_features import LOW, SECTORS, TILES, Planted
 from scipy import ndimage
 
+from bench.accuracy.paper import TableVote
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import ConsensusConfig, LearnedConfig
-from coview_stream.descriptors.feature_map import TILE, FeatureMap, feature_arrays
+from coview_stream.config import ConsensusConfig, LearnedConfig, LocalizerConfig
+from coview_stream.descriptors.feature_map import (
+    TILE,
+    FeatureMap,
+    feature_arrays,
+    quantized,
+    quantized_sigma,
+    weights_sha256,
+)
 from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import Circle, inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus
-from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.learned.matcher import FeatureMatcher, LearnedRecognizer, QueryFeatures
 from coview_stream.localization.search.learned.rasters import principal_axes
+from coview_stream.localization.search.request import SearchRequest
+
+CHANNELS = 16
+TILES = 6  # along an edge: 192 m
+LOW = np.array([-3, -2])  # tile at the lower corner
+SECTORS = 36
+
+
+def field(seed, shape, smooth):
+    """Unit vectors (C, H, W) that change over ``smooth`` cells."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(CHANNELS, *shape)).astype(np.float32)
+    values = ndimage.gaussian_filter(values, (0, smooth, smooth))
+    return values / np.linalg.norm(values, axis=0)
+
+
+def in_tiles(values):
+    """(H, W, ...) as tiles, row by row."""
+    size, *rest = values.shape[0] // TILE, *values.shape[2:]
+    blocks = values.reshape(size, TILE, size, TILE, *rest).swapaxes(1, 2)
+    return blocks.reshape(size * size, TILE, TILE, *rest)
+
+
+class Planted:
+    """A map of random features, and what a perfect ground network would see anywhere in it."""
+
+    def __init__(self, seed=1):
+        size = TILES * TILE
+        self.local = field(seed, (size, size), 2.5)
+        rng = np.random.default_rng(seed)
+        self.marks = rng.uniform(0, size, (1200, 2))  # keypoints: x and y in cells
+        self.sigma = np.full((size, size), 3.0, dtype=np.float32)
+        column, row = self.marks.astype(int).T
+        self.sigma[row, column] = rng.uniform(0.2, 0.4, len(self.marks)).astype(np.float32)
+        row, column = np.divmod(np.arange(TILES**2), TILES)
+        tiles = (np.column_stack([column, row]) + LOW).astype(np.int32)
+        at = (np.stack(np.meshgrid(np.arange(size // 8), np.arange(size // 8)), -1).reshape(-1, 2) + 0.5) * 8
+        place = rng.normal(size=(len(at), 24)).astype(np.float32)
+        self.place = place / np.linalg.norm(place, axis=1, keepdims=True)
+        self.place_at = at + LOW * TILE
+        arrays = {
+            "learned.local": in_tiles(quantized(self.local.transpose(1, 2, 0))),
+            "learned.sigma": in_tiles(quantized_sigma(self.sigma)),
+            "learned.tiles": tiles,
+            "learned.place": quantized(self.place),
+            "learned.place_at": self.place_at.astype(np.float32),
+        }
+        self.features = FeatureMap(arrays, {"weights": weights_sha256(), "cell": 1.0})
+
+    def seen(self, xy, yaw, centre, noise=0.5, seed=0):
+        """What the network makes of a robot at ``xy`` whose odometry frame is turned by ``yaw`` in the map."""
+        axis = np.arange(64) + 0.5 - 32.0
+        u, v = np.meshgrid(axis, axis)
+        c, s = np.cos(yaw), np.sin(yaw)
+        at = np.stack([c * u - s * v + xy[0], s * u + c * v + xy[1]]) - (LOW * TILE)[:, None, None]
+        where = at[::-1] - 0.5
+        local = np.stack([ndimage.map_coordinates(k, where, order=1, mode="nearest") for k in self.local])
+        local += noise * field(100 + seed, (64, 64), 1.0)
+        local /= np.linalg.norm(local, axis=0)
+        sigma = np.full((64, 64), 3.0, dtype=np.float32)
+        there = self.marks + LOW * TILE - xy
+        mine = np.column_stack([c * there[:, 0] + s * there[:, 1], -s * there[:, 0] + c * there[:, 1]]) + 32.0
+        near = ((mine > 0) & (mine < 64)).all(axis=1)
+        column, row = mine[near].astype(int).T
+        sigma[row, column] = 0.3
+        nearest = np.hypot(*(self.place_at - xy).T).argmin()
+        place = np.repeat(self.place[nearest][:, None], 256, axis=1).reshape(-1, 16, 16)
+        inside = np.hypot(u, v) <= 30.0
+        weight = np.where(inside, 1.0 / sigma, 0.0).astype(np.float32)
+        return QueryFeatures(Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre)
 
 
 @pytest.fixture(scope="module")
@@ -192,3 +271,78 @@ def test_principal_axes_keep_inner_products_with_what_they_were_found_in():
     query = rng.normal(size=32).astype(np.float32)
     np.testing.assert_allclose((axes @ query) @ (axes @ vectors), query @ vectors, atol=0.1)
     assert principal_axes(vectors, 0.999, 3).shape == (3, 32)
+
+
+@pytest.mark.parametrize("block", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
+@pytest.mark.parametrize("cell", [2.0, 4.0])
+def test_station_has_the_cells_of_its_block(planted, block, cell):
+    count = int(TILES * TILE / block)
+    xy = np.stack(np.meshgrid(*[(np.arange(count) + 0.5) * block + low * TILE for low in LOW]), -1)
+    places = np.column_stack([xy.reshape(-1, 2), np.zeros(count**2)]).astype(np.float32)
+    cells = FeatureMatcher(planted.features, places, LearnedConfig(cell=cell), block=block).cells
+    assert cells.shape == (int(TILES * TILE / cell),) * 2
+    middles = (np.arange(int(TILES * TILE / cell)) + 0.5) * cell
+    for k in np.random.default_rng(1).permutation(len(places))[:200]:
+        low = places[k, :2] - LOW * TILE - 0.5 * block
+        for axis, number in ((1, 0), (0, 1)):  # rows are along y
+            inside = np.flatnonzero((middles >= low[axis]) & (middles < low[axis] + block))
+            if not len(inside):  # a block smaller than cells
+                inside = np.array([(low[axis] + 0.5 * block) // cell])
+            assert cells.first[k, number] == inside[0]
+            assert cells.size[k, number] == len(inside)
+
+
+def test_four_metre_blocks_find_a_place_anywhere_inside(planted):
+    axis = np.arange(2.0, TILES * TILE, 4.0)
+    xy = np.stack(np.meshgrid(axis + LOW[0] * TILE, axis + LOW[1] * TILE), axis=-1).reshape(-1, 2)
+    places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
+    known = FeatureMatcher(planted.features, places, LearnedConfig(), block=4.0)
+    for place in ((21.0, 33.0), (23.0, 33.0), (21.0, 35.0), (23.0, 35.0)):
+        stations, _ = known.vote(planted.seen(place, 0.0, np.zeros(3))).candidates()
+        np.testing.assert_allclose(places[stations[0], :2], (22.0, 34.0))
+
+
+HERE, THERE, SHIFT = (5.0, -7.0), (-15.0, 11.0), 7
+
+
+def named(heights, peaks=5):
+    """What is named on a map with these storeys, of which features favour one place on all."""
+    axis = np.arange(-19.0, 20.0, 2.0)
+    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    stations = np.vstack([np.column_stack([xy, np.full(len(xy), z)]) for z in heights]).astype(np.float32)
+    config = LocalizerConfig(learned=LearnedConfig(peaks=peaks))
+    flat = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), config.learned.yaws)).astype(np.float32)
+    flat[(xy == HERE).all(axis=1), SHIFT] = -1.0
+    flat[(xy == THERE).all(axis=1), SHIFT] = 0.2
+    learned = SimpleNamespace(
+        encode=lambda points, centre: SimpleNamespace(centre=centre),
+        vote=lambda view, near, area: TableVote.of_distances(view.centre, [np.tile(flat, (len(heights), 1))]),
+    )
+    source = LearnedRecognizer(SimpleNamespace(station_grid=StationGrid(stations, 2.0)), config, learned)
+    ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)
+    body = np.eye(4)
+    body[2, 3] = 1.5
+    none = np.empty((0, 3), np.float32)
+    source.vote(SearchRequest(0.0, body, none, none, none, surroundings=ground.astype(np.float32)))
+    return source.hypotheses(), stations
+
+
+@pytest.mark.parametrize("gap", [3.0, 8.0])
+def test_each_storey_is_a_hypothesis(gap):
+    """At 3 m the consensus takes both for one place, at 8 m for two."""
+    (single, *_), _ = named([0.0])
+    found, stations = named([0.0, gap])
+    at = [transform(each.T_map_odom, np.zeros((1, 3)))[0] for each in found]
+    assert [tuple(xy) for xy in np.round(at, 3)[:2, :2].tolist()] == [HERE, HERE]
+    assert sorted(round(z, 3) for _, _, z in at[:2]) == [0.0, gap]
+    for each, place in zip(found[:4], at, strict=False):
+        np.testing.assert_allclose(stations[each.station], place, atol=1e-5)
+        assert each.shift == SHIFT
+        assert each.learned
+    assert [each.score for each in found[:2]] == pytest.approx([single.score] * 2, rel=0.01)
+    assert len({(each.station, each.shift) for each in found}) == len(found)
+
+
+def test_storey_hypotheses_are_bounded():
+    assert len(named([0.0, 2.9, 5.8])[0]) == 10
+    assert len(named([0.0])[0]) == 5

@@ -1,0 +1,218 @@
+"""Calibration of a localizer: leaning sensor, odometry of another scale, known values, late results, resets."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from small_world import pose_error
+
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import exp_so3, pose_from
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, mixed
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.state import State
+
+
+def poses_of(localizer, clouds, odometry, truth):
+    """Return frame, metres and degrees of error of each pose, and the last fix."""
+    errors, fix = [], None
+    for k, (cloud, T) in enumerate(zip(clouds, odometry, strict=True)):
+        fix = localizer.step(cloud, T, 0.5 * k)
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_odom @ T, fix.T_map_body, atol=1e-6)
+            errors.append((k, *pose_error(fix.T_map_body, truth[k])))
+    return errors, fix
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lean", [(0.0, 3.0), (-2.0, -2.0)])
+def test_leaning_sensor_is_levelled(world_map, world_drive, world_fixes, lean):
+    R = exp_so3(np.radians([*lean, 0.0]))
+    clouds = [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
+    errors, fix = poses_of(Localizer(world_map), clouds, world_drive.T_odom_body, world_drive.T_map_body)
+    straight = sum(each.T_map_body is not None for each in world_fixes)
+    assert len(errors) >= 0.85 * straight
+    assert max(metres for _, metres, _ in errors) < 0.1
+    assert max(degrees for _, _, degrees in errors) < 0.6
+    assert np.degrees(fix.calibration.roll) == pytest.approx(-lean[0], abs=0.3)
+    assert np.degrees(fix.calibration.pitch) == pytest.approx(-lean[1], abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.93, 1.07])
+def test_scale_of_odometry_is_learnt(world_map, world_drive, world_fixes, scale):
+    odometry = [pose_from(T[:3, :3], scale * T[:3, 3]) for T in world_drive.T_odom_body]
+    errors, fix = poses_of(Localizer(world_map), world_drive.clouds, odometry, world_drive.T_map_body)
+    assert len(errors) >= 0.85 * sum(each.T_map_body is not None for each in world_fixes)
+    assert max(metres for _, metres, _ in errors) < 0.1
+    assert (1.0 + fix.calibration.scale) * scale == pytest.approx(1.0, abs=0.02)
+
+
+LEAN = np.radians(3.0)
+
+
+@pytest.fixture(scope="module")
+def leaning(world_drive):
+    """Clouds of the drive from a sensor that looks down by three degrees."""
+    R = exp_so3(np.array([0.0, LEAN, 0.0]))
+    return [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
+
+
+@pytest.mark.slow
+def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, world_drive, leaning):
+    """The keyframe's clouds were levelled by what was known then."""
+    localizer, waiting, errors = Localizer(world_map), [], []
+    for k, cloud in enumerate(leaning):
+        if len(waiting) == 2:
+            localizer.apply_search_result(localizer.search.update(waiting.pop(0)))
+        request = localizer.add_frame(cloud, world_drive.T_odom_body[k], 0.5 * k)
+        if request is not None:
+            waiting.append(request)
+        fix = localizer.fix()
+        if fix.T_map_body is not None:
+            errors.append(pose_error(fix.T_map_body, world_drive.T_map_body[k]))
+    assert len(errors) > 0.5 * len(leaning)
+    assert max(metres for metres, _ in errors) < 0.1
+    assert max(degrees for _, degrees in errors) < 0.6
+    assert fix.calibration.pitch == pytest.approx(-LEAN, abs=np.radians(0.3))
+
+
+@pytest.mark.slow
+def test_calibration_outlives_the_odometry_frame_but_no_reset(world_map, world_drive, leaning):
+    localizer = Localizer(world_map)
+    for k, cloud in enumerate(leaning):
+        fix = localizer.step(cloud, world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    localizer.relocalize(1)
+    T_other = pose_from(exp_so3(np.array([0.0, 0.0, 1.0])), [40.0, -3.0, 1.0])
+    localizer.add_frame(leaning[0], T_other @ world_drive.T_odom_body[0], 60.0)
+    begun = localizer.fix()
+    assert begun.T_map_body is None
+    assert begun.calibration.pitch == pytest.approx(-LEAN, abs=np.radians(0.3))
+    localizer.reset(2)
+    localizer.add_frame(leaning[0], world_drive.T_odom_body[0], 90.0)
+    assert localizer.fix().calibration.pitch == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 1.05])
+def test_odometry_in_utm_that_turns_is_corrected(world_map, world_drive, world_fixes, scale):
+    """Far from its origin, a factor or a turn about that would be kilometres."""
+    utm = np.array([512_345.6, 5_403_210.9, 287.4])
+    odometry, turned = [pose_from(world_drive.T_odom_body[0][:3, :3], utm)], 0.0
+    for before, T in pairwise(world_drive.T_odom_body):
+        step = T[:3, 3] - before[:3, 3]
+        turned += np.radians(0.1) * float(np.linalg.norm(step))
+        turn = exp_so3(np.array([0.0, 0.0, turned]))
+        odometry.append(pose_from(turn @ T[:3, :3], odometry[-1][:3, 3] + scale * (turn @ step)))
+    localizer, errors = Localizer(world_map), []
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, odometry, strict=True)):
+        fix = localizer.step(cloud, T, 0.5 * k)
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_odom @ T, fix.T_map_body, atol=1e-5)
+            errors.append(pose_error(fix.T_map_body, world_drive.T_map_body[k]))
+    assert len(errors) >= 0.8 * sum(each.T_map_body is not None for each in world_fixes)
+    assert max(metres for metres, _ in errors) < 0.15
+    assert (1.0 + fix.calibration.scale) * scale == pytest.approx(1.0, abs=0.02)
+
+
+def last_fix(world_map, clouds, odometry, known):
+    localizer = Localizer(world_map)
+    localizer.hint_calibration(known)
+    for k, (cloud, T) in enumerate(zip(clouds, odometry, strict=True)):
+        fix = localizer.step(cloud, T, 0.5 * k)
+    return fix
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lean", [0.0, 3.0])
+def test_known_lean_is_measured_again(world_map, world_drive, lean):
+    """Once it is right, and once the sensor has been set straight meanwhile."""
+    known = Calibration(pitch=np.radians(-3.0), sigma_tilt=np.radians(0.1))
+    R = exp_so3(np.radians([0.0, lean, 0.0]))
+    clouds = [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
+    fix = last_fix(world_map, clouds, world_drive.T_odom_body, known)
+    assert fix.T_map_body is not None
+    assert np.degrees(fix.calibration.pitch) == pytest.approx(-lean, abs=0.4)
+
+
+def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, world_drive):
+    localizer = Localizer(world_map)
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
+        fix = localizer.step(cloud, T, 0.5 * k)
+    localizer.hint_calibration(Calibration(pitch=0.1))
+    assert localizer.fix().calibration == fix.calibration
+
+
+def test_ground_offset_of_the_site_is_restored(world_map):
+    localizer = Localizer(world_map)
+    localizer.hint_calibration(Calibration(ground=0.35))
+    offset = localizer._tracker.ground
+    assert offset.metres > 0.15
+    offset.clear()  # as at each place that is found
+    assert offset.metres > 0.15
+
+
+def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
+    """Lidar odometry levels itself: its tilt is known for sure, and says nothing of how well the scale is."""
+    localizer = Localizer(world_map, LocalizerConfig(sensor_leans=False))
+    localizer.hint_calibration(Calibration(pitch=0.05, scale=0.03, sigma_scale=0.001))
+    assert 0.008 < localizer.calibration.scale < 0.03  # doubted, for wheels may have been changed
+    assert localizer.calibration.pitch == 0.0
+
+
+def test_what_is_known_better_here_stays_group_by_group(world_map):
+    localizer = Localizer(world_map)
+    estimator = localizer._frames.estimator
+    estimator.restore(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
+    localizer.hint_calibration(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001))
+    assert localizer.calibration.pitch == pytest.approx(0.03, abs=0.002)
+    assert 0.008 < localizer.calibration.scale < 0.03
+
+
+def test_ground_that_was_learned_here_is_not_given_up_for_a_hint(world_map):
+    localizer = Localizer(world_map)
+    offset = localizer._tracker.ground
+    offset._views, offset.metres = 3, 0.1
+    localizer.hint_calibration(Calibration(ground=0.35))
+    assert offset.metres == 0.1
+    offset.restore(0.3)
+    offset.restore(0.0)
+    assert offset.metres == 0.0
+
+
+def test_what_a_leader_supposed_ends_with_it():
+    estimator = CalibrationEstimator()
+    before = estimator.calibration
+    T = np.eye(4)
+    T[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
+    estimator.suppose_attitude(T, np.eye(4), np.radians(0.3) ** 2, 0.7)
+    assert abs(np.degrees(estimator.calibration.pitch)) > 1.0
+    estimator.forget_leader()
+    assert estimator.calibration == before
+
+
+def test_mixture_has_the_sigma_of_each_axis():
+    straight = Calibration(sigma_tilt=1e-9)
+    mixture = mixed(straight, Calibration(roll=np.radians(4.0), sigma_tilt=1e-9), 0.5)
+    assert np.degrees(mixture.sigma_tilt) == pytest.approx(2.0 / np.sqrt(2.0))
+
+
+def test_leaders_that_alternate_do_not_begin_the_search_anew_at_every_frame(world_map, world_drive):
+    """A robot that stands still sees nothing new: what it has seen is levelled once, and evidence adds up."""
+    localizer = Localizer(world_map)
+    localizer.search.update = lambda request: SearchResult(None, KeyframeEvidence(request.stamp, State.SEARCHING, ""))
+    straight, leaning = np.eye(4), np.eye(4)
+    leaning[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
+    epochs = set()
+    for k in range(20):
+        localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.1 * k)
+        epochs.add(localizer._requests.epoch)
+        T = leaning if k % 2 else straight
+        localizer._frames.estimator.suppose_attitude(T, np.eye(4), 1e-5, 0.9)
+    assert len(epochs) <= 2

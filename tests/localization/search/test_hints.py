@@ -1,0 +1,478 @@
+"""Hints and guesses: judged like every other place, never trusted, harmless when wrong; when they are tried."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from se3 import exp_se3
+from small_world import pose_error
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import AcceptanceConfig
+from coview_stream.errors import ConfigError, InputError, RunError
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of, yaw_of
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.search import hints
+from coview_stream.localization.search.hints import FROM_THERE, HintSchedule, PlaceGuess, PoseHints
+from coview_stream.localization.state import State
+
+RULE = AcceptanceConfig()
+NEAR = pose_from(rot_z(np.radians(2.0)), [0.6, -0.5, 0.1])  # what a parked robot's last pose may be off by
+BESIDE = pose_from(rot_z(2.0), [9.0, -14.0, 0.0])  # another place of the map
+
+
+def follow(localizer, drive, frames, first=0):
+    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], 0.5 * k) for k in range(first, first + frames)]
+
+
+def first_fix(fixes):
+    return next((k for k, fix in enumerate(fixes) if fix.T_map_body is not None), None)
+
+
+def voteless(localizer, monkeypatch):
+    """The keyframes vote, but nothing comes of it."""
+    monkeypatch.setattr(localizer.search.coview.consensus, "hypotheses", list)
+    return localizer
+
+
+def misled(localizer, drive, monkeypatch):
+    """The votes name some places, but never the right one, nor any near it."""
+    consensus = localizer.search.coview.consensus
+    found = consensus.hypotheses
+
+    def wrong():
+        newest = localizer._newest.T_odom_body
+        k = int(np.argmin([abs(T[:3, 3] - localizer._frames.anchor - newest[:3, 3]).sum() for T in drive.T_odom_body]))
+        there = drive.T_map_body[k][:3, 3]
+        return [each for each in found() if np.linalg.norm((each.T_map_odom @ newest)[:3, 3] - there) > 8.0]
+
+    monkeypatch.setattr(consensus, "hypotheses", wrong)
+    return localizer
+
+
+UTM = np.array([512_345.6, 5_403_210.9, 287.4])
+
+
+# ---- right ones
+
+
+def test_correct_hint_is_judged_like_what_votes_find(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    fixes = follow(localizer, world_drive, 4)
+    assert first_fix(fixes) == first_fix(world_fixes)
+    assert [f.evidence.state for f in fixes] == [f.evidence.state for f in world_fixes[:4]]
+
+
+def test_correct_hint_without_votes_for_it_gives_a_pose(world_map, world_drive, monkeypatch):
+    localizer = misled(Localizer(world_map), world_drive, monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    fixes = follow(localizer, world_drive, 3)
+    posed = first_fix(fixes)
+    assert posed is not None
+    for fix in fixes[: posed + 1]:
+        assert fix.evidence.reason.endswith(FROM_THERE)
+        assert (fix.evidence.station, fix.evidence.shift) == (None, None)
+    metres, degrees = pose_error(fixes[posed].T_map_body, world_drive.T_map_body[posed])
+    assert metres < 0.1
+    assert degrees < 0.3
+
+
+def test_correct_hint_without_any_votes_waits(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    assert {fix.state for fix in follow(localizer, world_drive, 6)} == {State.AMBIGUOUS}
+
+
+def test_without_hint_and_votes_search_finds_nothing(world_map, world_drive, monkeypatch):
+    fixes = follow(voteless(Localizer(world_map), monkeypatch), world_drive, 6)
+    assert {fix.state for fix in fixes} == {State.SEARCHING}
+
+
+def test_hint_is_given_in_map_source_coordinates(world_map, world_drive, monkeypatch):
+    """A map far from zero, odometry far from zero, and a robot that leans otherwise than when it was saved."""
+    far = BaseMap({**world_map.arrays, "origin": UTM + world_map.origin}, world_map.parameters)
+    localizer = misled(Localizer(far), world_drive, monkeypatch)
+    leaning = exp_se3(np.array([0.05, -0.04, 0.0, *UTM])) @ pose_from(np.eye(3), -UTM)
+    there = pose_from(np.eye(3), UTM) @ world_drive.T_map_body[0] @ NEAR
+    localizer.hint_pose(leaning @ there)
+    fixes = follow(localizer, world_drive, 5)
+    assert fixes[-1].state is State.TRACKING
+    moved = pose_from(np.eye(3), -UTM) @ fixes[-1].T_map_body
+    assert pose_error(moved, world_drive.T_map_body[4])[0] < 0.1
+
+
+def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    follow(localizer, world_drive, 1)
+    T = world_drive.T_odom_body[0] @ pose_from(np.eye(3), [0.1, 0.0, 0.0])
+    localizer.hint_pose(world_drive.T_map_body[0])
+    assert localizer.add_frame(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
+    request = localizer.add_frame(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
+    (T_map_odom,) = request.hints
+    metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[1])
+    # but for what the lidar says of the motion between the two
+    assert metres == pytest.approx(0.1, abs=0.01)
+    assert degrees < 0.1
+    assert tilt_of(T_map_odom) < 1e-9
+
+
+# ---- wrong ones
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])])
+def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, off):
+    localizer = Localizer(world_map)
+    localizer.hint_pose(world_drive.T_map_body[0] @ off)
+    fixes = follow(localizer, world_drive, 4)
+    assert first_fix(fixes) == first_fix(world_fixes)
+    for fix, usual in zip(fixes, world_fixes, strict=False):
+        assert fix.evidence.station == usual.evidence.station
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, usual.T_map_body, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [(12, -4), (-14, 9)])
+def test_wrong_hint_is_not_accepted_without_other_candidates(world_map, world_drive, monkeypatch, share):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    localizer.hint_pose(pose_from(rot_z(0.4), [*share, small_world.SENSOR_HEIGHT]))
+    assert first_fix(follow(localizer, world_drive, 8)) is None
+
+
+@pytest.mark.slow
+def test_hint_gives_no_pose_off_the_map(world_map, world_drive, elsewhere):
+    localizer = Localizer(world_map)
+    localizer.hint_pose(world_drive.T_map_body[0])
+    for fix in follow(localizer, elsewhere, 4):
+        assert fix.T_map_body is None
+
+
+@pytest.fixture(scope="module")
+def lookalike_map(map_points, tmp_path_factory):
+    """Beside the robot's place another that is like it but for what stands in its upper right quarter."""
+    path = tmp_path_factory.mktemp("lookalike") / "map.ply"
+    quarter = (map_points[:, 0] > 4) & (map_points[:, 1] > 4) & (map_points[:, 2] > 0.2)
+    other = map_points[~quarter] + np.array([2 * small_world.HALF, 0, 0])
+    write_cloud(path, np.concatenate([map_points, other]).astype(np.float32))
+    return BaseMap.build(path, radius=30.0)
+
+
+@pytest.mark.slow
+def test_hint_of_lookalike_place_is_never_accepted(lookalike_map, world_drive):
+    plain = follow(Localizer(lookalike_map), world_drive, 8)
+    localizer = Localizer(lookalike_map)
+    localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    fixes = follow(localizer, world_drive, 8)
+    # a hint is one more rank for the wrong place, which may take some keyframes more to refute
+    assert first_fix(plain) <= first_fix(fixes)
+    for fix, truth in zip(fixes, world_drive.T_map_body, strict=False):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+@pytest.mark.slow
+def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_drive, monkeypatch):
+    """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
+    localizer = Localizer(lookalike_map)
+    consensus = localizer.search.coview.consensus
+    found = consensus.hypotheses
+    monkeypatch.setattr(consensus, "hypotheses", lambda: found() if len(consensus) > 3 else [])
+    localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    fixes = follow(localizer, world_drive, 8)
+    assert all(f.evidence.confidence > 0.5 for f in fixes[:3])  # in the wrong one, and it was alone
+    posed = first_fix(fixes)
+    assert posed is not None
+    for fix, truth in zip(fixes[posed:], world_drive.T_map_body[posed:], strict=False):
+        assert pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.eye(3),
+        2 * np.eye(4),
+        np.diag([1.0, -1, 1, 1]),
+        np.full((4, 4), np.nan),
+        pose_from(np.eye(3), [1e8, 0, 0]),
+        "here",
+        None,
+    ],
+    ids=str,
+)
+def test_invalid_hint_pose_is_refused(world_map, bad):
+    with pytest.raises(RunError, match="T_map_body"):
+        Localizer(world_map).hint_pose(bad)
+
+
+def test_farthest_accepted_hint_does_no_harm(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    localizer.hint_pose(pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6]))
+    assert first_fix(follow(localizer, world_drive, 4)) == first_fix(world_fixes)
+
+
+def test_place_that_led_is_one_hint_beside_the_others():
+    hints = PoseHints()
+    hints.odometry_continues(pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+    for x in (1.0, 2.0):
+        hints.place_leads(pose_from(rot_z(0.1), [x, 0.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+    assert len(hints.about(np.array([100.0, 0.0, 0.0]), np.eye(4))) == 1  # until the search begins anew
+    hints.search_begins_anew()
+    continued, led = hints.about(np.array([100.0, 0.0, 0.0]), np.eye(4))
+    np.testing.assert_allclose(continued, pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), atol=1e-9)
+    np.testing.assert_allclose(led, pose_from(rot_z(0.1), [2.0, 0.0, 0.0]), atol=1e-9)
+    hints.clear()
+    assert hints.about(np.zeros(3), np.eye(4)) == ()
+
+
+# ---- what a localizer keeps
+
+
+def test_hint_is_kept_until_accepted_or_reset(world_map, world_drive):
+    localizer = Localizer(world_map)
+    localizer.hint_pose(world_drive.T_map_body[0])
+    requests = [localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)]
+    assert [len(request.hints) for request in requests] == [1, 1]
+    np.testing.assert_array_equal(requests[0].hints, requests[1].hints)
+    localizer.reset()
+    assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).hints == ()
+    localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
+    assert follow(localizer, world_drive, 4, 1)[-1].state is State.TRACKING
+    assert localizer._requests.hints.about(np.zeros(3), np.eye(4)) == ()
+    localizer.hint_pose(world_drive.T_map_body[0])  # now it knows better
+    assert localizer._requests.hints.about(np.zeros(3), np.eye(4)) == ()
+
+
+def lost(world_map, world_drive):
+    """A localizer that has just lost its place to a blinded sensor, and the frame after."""
+    localizer = Localizer(world_map)
+    follow(localizer, world_drive, 5)
+    rng = np.random.default_rng(1)
+    k = 5
+    while localizer.state is not State.LOST:
+        garbage = rng.uniform([-20, -20, -1.5], [20, 20, 6], (6000, 3)).astype(np.float32)
+        localizer.step(garbage, world_drive.T_odom_body[k], 0.5 * k)
+        k += 1
+    return localizer, k
+
+
+@pytest.mark.slow
+def test_continuous_odometry_hints_the_place_after_loss(world_map, world_drive):
+    localizer, k = lost(world_map, world_drive)
+    request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    (T_map_odom,) = request.hints
+    metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[k])
+    assert metres < 0.3
+    assert degrees < 0.5
+
+
+@pytest.mark.slow
+def test_jumped_odometry_hint_is_not_accepted_after_loss(world_map, world_drive):
+    localizer, k = lost(world_map, world_drive)
+    jump = pose_from(rot_z(0.7), [12.0, -5.0, 0.0])
+    for fix, truth in zip(
+        [localizer.step(world_drive.clouds[n], jump @ world_drive.T_odom_body[n], 0.5 * n) for n in range(k, 10)],
+        world_drive.T_map_body[k:],
+        strict=True,
+    ):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+def test_odometry_frame_hint_is_kept_across_anchors():
+    rng = np.random.default_rng(3)
+    T_map_odom, T_odom_body = (exp_se3(rng.uniform(-1, 1, 6) * [0, 0, 3, 50, 50, 3]) for _ in range(2))
+    first, second = rng.uniform(-1e3, 1e3, (2, 3))
+    kept = PoseHints()
+    kept.odometry_continues(T_map_odom, first)
+    (again,) = kept.about(second, np.eye(4))
+    moved = pose_from(np.eye(3), first - second) @ T_odom_body  # the same pose about the second anchor
+    np.testing.assert_allclose(again @ moved, T_map_odom @ T_odom_body, atol=1e-9)
+    np.testing.assert_allclose(kept.about(first, np.eye(4))[0], T_map_odom, atol=1e-9)
+
+
+# ---- what a search tries
+
+
+def test_hint_is_tried_at_once_then_periodically():
+    schedule = HintSchedule()
+    tried = []
+    for _ in range(100):
+        due = schedule.due((np.eye(4),))
+        tried.append(bool(due))
+        if due:
+            schedule.tried(refuted=True)
+    assert tried[: hints._TRIES] == [True] * hints._TRIES
+    gaps = np.diff(np.flatnonzero(tried))[hints._TRIES - 1 :]
+    assert set(gaps) == {hints._PAUSE + 1}
+
+
+def test_unrefuted_keyframe_resets_hint_tries():
+    schedule = HintSchedule()
+    for refuted in [*[True] * (hints._TRIES - 1), False] * 3:
+        assert schedule.due((np.eye(4),))
+        schedule.tried(refuted)
+    assert schedule.due((np.eye(4),))
+
+
+def test_new_hint_is_tried_at_once():
+    schedule = HintSchedule()
+    for _ in range(hints._TRIES):
+        schedule.due((np.eye(4),))
+        schedule.tried(refuted=True)
+    assert not schedule.due((np.eye(4),))
+    assert schedule.due((pose_from(rot_z(0.1), [0, 0, 0]),))
+
+
+def counted(localizer, monkeypatch):
+    """Hinted places that were scored, keyframe by keyframe."""
+    made = []
+    whole = localizer.search._register
+
+    def register(scored, *others):
+        made.append(sum(place.hinted for place in scored.places))
+        return whole(scored, *others)
+
+    monkeypatch.setattr(localizer.search, "_register", register)
+    return made
+
+
+def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch):
+    localizer = misled(Localizer(world_map), world_drive, monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
+    follow(localizer, world_drive, 10)
+    assert made == [1] * hints._TRIES + [0] * 4 + [1]
+
+
+def test_hint_outside_the_map_is_not_refuted(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ pose_from(np.eye(3), [500.0, 0, 0]))
+    follow(localizer, world_drive, 10)
+    assert made == [1] * 10
+
+
+def test_followed_hint_is_one_place(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    follow(localizer, world_drive, 4)
+    assert made == [1] * 4
+
+
+# ---- acceptance
+
+
+def test_hint_waits_for_places_that_votes_name(world_map, world_drive, monkeypatch):
+    """Whatever fits at the hint may fit elsewhere as well: without a rival there is nothing to compare it with."""
+    localizer = Localizer(world_map)
+    consensus = localizer.search.coview.consensus
+    found = consensus.hypotheses
+    monkeypatch.setattr(consensus, "hypotheses", lambda: found()[1:] if len(consensus) > 2 else [])
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    fixes = follow(localizer, world_drive, 3)
+    assert [fix.state for fix in fixes] == [State.AMBIGUOUS, State.AMBIGUOUS, State.TRACKING]
+    assert fixes[0].T_map_body is None
+    assert fixes[2].evidence.confidence > 1.0 - RULE.risk
+
+
+def test_hint_places_the_robot_for_any_odometry_pose():
+    """The robot is at the hinted place at any odometry pose."""
+    kept = PoseHints()
+    T_map_body, T_odom_body = pose_from(rot_z(2.5), [40, -7, 3]), pose_from(rot_z(-1.0), [5, 6, 0.2])
+    kept.robot_at(T_map_body)
+    (T,) = kept.about(np.array([100.0, 200.0, 5.0]), T_odom_body)
+    np.testing.assert_allclose(T @ T_odom_body, T_map_body, atol=1e-9)
+    np.testing.assert_allclose(inverse(T) @ T_map_body, T_odom_body, atol=1e-9)
+
+
+def test_poses_to_try_begin_at_the_guess_and_cover_its_surroundings():
+    guess = PlaceGuess(10.0, 20.0, 0.5, distance=6.0, angle=np.radians(26))
+    poses = guess.poses()
+    np.testing.assert_allclose(poses[0], [10.0, 20.0, 0.5])
+    assert np.linalg.norm(poses[:, :2] - (10.0, 20.0), axis=1).max() <= 6.0
+    assert np.degrees(np.ptp(poses[:, 2])) == pytest.approx(52)
+    for place in np.random.default_rng(1).uniform((6.0, 16.0), (14.0, 24.0), (50, 2)):
+        assert np.linalg.norm(poses[:, :2] - place, axis=1).min() < 3.0
+
+
+def test_guess_without_heading_tries_them_all():
+    yaws = np.unique(np.round(PlaceGuess(0.0, 0.0, distance=1.0).poses()[:, 2], 6))
+    gaps = np.diff(np.concatenate([yaws, yaws[:1] + 2 * np.pi]))
+    assert np.degrees(gaps).max() < 14.0
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"x": float("nan")}, {"x": "1"}, {"x": True}, {"y": 1e9}, {"distance": 0.0}, {"distance": 100.0}, {"yaw": np.inf}],
+)
+def test_impossible_guesses_are_refused(fields):
+    with pytest.raises(ConfigError):
+        PlaceGuess(**{"x": 1.0, "y": 2.0, **fields})
+
+
+def test_transforms_put_the_robot_where_it_is_guessed():
+    T_odom_body, origin = pose_from(rot_z(0.7), [3.0, -2.0, 1.0]), np.array([100.0, 200.0, 5.0])
+    guess = PlaceGuess(112.0, 205.0, -0.4)
+    T_map_body = guess.transforms(origin, T_odom_body)[0] @ T_odom_body
+    np.testing.assert_allclose(T_map_body[:2, 3], [12.0, 5.0])
+    assert yaw_of(T_map_body) == pytest.approx(-0.4)
+
+
+def guessed_drive(localizer, world_drive, guess):
+    if guess is not None:
+        localizer.guess_place(guess)
+    fixes = []
+    for cloud, T, k in zip(world_drive.clouds, world_drive.T_odom_body, range(6), strict=False):
+        fixes.append(localizer.step(cloud, T, 0.5 * k))
+    return fixes
+
+
+@pytest.mark.slow
+def test_wrong_guess_changes_nothing_of_where_and_when_the_robot_is_found(world_map, world_drive, world_fixes):
+    true = next(fix for fix in world_fixes if fix.T_map_body is not None)
+    away = true.T_map_body[:2, 3] + (15.0, -12.0)
+    found = guessed_drive(Localizer(world_map), world_drive, PlaceGuess(*away.tolist(), 2.0))
+    for fix, plain in zip(found, world_fixes, strict=False):
+        assert fix.state is plain.state
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body[:3, 3], plain.T_map_body[:3, 3], atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("yaw", ["known", "open"])
+def test_right_guess_finds_a_place_that_no_vote_has_named(world_map, world_drive, world_fixes, yaw, monkeypatch):
+    true = next(fix for fix in world_fixes if fix.T_map_body is not None)
+    T, place = true.T_map_body, (true.T_map_body[:3, 3] - world_map.origin)[:2]
+
+    def without_the_right_one(localizer):
+        search, asked = localizer.search, []
+        vote, propose = search._vote, search._propose
+
+        def far_away():
+            named, ranks = propose()
+            T_odom_body = asked[-1].T_odom_body
+            far = [np.linalg.norm((each.T_map_odom @ T_odom_body)[:2, 3] - place) > 15.0 for each in named]
+            return [n for n, away in zip(named, far, strict=True) if away], [
+                r for r, away in zip(ranks, far, strict=True) if away
+            ]
+
+        monkeypatch.setattr(search, "_vote", lambda request: (asked.append(request), vote(request)))
+        monkeypatch.setattr(search, "_propose", far_away)
+        return localizer
+
+    lost = guessed_drive(without_the_right_one(Localizer(world_map)), world_drive, None)
+    assert all(fix.state is not State.TRACKING for fix in lost)
+    x, y = T[:2, 3] + (2.0, -1.5)
+    guess = PlaceGuess(float(x), float(y), yaw_of(T) + 0.25 if yaw == "known" else None)
+    found = guessed_drive(without_the_right_one(Localizer(world_map)), world_drive, guess)
+    fix = next(fix for fix in found if fix.T_map_body is not None)
+    plain = world_fixes[[f.stamp for f in world_fixes].index(fix.stamp)]
+    assert plain.T_map_body is None or np.linalg.norm(fix.T_map_body[:3, 3] - plain.T_map_body[:3, 3]) < 0.3
+
+
+def test_guess_beside_the_map_is_refused(world_map):
+    with pytest.raises(InputError, match="no ground within 5 m"):
+        Localizer(world_map).guess_place(PlaceGuess(9000.0, 9000.0))
