@@ -56,7 +56,7 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
     height, width = shape
     cloud = np.ascontiguousarray(points, dtype=np.float32)
     ratio = round(_GROUND_CELL / CELL)
-    x, y = (float(each) for each in corner)
+    x, y = (float(coordinate) for coordinate in corner)
     lowest = kernels.lowest_heights(cloud, OverheadGrid(x, y, _GROUND_CELL, (height // ratio, width // ratio)))
     if not np.isfinite(lowest).any():
         nothing = np.zeros((LAYERS, height, width), dtype=np.uint8)
@@ -71,13 +71,13 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
     return image.astype(np.uint8).reshape(LAYERS, height, width)
 
 
-def _layers(image: Floats32, occupied: npt.NDArray[np.uint8], top: Floats32, seen: npt.NDArray[np.uint8]) -> None:
+def _layers(image: Floats32, occupied: npt.NDArray[np.uint8], top: Floats32, ground: npt.NDArray[np.uint8]) -> None:
     """Fill all layers of a flat image but the last from the columns above its cells."""
     for k, (low, high) in enumerate(pairwise(SLABS)):
         slab = occupied[int(low / _LEVEL) : int(high / _LEVEL)]  # no more than 255 levels
         image[k] = 255.0 * np.sqrt(slab.sum(axis=0, dtype=np.uint8) * np.float32(1.0 / len(slab)))
     image[-3] = top * (255.0 / SLABS[-1])
-    image[-2] = seen * np.float32(255.0)
+    image[-2] = ground * np.float32(255.0)
 
 
 def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Floats32, Floats32]:
@@ -87,7 +87,7 @@ def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Float
     """
     from scipy import ndimage  # takes a quarter of a second, and not all who load a map draw images
 
-    seen = np.isfinite(lowest)
+    occupied = np.isfinite(lowest)
     # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
     offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL
     cone = -_MAX_SLOPE * np.hypot(offsets[:, None], offsets[None])
@@ -97,7 +97,7 @@ def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Float
     # the lowest point of a sloping cell lies below its middle: the mean of the points near it corrects that
     count, total = kernels.offsets_near(points, grid, ground, _GROUND_BAND)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
-    level = seen & (count > 0)
+    level = occupied & (count > 0)
     weight = ndimage.gaussian_filter(level.astype(np.float32), _RELIEF_SIGMA / _GROUND_CELL)
     mean = ndimage.gaussian_filter(np.where(level, ground, 0.0), _RELIEF_SIGMA / _GROUND_CELL) / np.maximum(
         weight, 1e-3

@@ -56,7 +56,7 @@ def ground_below(points: Points, position: Floats) -> float:
     if not len(near):
         return float(position[2])
     reach = int(np.ceil(_GROUND_RADIUS))
-    column, row = (np.floor(each[near]).astype(np.int64) + reach for each in (x, y))
+    column, row = (np.floor(axis[near]).astype(np.int64) + reach for axis in (x, y))
     lowest = np.full((2 * reach) ** 2, np.inf, dtype=np.float32)
     np.minimum.at(lowest, column * 2 * reach + row, points[near, 2])
     return float(np.median(lowest[np.isfinite(lowest)]))

@@ -339,14 +339,14 @@ def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
 def _stored(features: Features, image: Image, corner: Ints, shape: tuple[int, int]) -> dict[str, npt.NDArray[Any]]:
     """Quantize the features without their margin, of the tiles that have points."""
     height, width = shape
-    known = _known(image)
+    mapped = _known(image)
     core = (slice(_NET_MARGIN, _NET_MARGIN + height), slice(_NET_MARGIN, _NET_MARGIN + width))
     vectors = quantized(features.local[:, core[0], core[1]].transpose(1, 2, 0))
-    local = np.where(known[core][..., None], vectors, np.int8(0))
-    sigma = np.where(known[core], quantized_sigma(features.sigma[core]), 255).astype(np.uint8)
+    local = np.where(mapped[core][..., None], vectors, np.int8(0))
+    sigma = np.where(mapped[core], quantized_sigma(features.sigma[core]), 255).astype(np.uint8)
     numbers = np.stack(np.meshgrid(np.arange(width // TILE), np.arange(height // TILE)), axis=-1)
-    full = _in_tiles(known[core]).any(axis=(1, 2))
-    place, place_at = _places(features.place, known[core], shape)
+    full = _in_tiles(mapped[core]).any(axis=(1, 2))
+    place, place_at = _places(features.place, mapped[core], shape)
     return {
         "local": _in_tiles(local)[full],
         "sigma": _in_tiles(sigma)[full],
@@ -375,14 +375,14 @@ def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(blocks.swapaxes(1, 2).reshape(-1, TILE, TILE, *rest))
 
 
-def _places(place: Floats32, known: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
+def _places(place: Floats32, mapped: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
     """Pool global descriptors (K, P) over squares of 8 m, as a query does its four middle cells; also their middles."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)
     inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]
     mean = inner.reshape(len(place), height, _PER_PLACE, width, _PER_PLACE).mean(axis=(2, 4))
     mean /= np.linalg.norm(mean, axis=0) + np.float32(1e-9)
-    wanted = known.reshape(height, side, width, side).any(axis=(1, 3))
+    wanted = mapped.reshape(height, side, width, side).any(axis=(1, 3))
     row, column = np.nonzero(wanted)
     at = np.asarray((np.column_stack([column, row]) + 0.5) * side, dtype=np.float64)
     return quantized(mean[:, row, column].T), at

@@ -114,8 +114,8 @@ def network(view: ViewName, threads: int | None = None) -> Network:
 
 def weights_directory() -> Path:
     """Return the directory of the weights: ``COVIEW_WEIGHTS`` if that is set, else the package's."""
-    own = os.environ.get("COVIEW_WEIGHTS")
-    return Path(own) if own else Path(__file__).parent / "weights"
+    folder = os.environ.get("COVIEW_WEIGHTS")
+    return Path(folder) if folder else Path(__file__).parent / "weights"
 
 
 def weights_file(view: ViewName, directory: Path | None = None) -> Path:

@@ -290,16 +290,16 @@ class Localizer:
         if not self.state.has_place:
             self._requests.guess(guess)
 
-    def hint_calibration(self, known: Calibration) -> None:
+    def hint_calibration(self, earlier: Calibration) -> None:
         """Begin with an earlier calibration of this robot, less certain; it goes on being measured.
 
         Ignored while a place is known, and as far as it is known better here.
         """
         if self.state.has_place:
             return
-        self._frames.estimator.learn(known.doubted())
+        self._frames.estimator.learn(earlier.doubted())
         if not self._tracker.ground.learned:
-            self._tracker.ground.restore(known.ground)
+            self._tracker.ground.restore(earlier.ground)
 
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""

@@ -112,16 +112,16 @@ class RunResult:
     def interruptions(self) -> list[Interruption]:
         """Where poses are missing after the first fix, in order; frames that were skipped are told apart."""
         out: list[Interruption] = []
-        found, going_on = False, False
+        fixed, going_on = False, False
         for fix in self.fixes:
             has = fix.T_map_body is not None
-            if found and not has:
+            if fixed and not has:
                 if going_on:
                     out[-1] = replace(out[-1], last=fix.stamp, frames=out[-1].frames + 1)
                 else:
                     reason = fix.state.reported if fix.evidence is None else fix.evidence.reason
                     out.append(Interruption(fix.stamp, fix.stamp, 1, reason))
-            found, going_on = found or has, found and not has
+            fixed, going_on = fixed or has, fixed and not has
         return out
 
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class RunResult:
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
             "frames": self.frames,
             "posed": len(self.posed),
-            "interruptions": [each.to_json() for each in self.interruptions],
+            "interruptions": [gap.to_json() for gap in self.interruptions],
             "skipped": self.skipped,
             "sources": list(self.sources),
             "map_sha256": base_map.sha256,
@@ -175,8 +175,8 @@ def locate(
     driven, before = 0.0, None
     for index in range(len(run)):
         try:
-            known = localizer.calibration
-            frame = run.read(index, SweepCorrection(known.R_body_cloud, known.scale))
+            calibration = localizer.calibration
+            frame = run.read(index, SweepCorrection(calibration.R_body_cloud, calibration.scale))
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:
@@ -205,14 +205,14 @@ def from_stream(
     A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
     have the state that the newest status before them names.
     """
-    known = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
-    told = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
+    pose_at = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
+    states = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
     located = RunResult(len(stamps))
     for stamp in stamps:
-        pose = known.get(round(stamp * 1e6))
+        pose = pose_at.get(round(stamp * 1e6))
         if pose is None:
-            before = bisect_right(told, round(stamp * 1e9), key=lambda t: t[0])
-            located.fixes.append(Fix(stamp, State(told[before - 1][1]) if before else State.SEARCHING))
+            before = bisect_right(states, round(stamp * 1e9), key=lambda t: t[0])
+            located.fixes.append(Fix(stamp, State(states[before - 1][1]) if before else State.SEARCHING))
         else:
             T = pose_from_tum([*pose["position"], *pose["orientation"]])
             covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
@@ -295,16 +295,16 @@ def summary(located: RunResult) -> str:
 
 def _interrupted(located: RunResult) -> list[str]:
     """Say where poses are missing after the first one: the longest stretches, in the order of the run."""
-    every, begin = located.interruptions, located.fixes[0].stamp
-    longest = sorted(every, key=lambda each: -each.frames)[:_TOLD]
+    gaps, begin = located.interruptions, located.fixes[0].stamp
+    longest = sorted(gaps, key=lambda gap: -gap.frames)[:_TOLD]
     lines = [
-        f"{each.frames} frames from {each.first - begin:.1f} s to {each.last - begin:.1f} s: {each.reason}"
-        for each in every
-        if each in longest
+        f"{gap.frames} frames from {gap.first - begin:.1f} s to {gap.last - begin:.1f} s: {gap.reason}"
+        for gap in gaps
+        if gap in longest
     ]
-    if len(every) > _TOLD:
-        rest = sum(each.frames for each in every) - sum(each.frames for each in longest)
-        lines.append(f"{rest} frames in {len(every) - _TOLD} more places: see result.json")
+    if len(gaps) > _TOLD:
+        rest = sum(gap.frames for gap in gaps) - sum(gap.frames for gap in longest)
+        lines.append(f"{rest} frames in {len(gaps) - _TOLD} more places: see result.json")
     return lines
 
 

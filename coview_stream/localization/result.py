@@ -85,8 +85,8 @@ class KeyframeEvidence:
 
         Earlier versions left out the shares that were not known, the cause, the innovation and the places by chance.
         """
-        known = data.get(_SHARES[0]) is not None
-        parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
+        has_shares = data.get(_SHARES[0]) is not None
+        parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if has_shares else None
         return cls(
             float(data["stamp"]),
             State(data["state"]),

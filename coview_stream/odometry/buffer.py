@@ -166,11 +166,11 @@ class OdometryBuffer:
     def _max_plausible_speed(self) -> float:
         """Bound the robot's speed, metres per second, by that of the last seconds; infinite while unknown."""
         newest = self._samples[-1]
-        past = self._samples[bisect_left(self._samples, newest.stamp_ns - _SPEED_WINDOW_NS, key=lambda s: s.stamp_ns)]
-        seconds = (newest.stamp_ns - past.stamp_ns) / _NS
+        first = self._samples[bisect_left(self._samples, newest.stamp_ns - _SPEED_WINDOW_NS, key=lambda s: s.stamp_ns)]
+        seconds = (newest.stamp_ns - first.stamp_ns) / _NS
         if seconds < _MIN_SPEED_SPAN:
             return float("inf")
-        return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - past.travelled) / seconds
+        return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - first.travelled) / seconds
 
     def covers(self, stamp_ns: int) -> int:
         """Return -1 if the buffer starts after ``stamp_ns``, 1 if it ends before, 0 if the stamp lies within."""

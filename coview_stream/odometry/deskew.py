@@ -35,8 +35,8 @@ def deskew(
     if len(segment.stamps) < 2 or not len(points):
         return points
     at = (segment.stamps - stamp_ns) * 1e-9
-    known = np.clip(np.nan_to_num(times, nan=0.0), at[0], at[-1])
-    low, high = float(known.min()), float(known.max())
+    clipped = np.clip(np.nan_to_num(times, nan=0.0), at[0], at[-1])
+    low, high = float(clipped.min()), float(clipped.max())
     if max(-low, high) < _INSTANT:
         return points
     grid = np.linspace(low, high, _STEPS)
@@ -49,6 +49,6 @@ def deskew(
         body[:, :3, :3] = R_body_cloud.T @ body[:, :3, :3] @ R_body_cloud
         body[:, :3, 3] = body[:, :3, 3] @ R_body_cloud  # each row by the transposed rotation
     motion = body.astype(np.float32)
-    step = np.rint((known - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
+    step = np.rint((clipped - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
     moved = np.einsum("nij,nj->ni", motion[step, :3, :3], points) + motion[step, :3, 3]
     return np.asarray(moved, dtype=np.float32)

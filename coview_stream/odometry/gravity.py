@@ -66,11 +66,11 @@ class Ground:
 
 def find_ground(points: Reals) -> Ground | str:
     """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return why there is none."""
-    found = ground_plane(points)
-    if isinstance(found, str):
-        return found
-    corrected, walls = gravity_from_walls(points, found.up)
-    return replace(found, up=corrected, walls=walls)
+    ground = ground_plane(points)
+    if isinstance(ground, str):
+        return ground
+    corrected, walls = gravity_from_walls(points, ground.up)
+    return replace(ground, up=corrected, walls=walls)
 
 
 def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
@@ -84,9 +84,9 @@ def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
     if len(lowest) < _MIN_CELLS:
         return f"only {len(lowest)} cells of {_CELL:g} m within {_REACH:g} m hold points"
     if near is not None:
-        found = _checked(lowest, _refined(lowest, (near.up, near.height)))
-        if not isinstance(found, str):
-            return found
+        ground = _checked(lowest, _refined(lowest, (near.up, near.height)))
+        if not isinstance(ground, str):
+            return ground
     return _checked(lowest, _refined(lowest, _consensus_plane(lowest)))
 
 
@@ -187,19 +187,19 @@ def _patches(points: Floats, up: Floats) -> Floats:
     """Return normals (K, 3) of the flat, roughly upright pieces of surface around."""
     near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
     cell = np.floor(near / _WALL_CELL).astype(np.int64) @ np.array([1 << 40, 1 << 20, 1])
-    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
-    mean = _sums(near, which, len(count)) / count[:, None]
-    off = near - mean[which]
-    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), which, len(count)) / count[:, None]
+    _, cell_of, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean = _sums(near, cell_of, len(count)) / count[:, None]
+    off = near - mean[cell_of]
+    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), cell_of, len(count)) / count[:, None]
     variances, axes = np.linalg.eigh(moments[count >= _WALL_MIN_POINTS].reshape(-1, 3, 3))
     normals = axes[:, :, 0]
     flat = (variances[:, 0] < _WALL_MAX_THICKNESS**2) & (variances[:, 1] > _WALL_MIN_WIDTH**2)
     return np.asarray(normals[flat & (np.abs(normals @ up) < _WALL_MAX_LEAN)])
 
 
-def _sums(values: Floats, which: Indices, count: int) -> Floats:
+def _sums(values: Floats, cell_of: Indices, count: int) -> Floats:
     """Add up, (count, K), the rows of values (N, K) that go to each of ``count`` places."""
-    return np.stack([np.bincount(which, column, minlength=count) for column in values.T], axis=1)
+    return np.stack([np.bincount(cell_of, column, minlength=count) for column in values.T], axis=1)
 
 
 # set by hand
@@ -245,8 +245,8 @@ class Surfaces:
     def around(cls, points: Reals, up: Floats, near: Ground | None) -> Surfaces:
         """Look at a frame (N, 3), metres, whose up (3,) is good to some degrees; ``near``: the last ground seen."""
         walls, information, count = wall_evidence(points, up, _WIDE)
-        found = ground_plane(points, near)
-        return cls(walls if count else None, information, None if isinstance(found, str) else found)
+        plane = ground_plane(points, near)
+        return cls(walls if count else None, information, None if isinstance(plane, str) else plane)
 
     def seen(self, R: Floats) -> Plumb:
         """Return the same in axes that are level but for a small tilt; ``R`` (3, 3), those axes <- body."""

@@ -188,13 +188,13 @@ class LidarOdometry:
     def _begin(self, points: Points, stamp: float) -> Pose:
         """Determine gravity, and place the first frame."""
         if self.config.gravity == "ground":
-            found = find_ground(points)
-            if isinstance(found, str):
+            ground = find_ground(points)
+            if isinstance(ground, str):
                 raise CloudError(
-                    f"no ground to take gravity from: {found}; start where the ground is open, or give gravity "
+                    f"no ground to take gravity from: {ground}; start where the ground is open, or give gravity "
                     "(--gravity level, or --gravity=X,Y,Z in the body frame)"
                 )
-            self.ground, up = found, found.up
+            self.ground, up = ground, ground.up
         else:
             up = -down(self.config.gravity)
         start = pose_from(level_rotation(up), np.zeros(3))
@@ -219,10 +219,10 @@ class LidarOdometry:
         """Take registration's tilt out of the newest pose, and turn the odometry frame about it, slowly."""
         assert self._pose is not None
         R, here = self._pose[:3, :3], self._pose[:3, 3]
-        own = upright(self._tilt.update(around.seen(R), metres, since))
+        tilt = upright(self._tilt.update(around.seen(R), metres, since))
         turn = upright(self._tilt.turn())
         self._T_odom_local = pose_from(turn, here - turn @ here) @ self._T_odom_local
-        self._pose = orthonormal(pose_from(own @ turn @ R, here))
+        self._pose = orthonormal(pose_from(tilt @ turn @ R, here))
 
     def _predicted_motion(self, seconds: float) -> Pose:
         """Extrapolate the last motion (4, 4) to ``seconds``, which may be negative."""
@@ -270,9 +270,9 @@ def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig
     at = None if times is None else to_array(times, np.float64, "times")
     if at is not None and at.shape != (len(rows),):
         raise CloudError(f"cloud has {len(rows)} points and times of shape {at.shape}; give one time per point")
-    finite, kept = finite_rows(rows)
-    if at is not None and kept is not None:
-        at = at[kept]
+    finite, mask = finite_rows(rows)
+    if at is not None and mask is not None:
+        at = at[mask]
     with np.errstate(over="ignore"):
         ranges = norms(finite)
     usable = int(((ranges > config.min_range) & (ranges < config.max_range)).sum())
@@ -286,7 +286,7 @@ def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig
 
 def _sweep_interval(times: Floats) -> tuple[float, float] | None:
     """Return the first and last of times (N,), seconds after the stamp; None if they do not differ, or lie far off."""
-    known = times[np.isfinite(times)]
-    if not len(known) or np.abs(known).max() > _MAX_SWEEP_SECONDS or np.ptp(known) < _MIN_SWEEP_SECONDS:
+    finite = times[np.isfinite(times)]
+    if not len(finite) or np.abs(finite).max() > _MAX_SWEEP_SECONDS or np.ptp(finite) < _MIN_SWEEP_SECONDS:
         return None
-    return float(known.min()), float(known.max())
+    return float(finite.min()), float(finite.max())

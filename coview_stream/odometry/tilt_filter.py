@@ -125,19 +125,19 @@ class TiltFilter:
         self._P[_MAP, _MAP] = tilt
         self._first = True
 
-    def expected(self, seen: Plumb, sigma: float) -> Floats:
+    def expected(self, plumb: Plumb, sigma: float) -> Floats:
         """Return the tilt (2,) of a frame whose pose is a guess, good to ``sigma`` radians; nothing is learnt."""
-        x, P, slope = self._predicted(seen, 0.0)
-        return self._split(x, P, seen, sigma**2, slope)[0]
+        x, P, slope = self._predicted(plumb, 0.0)
+        return self._split(x, P, plumb, sigma**2, slope)[0]
 
-    def update(self, seen: Plumb, metres: float, since: Since | None = None) -> Floats:
+    def update(self, plumb: Plumb, metres: float, since: Since | None = None) -> Floats:
         """Take in a registered frame, ``metres`` after the one before; return its own tilt n (2,), radians.
 
         ``since``: how it is tilted against the frame before.
         """
-        x, P, slope = self._predicted(seen, metres)
+        x, P, slope = self._predicted(plumb, metres)
         frame = 0.0 if self._first else self._frame.value
-        tilt, self._x, self._P, learnt = self._split(x, P, seen, frame, slope, since)
+        tilt, self._x, self._P, learnt = self._split(x, P, plumb, frame, slope, since)
         if not self._first:
             for variance, (squares, redundancy) in zip((self._frame, self._slope, self._kappa), learnt, strict=True):
                 variance.learn(squares, redundancy)
@@ -156,12 +156,12 @@ class TiltFilter:
         """Return one sigma of the local map's drift in a frame, radians."""
         return max(_LEAST_DRIFT, _DRIFT * self.frame_tilt)
 
-    def _predicted(self, seen: Plumb, metres: float) -> tuple[Floats, Floats, float]:
+    def _predicted(self, plumb: Plumb, metres: float) -> tuple[Floats, Floats, float]:
         """Return state and covariance after ``metres``, before v, and v's variance."""
         x, P = self._x.copy(), self._P.copy()
         walls = _NO_WALLS**2
-        if seen.walls is not None:
-            walls = min(walls, self._kappa.value * float(np.trace(seen.covariance)) / 2.0)
+        if plumb.walls is not None:
+            walls = min(walls, self._kappa.value * float(np.trace(plumb.covariance)) / 2.0)
         if self._first:
             P[_BIAS, _BIAS] = walls * _EYE
             return x, P, 0.0
@@ -174,27 +174,27 @@ class TiltFilter:
         return x, P, self._slope.value
 
     def _split(
-        self, x: Floats, P: Floats, seen: Plumb, frame: float, slope: float, since: Since | None = None
+        self, x: Floats, P: Floats, plumb: Plumb, frame: float, slope: float, since: Since | None = None
     ) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
         """Share the innovation out among the state and the fresh errors n, v and w, outliers outvoted.
 
         Returns:
             n (2,), the state and its covariance, and for n, v and w squares and redundancy to learn from.
         """
-        y, rows = seen.rows()
+        y, rows = plumb.rows()
         y = np.concatenate([y, np.zeros(2) if since is None else since.tilt])
         rows = rows if since is None else np.concatenate([rows, [4, 5]])
-        errors = [frame * _EYE, slope * _EYE, self._kappa.value * seen.covariance]
+        errors = [frame * _EYE, slope * _EYE, self._kappa.value * plumb.covariance]
         ways = [_OF_FRAME[rows], _OF_GROUND[rows], _OF_WALLS[rows]]
         H, body = _OF_STATE[rows], _OF_BODY[rows]
         shake = 0.0 if since is None else since.sigma**2
-        known = H @ P @ H.T + _GROUND_FIT**2 * ways[1] @ ways[1].T + shake * body @ body.T
+        normal = H @ P @ H.T + _GROUND_FIT**2 * ways[1] @ ways[1].T + shake * body @ body.T
         innovation = y[rows] - H @ x
         least = np.inf
         for start in _STARTS if since is not None else _STARTS[:1]:
-            trial = _reweighted(innovation, known, errors, ways, start)
+            trial = _reweighted(innovation, normal, errors, ways, start)
             if trial[0] < least:
-                least, inverse, gain, wide, shares, left = trial
+                least, inverse, gain, wide, shares, rest_of = trial
         cross = P @ H.T
         cross[_SLOPES] += wide[1] @ ways[1].T
         P = P.copy()
@@ -202,21 +202,21 @@ class TiltFilter:
         P -= cross @ inverse @ cross.T
         learnt = [
             (_in_units_of(C, np.outer(share, share)), 2.0 - _in_units_of(C, rest))
-            if way.any() and C.any()
+            if J.any() and C.any()
             else (0.0, 0.0)
-            for C, share, rest, way in zip(wide, shares, left, ways, strict=True)
+            for C, share, rest, J in zip(wide, shares, rest_of, ways, strict=True)
         ]
         return shares[0], x + cross @ gain, 0.5 * (P + P.T), learnt
 
 
 def _reweighted(
-    innovation: Floats, known: Floats, errors: list[Floats], ways: list[Floats], weights: tuple[float, ...]
+    innovation: Floats, normal: Floats, errors: list[Floats], ways: list[Floats], weights: tuple[float, ...]
 ) -> tuple[float, Floats, Floats, list[Floats], list[Floats], list[Floats]]:
     """Find a maximum of the likelihood of an innovation (K,) that several errors share (EM), from ``weights``.
 
     Args:
         innovation: to be explained.
-        known: (K, K) covariance of its normal part.
+        normal: (K, K) covariance of its normal part.
         errors: (2, 2) covariance of each that has Student's t distribution, all zero for none.
         ways: (K, 2) how each gets into the innovation.
         weights: of each to begin with; its covariance is divided by that.
@@ -227,20 +227,20 @@ def _reweighted(
     """
     for _ in range(_ROUNDS):
         wide = [C / weight for C, weight in zip(errors, weights, strict=True)]
-        total = known + sum(way @ C @ way.T for way, C in zip(ways, wide, strict=True))
+        total = normal + sum(J @ C @ J.T for J, C in zip(ways, wide, strict=True))
         inverse = np.asarray(np.linalg.inv(total), dtype=np.float64)
         gain = inverse @ innovation
-        shares = [C @ way.T @ gain for way, C in zip(ways, wide, strict=True)]
-        left = [C - C @ way.T @ inverse @ way @ C for way, C in zip(ways, wide, strict=True)]
+        shares = [C @ J.T @ gain for J, C in zip(ways, wide, strict=True)]
+        rest_of = [C - C @ J.T @ inverse @ J @ C for J, C in zip(ways, wide, strict=True)]
         weights = tuple(
             (_FREEDOM + 2.0) / (_FREEDOM + _in_units_of(C, np.outer(share, share) + rest)) if C.any() else 1.0
-            for C, share, rest in zip(errors, shares, left, strict=True)
+            for C, share, rest in zip(errors, shares, rest_of, strict=True)
         )
-    cost = 0.5 * float(gain @ known @ gain)
+    cost = 0.5 * float(gain @ normal @ gain)
     for C, share in zip(errors, shares, strict=True):
         if C.any():
             cost += 0.5 * (_FREEDOM + 2.0) * math.log1p(_in_units_of(C, np.outer(share, share)) / _FREEDOM)
-    return cost, inverse, gain, wide, shares, left
+    return cost, inverse, gain, wide, shares, rest_of
 
 
 def upright(tilt: Floats) -> Floats:

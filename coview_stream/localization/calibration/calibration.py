@@ -1,4 +1,4 @@
-"""The calibration: current errors of sensor and odometry, and scans to which it is applied when they are read."""
+"""Calibration of sensor and odometry, and raw scans that are levelled by it when they are read."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from
 
-_WORTH_TELLING = math.radians(0.5)  # lean of a sensor beyond which a clause says so; the next three likewise
+# smaller corrections are not reported
+_LEAN = math.radians(0.5)
 _SCALE = 0.01
 _TURN = math.radians(0.05)  # per metre
 _GROUND = 0.1  # metres
-_MOVED_TILT = math.radians(1.0)  # sigmas of a calibration from before the robot was out of sight
+
+_MOVED_TILT = math.radians(1.0)  # least sigmas of a calibration from before the node started
 _MOVED_SCALE = 0.02
 _MOVED_TURN = math.radians(0.02)  # per metre
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Corrections of a robot's clouds and odometry, and how well they are known.
+    """Corrections of a robot's clouds and odometry, with their standard deviations.
 
     Attributes:
-        roll: radians about the body's x by which clouds have to be turned to agree with odometry's gravity.
+        roll: radians about the body's x that turn clouds to odometry's gravity.
         pitch: radians about the body's y, likewise.
         scale: factor that corrects odometry's distances, less one.
-        turn: radians per metre driven that odometry's heading has to be turned by.
-        sigma_tilt: radians, one sigma, each of roll and pitch.
-        sigma_scale: of the scale.
-        sigma_turn: radians per metre.
-        ground: metres by which the ground that the robot sees lies above the survey's, at this site.
+        turn: correction of odometry's heading, radians per metre driven.
+        sigma_tilt: one sigma of roll and of pitch, radians.
+        sigma_scale: one sigma of the scale.
+        sigma_turn: one sigma of the turn, radians per metre.
+        ground: height of the site's present ground above the survey's, metres.
     """
 
     roll: float = 0.0
@@ -52,44 +54,45 @@ class Calibration:
 
     @property
     def T_body_cloud(self) -> Pose:
-        """(4, 4) the same as a transform."""
+        """(4, 4) the rotation as a transform."""
         return pose_from(self.R_body_cloud, np.zeros(3))
 
     def level(self, cloud: Points) -> Points:
-        """Return a cloud (N, 3) of the sensor's own axes in the body's."""
+        """Return a cloud (N, 3) in the body's axes, from the sensor's."""
         R = self.R_body_cloud
         return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
     def describe(self, mount: Mount | None = None) -> list[str]:
-        """Describe the corrections in plain words, a clause each; none where sensor and odometry are right.
+        """Return one clause of text per noticeable correction.
 
-        Signs are those of ``--mount``. ``mount`` is the one that clouds have been read with already.
+        Signs are those of ``--mount``; ``mount`` is the mount already applied to the clouds.
         """
-        said: list[str] = []
+        clauses: list[str] = []
         leans = [
             f"{math.degrees(angle):.1f} deg in {name}"
             for name, angle in (("roll", self.roll), ("pitch", self.pitch))
-            if abs(angle) >= _WORTH_TELLING
+            if abs(angle) >= _LEAN
         ]
         if leans:
             option = (mount or Mount()).turned(self.R_body_cloud).option
             beyond = "" if mount is None or mount == Mount() else " beyond its mount"
-            said.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; set --mount={option} to silence this")
+            remedy = f"set --mount={option} to silence this"
+            clauses.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; {remedy}")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"
-            said.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")
+            clauses.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")
         if abs(self.turn) >= _TURN:
             side = "left" if self.turn < 0 else "right"
-            said.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
+            clauses.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
         if abs(self.ground) >= _GROUND:
             side = "above" if self.ground > 0 else "below"
-            said.append(
+            clauses.append(
                 f"the ground lies {abs(self.ground):.2f} m {side} the survey's (grass, snow): heights follow the rest"
             )
-        return said
+        return clauses
 
     def doubted(self) -> Calibration:
-        """Return the same, known less well: it is from before the node started, and the sensor may have been moved."""
+        """Return the calibration with wider sigmas: the sensor may have been moved since."""
         return replace(
             self,
             sigma_tilt=max(self.sigma_tilt, _MOVED_TILT),
@@ -114,22 +117,16 @@ class Calibration:
 
 
 class RawScan:
-    """Points of a frame in the sensor's own axes, with the frame's odometry; levelled when they are read.
+    """Points of a frame in the sensor's axes, with the frame's odometry; levelled when they are read.
 
-    The newest reading is held, so reading again with the same rotation costs nothing.
+    The newest reading is cached.
 
     Attributes:
         T_odom_body: (4, 4) odometry of the frame.
     """
 
     def __init__(self, points: Points, T_odom_body: Pose, R_body_cloud: Floats | None = None) -> None:
-        """Store a frame.
-
-        Args:
-            points: (N, 3) float32, one per voxel, odometry frame, levelled by ``R_body_cloud``.
-            T_odom_body: (4, 4) odometry of the frame.
-            R_body_cloud: (3, 3); None if the points are as the sensor saw them.
-        """
+        """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``R_body_cloud`` (3, 3), if given."""
         self.T_odom_body = T_odom_body
         self._newest = (np.eye(3) if R_body_cloud is None else R_body_cloud), points
         self._raw: Points | None = None
@@ -144,7 +141,7 @@ class RawScan:
         return np.asarray(self.T_odom_body[:3, 3])
 
     def levelled(self, R_body_cloud: Floats) -> Points:
-        """Return the points (N, 3), odometry frame, levelled by a rotation (3, 3)."""
+        """Return the points (N, 3) in the odometry frame, levelled by a rotation (3, 3)."""
         R, points = self._newest
         if np.array_equal(R, R_body_cloud):
             return points

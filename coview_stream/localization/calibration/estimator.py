@@ -1,22 +1,21 @@
-"""Estimation of the calibration: a Kalman filter over a robot's constants, or nearly so.
+"""Kalman filter for the calibration of a robot's sensor and odometry.
 
-The state is x = (roll, pitch, s, w, g): the tilt of the sensor against odometry's gravity, the scale of odometry's
-distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2): the errors
-of the pose graph but for those that are independent from step to step
-(:class:`coview_stream.localization.tracking.motion.Drift`). Each registration to the map that is
-believed measures two things:
+The state is x = (roll, pitch, s, w, g): tilt of the sensor against odometry's gravity, scale of odometry's distances
+less one, turn of its heading per metre, and lean of the odometry frame against the map (2 components). These are the
+systematic errors of odometry; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every
+believed registration to the map gives two measurements:
 
-* its attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the tilt
-  that is left is u_map x u_odometry (eq. C1). The sensor's turns with the body, that of odometry's frame does not; the
-  latter is left to the pose graph, which follows it;
-* the motion since the registration before against odometry's. Along the way they differ by s times the distance, in
-  heading by w times the distance (eq. C2), but for both registrations' errors and odometry's random walk.
+* Attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the residual
+  tilt is u_map x u_odometry (eq. C1). The sensor's tilt turns with the body, the lean of the odometry frame does not;
+  the pose graph follows the latter.
+* Motion since the previous registration against odometry's. They differ by s times the distance along the path and by
+  w times the distance in heading (eq. C2), apart from both registrations' errors and odometry's random walk.
 
-A motion far outside what all this allows (wheels slip) counts less, as under Student's t distribution. Nothing is for
-ever: each component walks at random, slowly, with the metres driven.
+A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk
+slowly at random with the metres driven.
 
-While a place only leads a search, the state is a mixture of two such Gaussians: that it is the right place, whose
-attitude has been measured, and that it is not.
+While a place only leads a search, the state is a mixture of two Gaussians: the place is right and its attitude has been
+measured, or the place is wrong.
 """
 
 from __future__ import annotations
@@ -32,14 +31,14 @@ from coview_stream.localization.calibration.calibration import Calibration
 
 
 class _Prior(NamedTuple):
-    """Prior of a group of components; all set by hand.
+    """Prior of a group of components (values set by hand).
 
     Attributes:
-        axes: of the state.
-        exact: sigma of one that is as it should be.
-        wide: sigma of one that is not.
-        share: probability that it is not.
-        walk: sigma of its random walk, per square root of a metre.
+        axes: components of the state.
+        exact: sigma of a correct sensor or odometry.
+        wide: sigma of a faulty one.
+        share: probability of a fault.
+        walk: sigma of the random walk, per square root of a metre.
     """
 
     axes: slice
@@ -53,7 +52,7 @@ _TILT = _Prior(slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.rad
 _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4)
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4))
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
-_GROUPS = (_TILT, _SCALE, _TURN)  # that are corrected
+_GROUPS = (_TILT, _SCALE, _TURN)  # corrected components
 _WIDE = np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide) for g in (*_GROUPS, GRAVITY)])
 SIZE = len(_WIDE)
 """Components of the state."""
@@ -61,11 +60,10 @@ _FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
 
 class CalibrationBelief:
-    """Gaussian over the state x = (roll, pitch, s, w, g), heavy-tailed where measurements contradict it.
+    """Gaussian over the state x = (roll, pitch, s, w, g), with heavier tails where measurements contradict it.
 
-    Most sensors stand straight and most odometry has the right scale. So each group of the state is a mixture: zero but
-    for a small spread, or anything up to a large one; the mean of both is applied, weighed by their probabilities
-    (Savage and Dickey's ratio, eq. C3).
+    Most sensors stand straight and most odometry has the right scale. So a group is a mixture of a narrow prior about
+    zero and a wide one; the applied value is the mean of both by their probabilities (Savage-Dickey ratio, eq. C3).
 
     Attributes:
         x: (6,) mean.
@@ -73,33 +71,34 @@ class CalibrationBelief:
     """
 
     def __init__(self, sensor_leans: bool = True) -> None:
-        """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
+        """Begin with the priors; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
         self.x = np.zeros(SIZE)
         self.P = np.diag(_WIDE**2)
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
     def copy(self) -> CalibrationBelief:
-        """Return the same belief, to be changed on its own."""
+        """Return an independent copy."""
         other = CalibrationBelief(self._sensor_leans)
         other.x, other.P = self.x.copy(), self.P.copy()
         return other
 
-    def restore(self, known: Calibration) -> None:
+    def restore(self, earlier: Calibration) -> None:
         """Begin with an earlier calibration."""
-        self.x = np.array([known.roll, known.pitch, known.scale, known.turn, 0.0, 0.0])
+        self.x = np.array([earlier.roll, earlier.pitch, earlier.scale, earlier.turn, 0.0, 0.0])
         self.P = np.diag(_WIDE**2)
-        sigmas = [known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]
+        sigmas = [earlier.sigma_tilt, earlier.sigma_tilt, earlier.sigma_scale, earlier.sigma_turn]
         self.P[:4, :4] = np.diag(np.square(sigmas))
         self._stand_straight()
 
-    def learn(self, known: Calibration) -> None:
-        """Take over an earlier calibration as far as it is better known than the present one."""
-        own = self.applied()
-        values = np.array([known.roll, known.pitch, known.scale, known.turn])
-        sigmas = (known.sigma_tilt, known.sigma_scale, known.sigma_turn)
-        for group, sigma, here in zip(_GROUPS, sigmas, (own.sigma_tilt, own.sigma_scale, own.sigma_turn), strict=True):
-            if sigma < here:
+    def learn(self, earlier: Calibration) -> None:
+        """Take over the components of an earlier calibration that have a smaller sigma than the present ones."""
+        present = self.applied()
+        values = np.array([earlier.roll, earlier.pitch, earlier.scale, earlier.turn])
+        sigmas = (earlier.sigma_tilt, earlier.sigma_scale, earlier.sigma_turn)
+        limits = (present.sigma_tilt, present.sigma_scale, present.sigma_turn)
+        for group, sigma, limit in zip(_GROUPS, sigmas, limits, strict=True):
+            if sigma < limit:
                 self.x[group.axes] = values[group.axes]
                 self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
                 axes = np.arange(SIZE)[group.axes]
@@ -107,30 +106,30 @@ class CalibrationBelief:
         self._stand_straight()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
+        """Forget the lean of the odometry frame, as a new one begins; the robot's constants stay."""
         self.x[GRAVITY.axes] = 0.0
         self.P[GRAVITY.axes], self.P[:, GRAVITY.axes] = 0.0, 0.0
         self.P[GRAVITY.axes, GRAVITY.axes] = np.eye(2) * GRAVITY.wide**2
 
     def walk(self, driven: float) -> None:
-        """Let everything have changed a little over ``driven`` metres."""
+        """Widen all components by their random walks over ``driven`` metres."""
         for group in (*_GROUPS, GRAVITY):
             axes = np.arange(SIZE)[group.axes]
             self.P[axes, axes] = np.minimum(self.P[axes, axes] + group.walk**2 * driven, group.wide**2)
         self._stand_straight()
 
-    def doubt_tilt(self, seen: Floats, H: Floats, R: Floats) -> None:
-        """Widen a tilt that a measurement contradicts by far: it is as probably right as the measurements before."""
-        gap, spread = seen - H @ self.x, H @ self.P @ H.T + R
+    def doubt_tilt(self, measured: Floats, H: Floats, R: Floats) -> None:
+        """Widen the tilt's covariance where a measurement contradicts it by far."""
+        gap, spread = measured - H @ self.x, H @ self.P @ H.T + R
         factor = heavier(float(gap @ np.linalg.solve(spread, gap)), len(gap))
         widest = _TILT.wide**2 / max(float(self.P[0, 0]), float(self.P[1, 1]), 1e-30)
         wider = math.sqrt(min(factor, max(widest, 1.0)))
         self.P[:2] *= wider
         self.P[:, :2] *= wider
 
-    def update(self, seen: Floats, H: Floats, R: Floats) -> float:
-        """Take in a measurement ``seen`` = H x + noise of covariance R; return its log-likelihood before."""
-        gap = seen - H @ self.x
+    def update(self, measured: Floats, H: Floats, R: Floats) -> float:
+        """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood."""
+        gap = measured - H @ self.x
         distance = float(gap @ np.linalg.solve(H @ self.P @ H.T + R, gap))
         R = R * heavier(distance, len(gap))
         spread = H @ self.P @ H.T + R
@@ -141,7 +140,7 @@ class CalibrationBelief:
         return -0.5 * float(gap @ np.linalg.solve(spread, gap) + np.linalg.slogdet(spread)[1])
 
     def applied(self) -> Calibration:
-        """Weigh, group by group, "as it should be" against "anything" (eq. C3)."""
+        """Return the mean of the narrow and the wide prior, group by group (eq. C3)."""
         means, sigmas = np.zeros(4), []
         for group in _GROUPS:
             x, P = self.x[group.axes], self.P[group.axes, group.axes]
@@ -150,20 +149,20 @@ class CalibrationBelief:
             exact = -0.5 * (x @ np.linalg.solve(spread, x) + np.linalg.slogdet(spread)[1]) + size * math.log(group.wide)
             weight = 1.0 / (1.0 + (1.0 - group.share) / group.share * math.exp(min(exact, 500.0)))
             means[group.axes] = weight * x
-            about = group.exact**2 * np.trace(P) / (np.trace(P) + size * group.exact**2)
-            within = weight * np.trace(P) + (1.0 - weight) * about
+            variance = group.exact**2 * np.trace(P) / (np.trace(P) + size * group.exact**2)
+            within = weight * np.trace(P) + (1.0 - weight) * variance
             sigmas.append(math.sqrt((within + weight * (1.0 - weight) * float(x @ x)) / size))
         return Calibration(*means.tolist(), *sigmas)
 
     def _stand_straight(self) -> None:
-        """Know for sure that the sensor does not lean, if it cannot: then odometry's gravity leans."""
+        """Fix the tilt at zero for a sensor that cannot lean: then odometry's gravity leans."""
         if not self._sensor_leans:
             self.x[:2] = 0.0
             self.P[:2], self.P[:, :2] = 0.0, 0.0
 
 
 def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
-    """Return the mean of two calibrations, ``share`` of it the other's, with the sigmas of the mixture."""
+    """Return the mixture of two calibrations, with the probability ``share`` of ``other``."""
 
     def mean(a: float, b: float) -> float:
         return (1.0 - share) * a + share * b
@@ -171,7 +170,7 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
     def sigma(a: float, b: float, apart: float) -> float:
         return math.sqrt(mean(a**2, b**2) + share * (1.0 - share) * apart**2)
 
-    apart = math.hypot(one.roll - other.roll, one.pitch - other.pitch) / math.sqrt(2.0)  # of each of the two
+    apart = math.hypot(one.roll - other.roll, one.pitch - other.pitch) / math.sqrt(2.0)  # per angle
     return Calibration(
         mean(one.roll, other.roll),
         mean(one.pitch, other.pitch),
@@ -184,69 +183,64 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
 
 
 def heavier(distance: float, size: int) -> float:
-    """Return the factor on a variance under Student's t distribution.
-
-    Args:
-        distance: squared Mahalanobis distance of the measurement.
-        size: its number of components.
-    """
+    """Return Student's t factor on the variance of a measurement, from its squared Mahalanobis distance and size."""
     return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
 
-_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own
-_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch
-_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else
+_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch, added to its covariance
+_LEAN = 3.0  # ratio of the roll and pitch errors of a frame-to-frame motion to its heading error
+_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the motion's errors
 
 
 class CalibrationEstimator:
-    """Estimate of the calibration, and the correction of clouds and odometry by it.
+    """Estimator of the calibration from registrations.
 
     Attributes:
-        calibration: the applied one.
+        calibration: the applied calibration.
     """
 
     def __init__(self, sensor_leans: bool = True) -> None:
-        """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
+        """Begin with the priors; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
         self._known = CalibrationBelief(sensor_leans)
-        self._supposed: CalibrationBelief | None = None  # the same if a place that leads a search is the right one
-        self._probability = 0.0  # that it is
+        self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
+        self._probability = 0.0  # that the leading place is right
         self._apply()
 
-    def restore(self, known: Calibration) -> None:
-        """Begin with an earlier calibration; it goes on being measured."""
+    def restore(self, earlier: Calibration) -> None:
+        """Begin with an earlier calibration; measurements go on improving it."""
         self._supposed = None
-        self._known.restore(known)
+        self._known.restore(earlier)
         self._apply()
 
-    def learn(self, known: Calibration) -> None:
-        """Take over an earlier calibration as far as it is better known than the present one."""
+    def learn(self, earlier: Calibration) -> None:
+        """Take over the components of an earlier calibration that have a smaller sigma than the present ones."""
         self._supposed = None
-        self._known.learn(known)
+        self._known.learn(earlier)
         self._apply()
 
     def forget_leader(self) -> None:
-        """Forget the supposition by a place that led a search."""
+        """Forget the measurement at a place that led a search."""
         self._supposed = None
         self._apply()
 
     def begin_odometry(self) -> None:
-        """Forget how odometry's frame leans, for another one begins; the robot's constants stay."""
+        """Forget the lean of the odometry frame, as a new one begins; the robot's constants stay."""
         self._supposed = None
         self._known.begin_odometry()
         self._apply()
 
     def motion_covariance(self, step: Floats) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the axes of that."""
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the step's axes."""
         along = np.concatenate([np.zeros(3), step])
         spread = np.outer(along, along) * self.calibration.sigma_scale**2
         spread[2, 2] += (self.calibration.sigma_turn * float(np.linalg.norm(step))) ** 2
         return np.asarray(spread)
 
     def measure_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
-        """Take in the attitude of a registration at the known place (eq. C1).
+        """Add the attitude of a registration at the tracked place (eq. C1).
 
         Args:
-            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
+            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
             T_odom_body: (4, 4) odometry of the same frame.
             variance: of the registration's roll and pitch, rad^2.
         """
@@ -255,23 +249,22 @@ class CalibrationEstimator:
         self._apply()
 
     def suppose_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float, probability: float) -> None:
-        """Take in the attitude at a place that is right with a ``probability``; a wrong place says nothing.
+        """Add the attitude at a place that is right with a ``probability``, in place of the previous supposition.
 
-        Replaces the previous supposition, for a search registers the same scans again. Args as
-        :meth:`measure_attitude`.
+        A search registers the same scans again, so suppositions do not add up. Args as :meth:`measure_attitude`.
         """
         self._supposed, self._probability = self._known.copy(), probability
         _measure_attitude(self._supposed, T_map_cloud, T_odom_body, variance)
         self._apply()
 
     def measure_motion(self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats) -> Pose:
-        """Take in the motion between two registrations (eq. C2); return the step as it is corrected from now on.
+        """Add the motion between two registrations (eq. C2); return ``step`` corrected by the new calibration.
 
         Args:
-            T_map_before: (4, 4) the earlier one, as the map alone has it.
-            T_map_body: (4, 4) the later one.
-            step: (4, 4) odometry between them, as it has been corrected.
-            noise: (2,) variances along the way and of the heading, but for the calibration's.
+            T_map_before: (4, 4) earlier pose, the prior removed.
+            T_map_body: (4, 4) later pose, likewise.
+            step: (4, 4) odometry between them, corrected by the calibration of its time.
+            noise: (2,) variances along the path and of the heading, without the calibration's.
         """
         driven = float(np.linalg.norm(step[:3, 3]))
         if driven < _MIN_STEP:
@@ -292,38 +285,38 @@ class CalibrationEstimator:
         return pose_from(turn @ step[:3, :3], (1.0 + now.scale) / (1.0 + before.scale) * step[:3, 3])
 
     def measure_frames(self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float) -> Pose:
-        """Take in the motion from frame to frame that the lidar alone has seen (eq. C4).
+        """Add a motion between frames measured by the lidar alone (eq. C4).
 
         Args:
             motion: (4, 4) of the levelled body.
-            step: (4, 4) odometry's, as it has been corrected.
-            variances: (6,) of odometry's random walk meanwhile, over (rx, ry, rz, x, y, z).
+            step: (4, 4) odometry's motion, corrected by the calibration of its time.
+            variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
             position: sigma of ``motion``, metres.
-            angle: sigma of it, radians.
+            angle: sigma of ``motion``, radians.
 
         Returns:
-            ``step`` as it is corrected from now on.
+            ``step`` corrected by the new calibration.
         """
         t, before = step[:3, 3], self.calibration
         applied = log_so3(before.R_body_cloud)[:2]
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
-        # the motion's height, of which the tilt is the cause
+        # a tilted sensor sees a climb
         H = np.zeros((1, SIZE))
         H[0, :2] = -t[1], t[0]
         rise = np.array([motion[2, 3] - t[2] + H[0, :2] @ applied])
         self._update(rise, H, np.array([[variances[5] + position**2]]))
         H = np.zeros((2, SIZE))
-        H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # odometry's heading is the worse one
+        H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # the lidar's heading, which is better than odometry's
         self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
         noise = np.array([variances[3] + position**2, variances[2] + angle**2])
         level = pose_from(self.calibration.R_body_cloud @ before.R_body_cloud.T, np.zeros(3))
         return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise)
 
-    def _update(self, seen: Floats, H: Floats, R: Floats) -> None:
-        """Take in a measurement ``seen`` = H x + noise of covariance R, whatever is supposed."""
-        likelihood = self._known.update(seen, H, R)
+    def _update(self, measured: Floats, H: Floats, R: Floats) -> None:
+        """Add a measurement ``measured`` = H x + noise of covariance R to both beliefs."""
+        likelihood = self._known.update(measured, H, R)
         if self._supposed is not None:
-            ratio = self._supposed.update(seen, H, R) - likelihood
+            ratio = self._supposed.update(measured, H, R) - likelihood
             right = self._probability * math.exp(min(ratio, 50.0))
             self._probability = right / (right + 1.0 - self._probability)
         self._apply()
@@ -336,14 +329,14 @@ class CalibrationEstimator:
 
 def _measure_attitude(belief: CalibrationBelief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
     R_body_cloud = belief.applied().R_body_cloud
-    left = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
-    left[2] = 0.0
-    seen = log_so3(exp_so3(left) @ R_body_cloud)[:2]
+    residual = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
+    residual[2] = 0.0
+    measured = log_so3(exp_so3(residual) @ R_body_cloud)[:2]
     H = np.eye(2, SIZE)
     H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # the lean of odometry's frame turns with the body
     R = np.eye(2) * (variance + _ATTITUDE**2)
-    belief.doubt_tilt(seen, H, R)
-    belief.update(seen, H, R)
+    belief.doubt_tilt(measured, H, R)
+    belief.update(measured, H, R)
 
 
 def tilt_variance(covariance: Floats) -> float:

@@ -1,15 +1,15 @@
-"""Motion from frame to frame by the lidar alone, before any place is known, as a measurement of sensor and odometry.
+"""Lidar motion between keyframes before the first fix, as a measurement of sensor and odometry errors.
 
-The newest keyframe is registered to the one before. With ε the tilt of the sensor that is not corrected yet, t and R
-odometry's motion in the body's axes, s and w as in :mod:`coview_stream.localization.calibration.estimator`, the
-registered motion differs from odometry's (hand-eye calibration, to first order) by
+The newest keyframe is registered to the previous one. With ε the uncorrected tilt of the sensor, t and R odometry's
+motion in the body's axes, s and w as in :mod:`coview_stream.localization.calibration.estimator`, the registered motion
+differs from odometry's (hand-eye calibration, to first order) by
 
-* t x ε + s t in position, of which the components along the way (s) and along the body's z (ε) are used: the third one
-  is the heading of the sensor on the body, which is not estimated;
-* (R - I) ε + w |t| z in rotation: a robot that turns sees its roll, too (eq. C4).
+* t x ε + s t in position. The components along the path (s) and along the body's z (ε) are used; the third is the
+  heading of the sensor on the body, which is not estimated.
+* (R - I) ε + w |t| z in rotation: a robot that turns also observes its roll (eq. C4).
 
-The same registration mends the motion itself: odometry that drifts smears the virtual scan of many keyframes. Both are
-weighed by their variances; a registration that contradicts odometry counts less (in a street all along looks alike).
+The registration also corrects the motion itself, as drifting odometry smears the virtual scan of many keyframes. Both
+count by their variances; a registration that contradicts odometry counts less (a street looks alike along its length).
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ from coview_stream.localization.registration.register import Prior, register
 # set by hand
 _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
-_FREE_METRE = 0.1  # sigmas by which the motion may differ from odometry's, and metres more per metre driven
+_FREE_METRE = 0.1  # prior sigmas of the motion about odometry's: constant, and metres per metre driven
 _POSITION = 0.02  # sigma of a registered motion, metres
 _POSITION_METRE = 0.01  # and per metre driven: as in three real runs at two to eight metres a step
-_ANGLE = math.radians(0.2)  # likewise
+_ANGLE = math.radians(0.2)  # sigma of a registered motion
 _HEADING = math.radians(1.0)  # sigma of the heading of the sensor on the body
-_POORER = 3.0  # times odometry may drift as it is known to, or configured
-_FAILS = 0.1  # probability that a registration fails, and sigmas of where it comes to then: angles, and metres a metre
+_POORER = 3.0  # times the configured drift that odometry may have
+_FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
 _FAILED_ANGLE = math.radians(3.0)
 _FAILED = 0.15
-_LONGEST = 12.0  # metres between two keyframes that are compared
+_LONGEST = 12.0  # metres between two keyframes
 
-# of surface patches; set by hand
+# surface patches
 _CELL = 1.0  # metres
 _CELL_POINTS = 5
 _THICKNESS = 0.15  # metres, one sigma across
 _FLATTER = 2.0  # times as wide as thick
 
 Variances = Callable[[float, float], Floats]
-"""Variances (6,) over (rx, ry, rz, x, y, z) that odometry's random walk gathers in metres driven and radians turned."""
+"""Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, of metres driven and radians turned."""
 
 
 @dataclass(frozen=True)
 class _Reference:
-    """The keyframe that the next one is registered to.
+    """Keyframe that the next one is registered to.
 
     Attributes:
-        points: (K, 3) float32 on surfaces, body frame, as they came.
-        normals: (K, 3) float32 of those, same frame.
-        T_odom_body: (4, 4) odometry, corrected.
+        points: (K, 3) float32 on surfaces, sensor's axes.
+        normals: (K, 3) float32 of the points, same frame.
+        T_odom_body: (4, 4) corrected odometry.
     """
 
     points: Points
@@ -70,7 +70,7 @@ class _Reference:
 
 
 class FrameMotion:
-    """Registration of each keyframe to the one before, while no place is known."""
+    """Registration of keyframes to their predecessors, before the first fix."""
 
     def __init__(self, config: RegistrationConfig, distance: float) -> None:
         """Compare frames at least ``distance`` metres apart."""
@@ -83,24 +83,24 @@ class FrameMotion:
         self._reference = None
 
     def is_due(self, T_odom_body: Pose) -> bool:
-        """Tell whether a frame is far enough from the one before."""
+        """Return whether a frame is far enough from the previous keyframe."""
         if self._reference is None:
             return True
         return float(np.linalg.norm(T_odom_body[:3, 3] - self._reference.T_odom_body[:3, 3])) >= self._distance
 
     def refine(self, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator, drift: Variances) -> Pose:
-        """Register a frame to the one before; return its odometry, mended.
+        """Register a frame to the previous keyframe; return its odometry (4, 4), corrected by the result.
 
         Args:
-            points: (N, 3) float32 body frame, one per voxel, as they came.
+            points: (N, 3) float32, one per voxel, sensor's axes.
             T_odom_body: (4, 4) odometry, corrected by the estimator's calibration.
-            estimator: learns from it.
+            estimator: gets the motion as a measurement.
             drift: of odometry.
         """
         reference = self._reference
-        seen = None if reference is None else self._registered(reference, points, T_odom_body, estimator)
-        if reference is not None and seen is not None:
-            T_odom_body = _mended(reference.T_odom_body, T_odom_body, seen, estimator, drift)
+        T_registered = None if reference is None else self._registered(reference, points, T_odom_body, estimator)
+        if reference is not None and T_registered is not None:
+            T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift)
         on_surfaces, normals = surface_points(points)
         self._reference = _Reference(on_surfaces, normals, T_odom_body)
         return T_odom_body
@@ -108,7 +108,7 @@ class FrameMotion:
     def _registered(
         self, reference: _Reference, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator
     ) -> Pose | None:
-        """Return where the keyframe before sees this one, (4, 4) odometry <- body; None if nothing can be told."""
+        """Return the registered pose (4, 4), odometry <- body; None if the frames cannot be registered."""
         far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
         if len(reference.points) < MIN_PAIRS or far > _LONGEST:
             return None
@@ -123,22 +123,16 @@ class FrameMotion:
             return None
         free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
         prior = Prior(np.eye(4), np.diag(free**-2.0))
-        found = register(scan, np.eye(4), target, self._config, _SCALES, prior, T_odom_body[:3, 3])
-        return None if found is None else found.T_map_source @ T_odom_body
+        registration = register(scan, np.eye(4), target, self._config, _SCALES, prior, T_odom_body[:3, 3])
+        return None if registration is None else registration.T_map_source @ T_odom_body
 
 
-def _mended(before: Pose, T_odom_body: Pose, seen: Pose, estimator: CalibrationEstimator, drift: Variances) -> Pose:
-    """Teach the estimator a registered motion; return the newest frame's odometry (4, 4), mended by both.
-
-    Args:
-        before: (4, 4) odometry of the keyframe before.
-        T_odom_body: (4, 4) odometry of the newest, corrected by the estimator's calibration.
-        seen: (4, 4) where the keyframe before sees the newest.
-        estimator: learns from it.
-        drift: of odometry.
-    """
+def _corrected(
+    before: Pose, T_odom_body: Pose, T_registered: Pose, estimator: CalibrationEstimator, drift: Variances
+) -> Pose:
+    """Give the estimator a registered motion from ``before`` (4, 4); return the newest odometry (4, 4), fused."""
     level = estimator.calibration.R_body_cloud
-    motion, step = inverse(before) @ seen, inverse(before) @ T_odom_body
+    motion, step = inverse(before) @ T_registered, inverse(before) @ T_odom_body
     far = float(np.linalg.norm(step[:3, 3]))
     variances = drift(far, abs(yaw_of(step)))
     position = math.hypot(_POSITION, _POSITION_METRE * far)
@@ -150,47 +144,47 @@ def _mended(before: Pose, T_odom_body: Pose, seen: Pose, estimator: CalibrationE
 
 
 def surface_points(points: Points) -> tuple[Points, Floats32]:
-    """Return the points (K, 3) of a cloud (N, 3) whose cubic metre holds a piece of surface, and its normals (K, 3)."""
+    """Return the points (K, 3) of a cloud (N, 3) in cubic metres with a flat surface, and their normals (K, 3)."""
     cell = np.floor(points / np.float32(_CELL)).astype(np.int64)
     cell -= cell.min(axis=0) if len(cell) else 0
     size = cell.max(axis=0) + 1 if len(cell) else np.ones(3, dtype=np.int64)
-    _, which, count = np.unique(
+    _, cell_of, count = np.unique(
         (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True, return_counts=True
     )
     exact = points.astype(np.float64)
-    off = exact - (_sums(exact, which, len(count)) / count[:, None])[which]
-    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), which, len(count)) / count[:, None]
+    off = exact - (_sums(exact, cell_of, len(count)) / count[:, None])[cell_of]
+    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), cell_of, len(count)) / count[:, None]
     variances, axes = np.linalg.eigh(moments.reshape(-1, 3, 3))
     thin = np.maximum(variances[:, 0], 0.0)
     flat = (count >= _CELL_POINTS) & (thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin)
-    kept = flat[which]
-    return points[kept], axes[:, :, 0][which[kept]].astype(np.float32)
+    chosen = flat[cell_of]
+    return points[chosen], axes[:, :, 0][cell_of[chosen]].astype(np.float32)
 
 
-def _sums(values: Floats, which: Ints, count: int) -> Floats:
-    """Add up, (count, K), the rows of values (N, K) that go to each of ``count`` cells."""
-    columns = [np.bincount(which, column, minlength=count) for column in values.T]
+def _sums(values: Floats, cell_of: Ints, count: int) -> Floats:
+    """Return the sums (count, K) of values (N, K) by cell number (N,)."""
+    columns = [np.bincount(cell_of, column, minlength=count) for column in values.T]
     return np.stack(columns, axis=1) if columns else np.empty((count, 0))
 
 
 def _turned(motion: Pose, R: Floats) -> Pose:
-    """Return a motion (4, 4) of a body whose axes are turned by ``R`` (3, 3)."""
+    """Return a motion (4, 4) in axes turned by ``R`` (3, 3)."""
     return pose_from(R @ motion[:3, :3] @ R.T, R @ motion[:3, 3])
 
 
-def _probability_right(motion: Pose, step: Pose, variances: Floats, known: Calibration, position: float) -> float:
-    """Return how probable it is that a registration has not failed, by how it differs from odometry's ``step``.
+def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration, position: float) -> float:
+    """Return the probability that a registration succeeded, by its difference from odometry's ``step``.
 
-    One that fails (a street all along looks alike, and a lorry drives away) may come to anything within its reach.
+    A failed one (a street looks alike along its length, a lorry drives away) may end anywhere within its reach.
     """
     far = float(np.linalg.norm(step[:3, 3]))
     gap = np.concatenate([log_so3(motion[:3, :3] @ step[:3, :3].T), motion[:3, 3] - step[:3, 3]])
-    tilt = known.sigma_tilt * far
-    constant = np.array([0.0, 0.0, known.sigma_turn * far, known.sigma_scale * far, _HEADING * far, tilt])
-    seen = np.array([_ANGLE] * 3 + [position] * 3)
-    right = _POORER**2 * variances + constant**2 + seen**2
-    turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # by which a lean shows in rotation
-    right[:2] += (known.sigma_tilt * turn) ** 2
+    tilt = calibration.sigma_tilt * far
+    constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, _HEADING * far, tilt])
+    noise = np.array([_ANGLE] * 3 + [position] * 3)
+    right = _POORER**2 * variances + constant**2 + noise**2
+    turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that shows in rotation
+    right[:2] += (calibration.sigma_tilt * turn) ** 2
     failed = right + np.array([_FAILED_ANGLE] * 3 + [_FAILED * far] * 3) ** 2
     ratio = math.log(_FAILS / (1.0 - _FAILS)) + 0.5 * float(
         (gap**2 / right - gap**2 / failed + np.log(right) - np.log(failed)).sum()
@@ -199,7 +193,7 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, known: Calib
 
 
 def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, position: float, angle: float) -> Pose:
-    """Return odometry's pose (4, 4), moved and turned about the vertical towards where the lidar sees it."""
+    """Return odometry's pose (4, 4), moved and turned about the vertical towards the lidar's by their variances."""
     moved = T_odometry.copy()
     for axis in range(3):
         gap = float(T_seen[axis, 3] - T_odometry[axis, 3])
@@ -209,7 +203,7 @@ def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, position: float, a
     return moved
 
 
-def _share(gap: float, odometry: float, seen: float) -> float:
-    """Return the share of a gap by which odometry is off, by both variances; the lidar's have heavier tails."""
-    seen = float(heavier(gap**2 / (odometry + seen), 1)) * seen
-    return odometry / (odometry + seen)
+def _share(gap: float, odometry: float, lidar: float) -> float:
+    """Return odometry's share of a gap, by both variances; the lidar's has heavier tails."""
+    lidar = float(heavier(gap**2 / (odometry + lidar), 1)) * lidar
+    return odometry / (odometry + lidar)

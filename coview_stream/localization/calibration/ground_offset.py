@@ -1,16 +1,15 @@
-"""Ground offset: by how much the ground that the robot sees lies above the survey's, as grass or snow raise it.
+"""Ground offset: height of the present ground above the survey's, as grass or snow raise it.
 
-It is constant or changes slowly along the way, and is a nuisance of the pose: registration would put the robot's ground
-on the survey's, and so the robot as much too low. Structure says which it is: it is compared with the map at shifts up
-and down, the ground likewise, and what the two disagree by is the offset. The robot's height follows structure then,
-as far as there is any that shows a height; where there is none, the offset is taken for nothing.
+The offset is constant or changes slowly along the path. Registration would put the present ground on the survey's, and
+so the robot too low by the offset. Structure reveals it: structure and ground are compared with the map at shifts up
+and down, and the difference of their best shifts is the offset. The robot's height then follows structure; where no
+structure shows a height, the offset is zero.
 
-Most sites have none, and structure seen from below differs by centimetres from what a survey from above shows. So two
-hypotheses are compared, that there is no offset but the survey's own error and that there is one, of some decimetres,
-with what structure says blurred by that much; the more probable one holds, for a mean of both would leave every site
-without an offset some centimetres too high. Less than two decimetres are hardly told from none, and the height then
-follows the ground. A ground that lies below the survey's looks like trees that have grown since, which is more
-probable: little of it is corrected.
+Most sites have no offset, and structure seen from below differs by centimetres from a survey from above. So two
+hypotheses are compared: no offset beyond the survey's error, or one of some decimetres. The more probable one holds, as
+a mean of both would raise every site without an offset by some centimetres. Offsets below two decimetres hardly differ
+from none. Ground below the survey's looks like trees that have grown since, which is more probable: little of it is
+corrected.
 """
 
 from __future__ import annotations
@@ -23,24 +22,23 @@ from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
-# chosen on drives through a simulated town and a campus, their ground lifted by -0.2, 0 and 0.3 m, and looked at on
-# three real runs and a real forest plot spoilt likewise (docs/tracking.md); no command prints it
-_SHIFTS = 0.1 * np.arange(-7, 8)  # metres that are tried
-_OFFSETS = 0.02 * np.arange(-25, 26)  # metres that an offset may have
+# set by hand on a simulated town and campus with their ground lifted by -0.2, 0 and 0.3 m, and checked on three real
+# runs and a real forest plot changed likewise (docs/tracking.md); no command prints it
+_SHIFTS = 0.1 * np.arange(-7, 8)  # metres
+_OFFSETS = 0.02 * np.arange(-25, 26)  # metres
 _REACH = 0.5  # metres to a map point
 _WIDTH = 0.15  # metres off its plane at which a point is half as good
-_POINTS = 400  # of each kind that are compared
+_POINTS = 400  # of structure and of ground
 _PATCH = 4.0  # metres: a patch of structure is one observation
 _FEW = 4  # points of a patch; fewer say nothing
 _CHANCE = 0.1  # share of a patch that fits anywhere
 _NONE = 0.98  # prior probability of none: 0.9 left drives through changed campuses (bench tracking) 0.1 m off in height
 _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
-_VIEWED = 0.07  # metres, one sigma, by which structure seen from below differs in height from that seen from above
-_INDEPENDENT = 0.3  # observations for each patch: neighbours err alike
-_KEPT = 0.9  # weight of earlier registrations, from one to the next
-_FOLLOWED = 0.25  # of a change, at each registration but the first ones: the height follows it smoothly
-_STILL, _CHANGED = 0.6, 0.1  # probability that an offset known before is still there; metres by which it may be another
-
+_VIEWED = 0.07  # metres, one sigma of the height difference of structure seen from below and from above
+_INDEPENDENT = 0.3  # observations per patch: neighbours err alike
+_MEMORY = 0.9  # weight of earlier registrations, from one to the next
+_FOLLOWED = 0.25  # share of a change per registration: the height follows smoothly
+_STILL, _CHANGED = 0.6, 0.1  # probability that an earlier offset still holds; its sigma, metres
 
 # growth since the survey looks as if the ground had sunk: a nuisance, summed over
 _HEIGHTS, _PARTS = 0.1 * np.arange(1, 7), (0.5, 1.0)  # metres of growth, share of the patches
@@ -52,9 +50,9 @@ class GroundOffset:
     """Estimate of the ground offset at one site, from registrations.
 
     Attributes:
-        metres: the robot's ground above the survey's, as it is corrected for.
-        sigma: of that, one sigma, metres.
-        probability: that there is an offset at all.
+        metres: the applied offset.
+        sigma: one sigma of the offset, metres.
+        probability: that the site has an offset.
     """
 
     def __init__(self) -> None:
@@ -62,58 +60,53 @@ class GroundOffset:
 
     @property
     def learned(self) -> bool:
-        """Whether a registration has told anything since the place was found."""
+        """Whether a registration has measured it since the place was accepted."""
         return self._views > 0
 
     def restore(self, metres: float) -> None:
-        """Begin, now and at each place that is found, with the offset that was known at this site before.
+        """Begin, now and at every accepted place, with an earlier offset of this site as a third hypothesis.
 
-        It is a third hypothesis, the most probable one until registrations tell another; next to nothing restores none.
+        It is the most probable one until registrations contradict it; an offset near zero restores none.
         """
         self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
         if abs(metres) > 2.0 * _NONE_SIGMA:
-            known = _normal(_CHANGED, _OFFSETS - np.clip(metres, _OFFSETS[0], _OFFSETS[-1]))
-            self._some = _STILL * known + (1.0 - _STILL) * (1.0 - _NONE) * _ANY
+            near = _normal(_CHANGED, _OFFSETS - np.clip(metres, _OFFSETS[0], _OFFSETS[-1]))
+            self._some = _STILL * near + (1.0 - _STILL) * (1.0 - _NONE) * _ANY
             self._none = (1.0 - _STILL) * _NONE * _ZERO
         self.clear()
 
     def clear(self) -> None:
         """Forget the registrations: the place is another."""
-        self._told, self._views = np.zeros((len(_GROWTHS), len(_OFFSETS))), 0
+        self._likelihoods, self._views = np.zeros((len(_GROWTHS), len(_OFFSETS))), 0
         self.metres = self._weigh()
 
     def lower(self, cloud: RegistrationCloud) -> RegistrationCloud:
-        """Return a scan with its ground lowered by the offset, to where the survey has it."""
+        """Return a scan with its ground lowered by the offset, onto the survey's."""
         return cloud.lowered(self.metres) if self.metres else cloud
 
     def learn(self, cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap) -> None:
-        """Learn from a registration that is believed.
-
-        Args:
-            cloud: the registered one, lowered or not.
-            T_map_source: (4, 4) where.
-            target: the map around it.
-        """
-        told = log_likelihoods(cloud, T_map_source, target)
-        if told is None:
+        """Learn from a believed registration of ``cloud`` (lowered or not) to ``target`` at ``T_map_source`` (4, 4)."""
+        likelihoods = log_likelihoods(cloud, T_map_source, target)
+        if likelihoods is None:
             return
-        self._told, self._views = _KEPT * self._told + _INDEPENDENT * told, self._views + 1
-        # the first ones are averaged: as yet there is no height to be followed smoothly
+        self._likelihoods, self._views = _MEMORY * self._likelihoods + _INDEPENDENT * likelihoods, self._views + 1
+        # the first ones are averaged: there is no height to follow yet
         self.metres += max(_FOLLOWED, 1.0 / self._views) * (self._weigh() - self.metres)
 
     def _weigh(self) -> float:
         """Weigh the hypotheses by the registrations; return the mean of the more probable one, metres."""
-        likelihoods = _blurred(_GROWTH_PRIOR @ np.exp(self._told - self._told.max()))
-        some, none = likelihoods * self._some, likelihoods * self._none
-        self.probability = float(some.sum() / (some.sum() + none.sum()))
-        mean = float(some @ _OFFSETS / some.sum()) if self.probability > 0.5 else 0.0
-        weights = (some + none) / (some + none).sum()
+        growths = _GROWTH_PRIOR @ np.exp(self._likelihoods - self._likelihoods.max())
+        likelihoods = np.convolve(growths, _normal(_VIEWED, _OFFSETS), mode="same")
+        offset, none = likelihoods * self._some, likelihoods * self._none
+        self.probability = float(offset.sum() / (offset.sum() + none.sum()))
+        mean = float(offset @ _OFFSETS / offset.sum()) if self.probability > 0.5 else 0.0
+        weights = (offset + none) / (offset + none).sum()
         self.sigma = float(np.sqrt(weights @ (_OFFSETS - mean) ** 2))
         return mean
 
 
 def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap) -> Floats | None:
-    """Return the log-likelihoods (G, 51) of growths and offsets, -0.5 to 0.5 m; None without structure or ground."""
+    """Return the log-likelihoods (G, 51) of growths and offsets -0.5 to 0.5 m; None without structure or ground."""
     structure = _some(cloud.points[cloud.high])
     ground = _some(cloud.points[~cloud.above])
     if len(structure) < _FEW or len(ground) < _FEW:
@@ -123,35 +116,35 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
     patch, count = _patches(structure)
     shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
     shares = shares[count >= _FEW]
-    # where structure is right, the ground is as far off as the two differ by
+    # at the structure's height, the ground is off by their difference
     at = _OFFSETS + level - cloud.ground_offset
     still = _between(shares, at)
-    told = [np.log(_CHANCE + (1.0 - q) * still + q * _between(shares, at - g)).sum(axis=0) for g, q in _GROWTHS]
-    return np.stack(told)
+    rows = [np.log(_CHANCE + (1.0 - q) * still + q * _between(shares, at - g)).sum(axis=0) for g, q in _GROWTHS]
+    return np.stack(rows)
 
 
 def _between(profiles: Floats, at: Reals) -> Floats:
-    """Return profiles (P, K) over the shifts at other ones (S,), linearly: (P, S)."""
+    """Interpolate profiles (P, K) over the shifts linearly at others (S,): (P, S)."""
     where = np.clip((at - _SHIFTS[0]) / (_SHIFTS[1] - _SHIFTS[0]), 0.0, len(_SHIFTS) - 1.001)
     k = where.astype(np.int64)
     return np.asarray(profiles[:, k] * (1.0 - where + k) + profiles[:, k + 1] * (where - k))
 
 
 def _fits(points: Points, T_map_source: Pose, target: LocalMap) -> Floats:
-    """Return how well points (N, 3) fit the map, in [0, 1], at each of the shifts up and down (N, K)."""
+    """Return the fit (N, K) in [0, 1] of points (N, 3) to the map at the shifts up and down."""
     moved = np.repeat(transform(T_map_source, points)[:, None], len(_SHIFTS), axis=1)
     moved[:, :, 2] += _SHIFTS
     flat = moved.reshape(-1, 3).astype(np.float32)
     distance, partner = kernels.nearest(target.grid, flat, _REACH)
-    found = distance < _REACH
+    paired = distance < _REACH
     off = np.zeros(len(flat))
-    normals, _ = target.planes(partner[found])
-    off[found] = np.einsum("ij,ij->i", flat[found] - target.points[partner[found]], normals, dtype=np.float64)
-    return np.where(found, 1.0 / (1.0 + (off / _WIDTH) ** 2), 0.0).reshape(len(points), -1)
+    normals, _ = target.planes(partner[paired])
+    off[paired] = np.einsum("ij,ij->i", flat[paired] - target.points[partner[paired]], normals, dtype=np.float64)
+    return np.where(paired, 1.0 / (1.0 + (off / _WIDTH) ** 2), 0.0).reshape(len(points), -1)
 
 
 def _peak(profile: Floats) -> float:
-    """Return the shift at which a profile (K,) is highest, between two shifts by a parabola."""
+    """Return the shift at the maximum of a profile (K,), by a parabola through its neighbours."""
     k = int(np.clip(profile.argmax(), 1, len(profile) - 2))
     below, here, above = profile[k - 1 : k + 2]
     bend = below - 2.0 * here + above
@@ -160,7 +153,7 @@ def _peak(profile: Floats) -> float:
 
 
 def _patches(points: Points) -> tuple[Ints, Ints]:
-    """Return the number of the patch of each point (N,), and how many points each patch has."""
+    """Return the patch numbers (N,) of points, and the number of points per patch."""
     cell = np.floor(points[:, :2] / _PATCH).astype(np.int64)
     _, patch, count = np.unique(cell @ np.array([1 << 20, 1]), return_inverse=True, return_counts=True)
     return patch, count
@@ -174,10 +167,6 @@ def _some(points: Points) -> Points:
 def _normal(sigma: float, at: Reals) -> Floats:
     weights = np.exp(-0.5 * (at / sigma) ** 2)
     return np.asarray(weights / weights.sum())
-
-
-def _blurred(likelihoods: Floats) -> Floats:
-    return np.convolve(likelihoods, _normal(_VIEWED, _OFFSETS), mode="same")
 
 
 _GROWTH_PRIOR = np.array([1.0 - _GROWN, *np.full(len(_GROWTHS) - 1, _GROWN / (len(_GROWTHS) - 1))])

@@ -1,11 +1,11 @@
-"""Background: what chance explains of this scan on this map, measured at the places that were scored and are wrong.
+"""Background: shares of a scan that this map explains by chance, measured at wrong places.
 
-All but the places around the leader are chance places. Their mean shares are what an observation is worth at a wrong
-place, in a yard of equal boxes as much as 0.4. How far they scatter about that mean says how many independent
-observations a scan is: neighbouring points fall and rise together, and so do the scans of successive keyframes.
+All scored places but those around the leader are chance places. Their mean shares are an observation's value at a wrong
+place, as much as 0.4 in a yard of equal boxes. Their scatter about the mean gives the number of independent
+observations in a scan: neighbouring points fall and rise together, and so do the scans of successive keyframes.
 
-A search has hundreds of wrong places to compare with. While tracking there is one place, so the background is measured
-in rings around it, where walls and ground are of the same kind (:func:`observe_with_background`).
+A search has hundreds of wrong places. Tracking has one place, so its background is measured in rings around it, where
+walls and ground are of the same kind (:func:`observe_with_background`).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.evidence.observation import ObservedScan, Share
 
-# what is presumed before any place has been scored: as many chance places as these; set by hand
-_PSEUDO = 6.0  # chance places
+# prior, set by hand
+_PSEUDO = 6.0  # chance places that it counts as
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
 _MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
-_LEAST = 0.05  # of any outcome: what few chance places show is not impossible at another
-_COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
+_LEAST = 0.05  # probability of any outcome: one missing at few chance places is not impossible elsewhere
+_COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
-_MANY = 20  # places, of which the second largest share tells something
+_MANY = 20  # places from which the second largest share is meaningful
 _CALIBRATED = 1.75
-"""Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
-e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
+"""Factor on the number of independent observations by the scatter: searches on maps of other sites then state an error
+below e in less than a share e of them (``python -m bench.integrity.calibrate``)."""
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
 _TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
@@ -38,12 +38,12 @@ _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structur
 
 @dataclass(frozen=True)
 class Most:
-    """Most independent observations that there can be, however little chance places scatter.
+    """Upper limits of the number of independent observations.
 
     Attributes:
-        structure: patches of structure that a scan shows.
-        free: cubes of free space that it shows.
-        scans: of how many scans' surroundings the keyframes have seen something: of one, where all see the same.
+        structure: patches of structure in a scan.
+        free: cubes of free space in a scan.
+        scans: number of scans with different surroundings; 1 where all keyframes see the same.
     """
 
     structure: float = np.inf
@@ -53,13 +53,13 @@ class Most:
 
 @dataclass(frozen=True)
 class Background:
-    """Shares at chance places, and how many independent observations a scan is.
+    """Shares at chance places, and the number of independent observations in a scan.
 
     Attributes:
         structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
             unexplained.
         passed: probability that a free point lies on map structure.
-        ground: parameters of the Beta distribution of the share of the ground that lies on the map's, over places.
+        ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
         number: effective numbers of independent structure points and of free points.
     """
 
@@ -70,7 +70,7 @@ class Background:
 
 
 def outcomes(observed: Floats32) -> Floats:
-    """Return how the structure's outcomes (P, 4) share an observation (P, 7): on, near, edge, unexplained."""
+    """Return the shares (P, 4) of the structure's outcomes in observations (P, 7): on, near, edge, unexplained."""
     on, near, edge, covered = (observed[:, k].astype(np.float64) for k in range(4))
     return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
 
@@ -78,9 +78,9 @@ def outcomes(observed: Floats32) -> Floats:
 def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares: on, near, explained, passed.
 
-    They are those of the narrowest normal distribution that reaches as far as the shares do towards what a right place
-    has, at one, two and about three standard deviations and at the last of them but one: the tail decides, and it is
-    often wider than the middle, above all where a few places are of another kind than the rest.
+    They belong to the narrowest normal distribution that covers the shares' tail towards a right place's, at one, two
+    and about three standard deviations and at the second largest share. The tail is often wider than the middle, above
+    all where a few places are of another kind than the rest.
     """
     if len(observed) < 2:
         return np.full(4, np.nan)
@@ -88,28 +88,28 @@ def scatter(observed: Floats32) -> Floats:
     shares = np.sort(_compared(observed), axis=0)
     levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
     reach = (levels[1:] - levels[0]) / ndtri(np.array(_TAIL) / 100.0)[:, None]
-    if count >= _MANY:  # the second largest, after Blom; the largest may be a twin, which is a rival and not chance
+    if count >= _MANY:  # the second largest, by Blom's plotting position; the largest may be a twin of the right place
         last = (shares[-2] - levels[0]) / ndtri((count - 1.375) / (count + 0.25))
         reach = np.vstack([reach, last])
     return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
 
 
 def left_in_mean(observed: Floats32) -> Floats:
-    """Return how much of the variances of :func:`scatter` is left in the mean over keyframes: 1 if they see the same.
+    """Return the shares (4,) of the variances of :func:`scatter` that remain in the mean over keyframes.
 
-    Keyframes see much of the same surroundings, and a place that fits by chance goes on to fit: so much is measured, at
-    places that are wrong. It is what is left of all places' variance, or of that of their tail, whichever is more.
+    Keyframes see much of the same surroundings, and a place that fits by chance goes on to fit. The share is measured
+    at wrong places, from the variance of all of them and of their tail; the larger counts. 1: all see the same.
 
     Args:
-        observed: (N, W, 7) at the same chance places by W keyframes.
+        observed: (N, W, 7) observations of W keyframes at the same chance places.
     """
     count, width = observed.shape[:2]
     if count < _MANY or width < 2:
         return np.ones(4)
-    each = np.stack([_compared(observed[:, k]) for k in range(width)])
-    whole = each.mean(axis=0).var(axis=0) / np.maximum(each.var(axis=1).mean(axis=0), 1e-9)
-    every = np.mean([scatter(observed[:, k]) for k in range(width)], axis=0)
-    return np.asarray(np.clip(np.maximum(whole, scatter(observed.mean(axis=1)) / every), 1.0 / width, 1.0))
+    shares = np.stack([_compared(observed[:, k]) for k in range(width)])
+    whole = shares.mean(axis=0).var(axis=0) / np.maximum(shares.var(axis=1).mean(axis=0), 1e-9)
+    single = np.mean([scatter(observed[:, k]) for k in range(width)], axis=0)
+    return np.asarray(np.clip(np.maximum(whole, scatter(observed.mean(axis=1)) / single), 1.0 / width, 1.0))
 
 
 def _compared(observed: Floats32) -> Floats:
@@ -119,14 +119,14 @@ def _compared(observed: Floats32) -> Floats:
     return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
 
 
-def estimate_background(now: Floats32, variance: Floats, kept: Floats32, most: Most | None = None) -> Background:
+def estimate_background(now: Floats32, variance: Floats, followed: Floats32, most: Most | None = None) -> Background:
     """Estimate the background from chance places.
 
     Args:
-        now: (N, 7) the newest keyframe's observations at them.
+        now: (N, 7) the newest keyframe's observations there.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        kept: (K, 7) mean observations, over the keyframes, at those of them that are followed.
-        most: how many independent observations there can be.
+        followed: (K, 7) mean observations over the keyframes at the followed ones.
+        most: limits of the number of independent observations.
     """
     most = most or Most()
     counts = outcomes(now)
@@ -137,17 +137,17 @@ def estimate_background(now: Floats32, variance: Floats, kept: Floats32, most: M
     chance = np.append(np.cumsum(structure[:3]), passed)
     chance = chance * (1.0 - chance)
     count = np.where(np.isfinite(variance), len(now), 0)
-    seen = np.where(np.isfinite(variance), variance, 0.0)
+    measured = np.where(np.isfinite(variance), variance, 0.0)
     presumed = chance / _PSEUDO_NUMBER
-    number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO))
+    number = _CALIBRATED * chance / ((count * measured + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
     both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
-    return Background(structure, passed, _beta(now, kept), both)
+    return Background(structure, passed, _beta(now, followed), both)
 
 
-def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:
+def _beta(now: Floats32, followed: Floats32) -> tuple[float, float]:
     """Fit a Beta distribution to the shares of the ground by their mean and variance."""
-    both = np.concatenate([now, kept])
+    both = np.concatenate([now, followed])
     shares = np.clip(both[:, Share.GROUND] / np.maximum(both[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
     shares = np.concatenate([shares, np.linspace(0.0, 1.0, round(_PSEUDO))])
     mean = float(np.clip(shares.mean(), 0.02, 0.98))
@@ -159,7 +159,7 @@ def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:
 def observe_with_background(
     field: kernels.FieldMap, scan: ObservedScan, T_map_odom: Floats
 ) -> tuple[Floats32, Background]:
-    """Observe the map from poses (P, 4, 4) as they are, and measure the background around the first of them.
+    """Observe the map from poses (P, 4, 4), and measure the background around the first.
 
     Returns:
         Observations (P, 7), see :class:`~coview_stream.localization.evidence.observation.Share`, and the background.
@@ -171,7 +171,7 @@ def observe_with_background(
 
 
 def chance_places(pose: Floats) -> Floats:
-    """Return poses (H, 4), x, y, z and heading, in rings around one (4,), turned a little."""
+    """Return poses (H, 4), x, y, z and heading, in rings around a pose (4,), turned a little."""
     ring, spoke = (index.ravel() for index in np.indices((len(_RINGS), _SPOKES)))
     angle = 2.0 * np.pi * (spoke + 0.5 * (ring % 2)) / _SPOKES
     radius, turn = np.take(_RINGS, ring), np.take(_TURNS, (ring + spoke) % len(_TURNS))

@@ -159,15 +159,15 @@ def _pairs(
 ) -> _Pairs | None:
     """Find pairs at a pose and sum up what they say, both kinds weighing the same; None where they are too few."""
     gicp, moved_pivot = library(), T[:3, :3] @ pivot + T[:3, 3]
-    H, b, kept, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
+    H, b, pairs, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     points = sum(len(kind.points) for kind in clouds)
     for kind in clouds:
         distance, partner = kernels.nearest(grid, kind.points, radius, T)
-        found = distance[np.isfinite(distance)]
-        if not len(found):
+        distances = distance[np.isfinite(distance)]
+        if not len(distances):
             continue
-        number = max(1, int(keep * len(found)))
-        farthest = min(radius, float(np.partition(found, number - 1)[number - 1]) + _ROUNDING)
+        number = max(1, int(keep * len(distances)))
+        farthest = min(radius, float(np.partition(distances, number - 1)[number - 1]) + _ROUNDING)
         answer = gicp.align(
             target.cloud, kind.cloud, target.tree, T, registration_type="GICP",
             max_correspondence_distance=farthest, num_threads=1, max_iterations=1,
@@ -182,9 +182,9 @@ def _pairs(
         H_along, b_along = point_to_point_system(moved, gap, moved_pivot)
         H = H + weight * _INFORMATION * (H_kind - _ALONG * H_along)
         b = b + weight * _INFORMATION * (b_kind - _ALONG * b_along)
-        kept += len(near)
+        pairs += len(near)
         squares, weights = squares + weight * float(residual @ residual), weights + weight * len(near)
-    return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= MIN_PAIRS else None
+    return _Pairs(H, b, pairs, float(np.sqrt(squares / weights))) if pairs >= MIN_PAIRS else None
 
 
 def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, Floats]:
@@ -227,9 +227,9 @@ def _with_pivot(T: npt.ArrayLike, pivot: Floats) -> Pose:
     return there
 
 
-def point_to_point_system(moved_points: Floats, gap: Floats, about: Floats) -> tuple[Floats, Floats]:
+def point_to_point_system(moved_points: Floats, gap: Floats, pivot: Floats) -> tuple[Floats, Floats]:
     """Hessian and gradient of |gap|^2 / 2 of pairs: points (N, 3) in the map, gaps (N, 3), the moved pivot (3,)."""
-    a = moved_points - about
+    a = moved_points - pivot
     H, b = np.zeros((6, 6)), np.zeros(6)
     H[:3, :3] = np.einsum("ij,ij->", a, a) * np.eye(3) - a.T @ a
     H[:3, 3:] = skew(a.sum(axis=0))

@@ -61,7 +61,7 @@ class RegistrationCloud:
         """The points above the ground and those on it as GICP takes them, what there is of them."""
         from coview_stream.localization.registration.gicp import surfaces
 
-        kinds = [surfaces(self.points[some]) for some in (self.above, ~self.above)]
+        kinds = [surfaces(self.points[rows]) for rows in (self.above, ~self.above)]
         return [kind for kind in kinds if kind is not None]
 
 

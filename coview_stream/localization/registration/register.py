@@ -108,16 +108,16 @@ def register(
             _kernel_scales(scales, config, 1), keep=config.keep, iterations=steps, prior=belief,
         )  # fmt: skip
     else:
-        every = max(1, len(source.points) // _COARSE_POINTS)
+        stride = max(1, len(source.points) // _COARSE_POINTS)
         alignment = kernels.align_planes(
             target.grid, target.normals, source.points, source.above, T_map_source, pivot,
-            _kernel_scales(scales, config, every), keep=config.keep, iterations=steps, min_pairs=MIN_PAIRS,
+            _kernel_scales(scales, config, stride), keep=config.keep, iterations=steps, min_pairs=MIN_PAIRS,
             prior=belief,
         )  # fmt: skip
     return None if alignment is None else Registration(*alignment)
 
 
-def _kernel_scales(scales: tuple[float, ...], config: RegistrationConfig, every: int) -> list[kernels.Scale]:
+def _kernel_scales(scales: tuple[float, ...], config: RegistrationConfig, stride: int) -> list[kernels.Scale]:
     """Return the scales as the kernel takes them.
 
     All but the last end early and make do with one of ``every`` points, as the next one goes on from there.
@@ -129,7 +129,7 @@ def _kernel_scales(scales: tuple[float, ...], config: RegistrationConfig, every:
             max(config.residual_scale, _WIDTH_SHARE * scale),
             _STOP_SHIFT if k == last else max(_STOP_SHIFT, _COARSE_SHIFT * scale),
             _STOP_TURN if k == last else max(_STOP_TURN, _COARSE_TURN * scale),
-            1 if k == last else every,
+            1 if k == last else stride,
         )
         for k, scale in enumerate(scales)
     ]

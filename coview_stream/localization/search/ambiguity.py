@@ -118,19 +118,19 @@ def ambiguity(
     """
     rehearsal = _Rehearsal(base_map, config or LocalizerConfig(), changed)
     station = sample(base_map, count)
-    begun = [rehearsal.begin(int(each)) for each in _counted(station, progress)]
-    waiting = np.flatnonzero([not each.found and not each.wrong for each in begun])
-    tried = waiting[np.linspace(0, len(waiting) - 1, min(_DRIVES, len(waiting))).round().astype(np.int64)]
-    drive = np.where([each.found for each in begun], 0.0, np.inf)
-    wrong = np.array([each.wrong for each in begun], dtype=bool)
-    for k in _counted(tried, progress):
+    trials = [rehearsal.begin(int(trial)) for trial in _counted(station, progress)]
+    waiting = np.flatnonzero([not trial.found and not trial.wrong for trial in trials])
+    driven_rows = waiting[np.linspace(0, len(waiting) - 1, min(_DRIVES, len(waiting))).round().astype(np.int64)]
+    drive = np.where([trial.found for trial in trials], 0.0, np.inf)
+    wrong = np.array([trial.wrong for trial in trials], dtype=bool)
+    for k in _counted(driven_rows, progress):
         drive[k], wrong[k] = rehearsal.drive(int(station[k]))
     position = base_map.stations[station].astype(np.float64)
-    for k in np.setdiff1d(waiting, tried):
-        drive[k] = drive[tried[np.argmin(np.linalg.norm(position[tried] - position[k], axis=1))]]
-    values = np.array([(each.evidence, each.lead, each.error) for each in begun]).reshape(-1, 3)
+    for k in np.setdiff1d(waiting, driven_rows):
+        drive[k] = drive[driven_rows[np.argmin(np.linalg.norm(position[driven_rows] - position[k], axis=1))]]
+    values = np.array([(trial.evidence, trial.lead, trial.error) for trial in trials]).reshape(-1, 3)
     evidence, lead, error = values.T
-    driven = ~np.isin(np.arange(len(station)), np.setdiff1d(waiting, tried))
+    driven = ~np.isin(np.arange(len(station)), np.setdiff1d(waiting, driven_rows))
     return Ambiguity(
         station,
         position,
@@ -161,8 +161,8 @@ def sample(base_map: BaseMap, count: int) -> Indices:
 
 
 def _counted(items: Indices, progress: Progress | None) -> Iterator[int]:
-    for done, each in enumerate(items.tolist()):
-        yield each
+    for done, item in enumerate(items.tolist()):
+        yield item
         if progress is not None:
             progress(done + 1, len(items))
 
@@ -204,9 +204,9 @@ class _Rehearsal:
         if self.begin(station).wrong:
             return np.inf, True
         for metres, place in self._way(self.base_map.stations[station].astype(np.float64)):
-            seen = self._look(place, int(self.base_map.station_grid.at(place[None])[0]))
-            if seen.found or seen.wrong:
-                return (metres, False) if seen.found else (np.inf, True)
+            trial = self._look(place, int(self.base_map.station_grid.at(place[None])[0]))
+            if trial.found or trial.wrong:
+                return (metres, False) if trial.found else (np.inf, True)
         return np.inf, False
 
     def _look(self, place: Floats, station: int) -> _Seen:
@@ -214,12 +214,15 @@ class _Rehearsal:
         scan = self._scan(place)
         if scan is None:
             return _Seen(False, False, 0.0, 0.0, 1.0)
-        query = {name: own.astype(np.float32) for name, own in station_descriptors(self.base_map, station).items()}
+        query = {
+            name: descriptor.astype(np.float32)
+            for name, descriptor in station_descriptors(self.base_map, station).items()
+        }
         self._consensus.vote(self.base_map.stations[station].astype(np.float64), query)
-        named = self._consensus.hypotheses()
-        beside = np.tile(np.eye(4), (len(AROUND), 1, 1))
-        beside[:, :2, 3] = AROUND
-        others = [*named, *(Hypothesis(T, station, 0, 0.0) for T in beside)]
+        voted = self._consensus.hypotheses()
+        shifted = np.tile(np.eye(4), (len(AROUND), 1, 1))
+        shifted[:, :2, 3] = AROUND
+        others = [*voted, *(Hypothesis(T, station, 0, 0.0) for T in shifted)]
         scored = self._scorer.score([Hypothesis(np.eye(4), station, 0, 0.0), *others], range(len(others) + 1), 0, scan)
         return _judged(scored, scan.T_odom_body[:3, 3], self.config.acceptance.risk)
 
@@ -256,8 +259,8 @@ class _Rehearsal:
             if before is not None and abs((heading - before + np.pi) % (2.0 * np.pi) - np.pi) > _SHARPEST:
                 continue
             along = np.array([np.cos(heading), np.sin(heading)])
-            ahead, beside = obstacle @ along, obstacle @ (-along[1], along[0])
-            blocking = ahead[(np.abs(beside) < _HALF_WIDTH) & (ahead > 0.0)]
+            ahead, across = obstacle @ along, obstacle @ (-along[1], along[0])
+            blocking = ahead[(np.abs(across) < _HALF_WIDTH) & (ahead > 0.0)]
             free = min(metres, float(blocking.min(initial=np.inf)) - _HALF_WIDTH)
             ways = self._with_stations(place, along, int(free / _STEP))
             if len(ways) > len(best):
@@ -283,13 +286,13 @@ def _judged(scored: Scored, body: Floats, risk: float) -> _Seen:
     right = [_is_right(place, body) for place in scored.places]
     if not scored.places:
         return _Seen(False, False, 0.0, 0.0, 1.0)
-    own = max((p.ratio for p, yes in zip(scored.places, right, strict=True) if yes), default=0.0)
+    true_ratio = max((p.ratio for p, yes in zip(scored.places, right, strict=True) if yes), default=0.0)
     rival = max((p.ratio for p, yes in zip(scored.places, right, strict=True) if not yes), default=0.0)
-    sure = scored.error < risk
+    certain = scored.error < risk
     error = scored.error if right[0] else 1.0 - sum(
         p.probability for p, yes in zip(scored.places, right, strict=True) if yes
     )  # fmt: skip
-    return _Seen(sure and right[0], sure and not right[0], own, own - max(rival, 0.0), error)
+    return _Seen(certain and right[0], certain and not right[0], true_ratio, true_ratio - max(rival, 0.0), error)
 
 
 def _is_right(place: Hypothesis, body: Floats) -> bool:
@@ -312,13 +315,13 @@ def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: Registr
         config: how scans are thinned.
     """
     near = base_map.crop(eye, _RANGE + _MOVED[1])[0]
-    seen = _in_view(_rearranged(near, changed) - eye.astype(np.float32))
-    if not len(seen):
+    visible = _in_view(_rearranged(near, changed) - eye.astype(np.float32))
+    if not len(visible):
         return None
-    seen += np.random.default_rng(0).normal(0.0, _NOISE, seen.shape).astype(np.float32)
-    cloud = prepare_scan(seen + eye.astype(np.float32), eye, config)
+    visible += np.random.default_rng(0).normal(0.0, _NOISE, visible.shape).astype(np.float32)
+    cloud = prepare_scan(visible + eye.astype(np.float32), eye, config)
     # a single return says nothing about a direction, where a lidar would have several
-    return ObservedScan.of(cloud, np.repeat(seen, 2, axis=0), pose_from(np.eye(3), eye))
+    return ObservedScan.of(cloud, np.repeat(visible, 2, axis=0), pose_from(np.eye(3), eye))
 
 
 def _rearranged(points: Points, changed: float) -> Points:

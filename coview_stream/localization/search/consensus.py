@@ -153,15 +153,15 @@ class Consensus:
         """Add one keyframe's vote: on the known places, and with all older votes on the places that it names."""
         column = (self._votes[-1][0] + 1) % self.config.window if self._votes else 0
         self._votes.append((column, vote))
-        known, named = self._moved(self._places, vote), self._named(vote)
-        requests = [Request(vote, places.station, places.shift) for places in (known, named)]
-        targets = [places.votes[:, column] for places in (known, named)]
+        followed, added = self._moved(self._places, vote), self._named(vote)
+        requests = [Request(vote, places.station, places.shift) for places in (followed, added)]
+        targets = [places.votes[:, column] for places in (followed, added)]
         for other, older in list(self._votes)[:-1]:
-            requests.append(Request(older, self.grid.at(self._positions(named, older)), named.shift))
-            targets.append(named.votes[:, other])
+            requests.append(Request(older, self.grid.at(self._positions(added, older)), added.shift))
+            targets.append(added.votes[:, other])
         for target, scores in zip(targets, vote.at_all(requests), strict=True):
             target[:] = scores
-        places = known + named
+        places = followed + added
         order = np.argsort(places.votes.sum(axis=1), kind="stable")
         _, first = np.unique(self._bins(places, vote)[order], return_index=True)
         self._places = places[order[np.sort(first)[: _KEPT * self.config.peaks]]]
@@ -204,8 +204,8 @@ class Consensus:
         """Return known places at the stations of a new keyframe, whose height they follow."""
         position = self._positions(places, vote)
         station = self.grid.at(position)
-        known = station >= 0
-        places.offset[known, 2] += self.grid.stations[station[known], 2] - position[known, 2]
+        on_map = station >= 0
+        places.offset[on_map, 2] += self.grid.stations[station[on_map], 2] - position[on_map, 2]
         return _Places(places.shift, places.offset, station, places.votes)
 
     def _named(self, vote: Vote) -> _Places:

@@ -51,7 +51,7 @@ class GlobalSearch:
         index = index or SearchIndex.of(base_map, config)
         self.coview, self.learned = _recognizers(base_map, config, index)
         self._recognizers: list[CoViewRecognizer | PlaceRecognizer] = [
-            each for each in (self.coview, self.learned) if each is not None
+            recognizer for recognizer in (self.coview, self.learned) if recognizer is not None
         ]
         self._local_maps = local_maps
         self._index = index
@@ -108,11 +108,11 @@ class GlobalSearch:
         cloud = prepare_scan(request.submap, request.position, self.config.registration)
         scan = ObservedScan.of(cloud, request.cloud, request.T_odom_body)
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
-        named, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
+        voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request, scan)
-        named, ranks = [*named, *guessed], [*ranks, *range(len(guessed))]
+        voted, ranks = [*voted, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
-        scored = self._scorer.score([*named, *hints], ranks, len(hints), scan)  # against chance, all keyframes
+        scored = self._scorer.score([*voted, *hints], ranks, len(hints), scan)  # against chance, all keyframes
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         self._note_hints(scored, hints, request)
         undecided = 0.0
@@ -134,7 +134,9 @@ class GlobalSearch:
     def _propose(self) -> tuple[list[Hypothesis], list[int]]:
         """Return the hypotheses of the votes, and the rank of each in its recognizer's votes."""
         lists = [recognizer.hypotheses() for recognizer in self._recognizers]
-        return [place for named in lists for place in named], [rank for named in lists for rank in range(len(named))]
+        return [place for ranked in lists for place in ranked], [
+            rank for ranked in lists for rank in range(len(ranked))
+        ]
 
     def _guessed(self, request: SearchRequest, scan: ObservedScan) -> list[Hypothesis]:
         """Return the best few poses of a guess, on the ground; seldom, once they have been tried.
@@ -146,12 +148,12 @@ class GlobalSearch:
             return []
         self._guesses.tried(refuted=True)
         points = request.scan if len(request.scan) else request.submap
-        named = on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
-        if len(named) <= _GUESSES:
-            return named
-        poses = scan.poses(np.array([each.T_map_odom for each in named]))
+        guesses = on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
+        if len(guesses) <= _GUESSES:
+            return guesses
+        poses = scan.poses(np.array([guess.T_map_odom for guess in guesses]))
         scores = scan.few.look_up(self.base_map.field, poses, Move.FAR).scores
-        return [named[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
+        return [guesses[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
     def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Hypothesis | None:
         """Register the most probable place; None if it comes to another one, or leans."""
@@ -168,7 +170,7 @@ class GlobalSearch:
         if not hints:
             return
         best = max((place.ratio for place in scored.places if place.hinted), default=-math.inf)
-        positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
+        positions = [robot_position(hint.T_map_odom, request.T_odom_body) for hint in hints]
         # where the map knows nothing, a keyframe does not speak against a hint
         surveyed = all(self.base_map.surveyed(position).all() for position in positions)
         self._hints.tried(refuted=surveyed and best < 0.0)

@@ -64,8 +64,8 @@ class CoViewVote:
         # every station has a heading that is no worse than the best one of the last
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
         here = scores[station, shift]
-        left, right = scores[station, shift - 1], scores[station, (shift + 1) % self.sectors]
-        peaks = np.flatnonzero((here < left) & (here <= right))
+        previous, following = scores[station, shift - 1], scores[station, (shift + 1) % self.sectors]
+        peaks = np.flatnonzero((here < previous) & (here <= following))
         chosen = peaks[argsmallest(here[peaks], int(count * _PER_STATION))]
         return stations[station[chosen]], shift[chosen]
 

@@ -169,14 +169,14 @@ class PlaceScorer:
             scan: the keyframe's.
         """
         followed, voted = self._followed, len(hypotheses) - hints
-        known = len(followed.hypotheses)
+        count = len(followed.hypotheses)
         all_hypotheses = [
             *followed.hypotheses, *hypotheses[:voted], *self._around_leader(), *hypotheses[voted:]
         ]  # fmt: skip
         ranks = np.full(len(all_hypotheses), len(all_hypotheses))
-        ranks[:known] = followed.votes + 1
-        ranks[known : known + voted] = votes[:voted]
-        observed = self._observe(scan, known, all_hypotheses)
+        ranks[:count] = followed.votes + 1
+        ranks[count : count + voted] = votes[:voted]
+        observed = self._observe(scan, count, all_hypotheses)
         followed = self._follow(scan, observed, all_hypotheses, ranks, hints)
         first = observed.first
         ratios = self._evidence(followed, observed, scan)
@@ -220,13 +220,16 @@ class PlaceScorer:
         T[:, :2, 3] += AROUND
         return [Hypothesis(pose) for pose in T]
 
-    def _observe(self, scan: ObservedScan, known: int, hypotheses: list[Hypothesis]) -> _Observed:
+    def _observe(self, scan: ObservedScan, followed: int, hypotheses: list[Hypothesis]) -> _Observed:
         """Observe the map from hypotheses; the first ``known`` are followed and hardly drift."""
         if not hypotheses:
             nothing = np.empty((0, len(Share)), dtype=np.float32)
             return _Observed(np.empty((0, 4)), nothing, np.empty(0, dtype=np.float32), [])
-        start, layers = scan.poses(np.array([each.T_map_odom for each in hypotheses])), self._base_map.field
-        parts = scan.few.look_up(layers, start[:known], Move.NEAR), scan.few.look_up(layers, start[known:], Move.FAR)
+        start, layers = scan.poses(np.array([hypothesis.T_map_odom for hypothesis in hypotheses])), self._base_map.field
+        parts = (
+            scan.few.look_up(layers, start[:followed], Move.NEAR),
+            scan.few.look_up(layers, start[followed:], Move.FAR),
+        )
         poses, shares, scores = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "shares", "scores")
         )
@@ -242,25 +245,27 @@ class PlaceScorer:
     ) -> _Followed:
         """Choose the places to follow: the best now, the best so far, and those that hints came to."""
         before = self._followed
-        known = len(before.votes)
+        count = len(before.votes)
         T = scan.transforms(observed.poses)
         chosen, origins = [], []
         for number, group in enumerate(observed.groups):
             origin = min(group)
             hinted = hints > 0 and max(group) >= len(hypotheses) - hints
-            if number < _FOLLOWED or origin < min(_KEPT, known) or hinted:
+            if number < _FOLLOWED or origin < min(_KEPT, count) or hinted:
                 # the votes for the place, if it has any: a hint that came to it takes none away
-                named = next((hypotheses[k] for k in group if hypotheses[k].station is not None), hypotheses[group[0]])
-                chosen.append((group, replace(named, T_map_odom=T[group[0]], hinted=hinted)))
-                origins.append(origin if origin < known else -1)
+                hypothesis = next(
+                    (hypotheses[k] for k in group if hypotheses[k].station is not None), hypotheses[group[0]]
+                )
+                chosen.append((group, replace(hypothesis, T_map_odom=T[group[0]], hinted=hinted)))
+                origins.append(origin if origin < count else -1)
         newest = np.array([group[0] for group, _ in chosen], dtype=np.int64)
         votes = np.array([min(ranks[group].min(), len(observed.groups) - 1) for group, _ in chosen], dtype=np.int64)
-        past = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
+        history = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
-            past[row >= 0] = before.observed[row[row >= 0]]
-            past[row < 0] = self._look_back(T[newest[row < 0]])
-        shares = np.concatenate([past, observed.shares[newest][:, None]], axis=1)
+            history[row >= 0] = before.observed[row[row >= 0]]
+            history[row < 0] = self._look_back(T[newest[row < 0]])
+        shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
         return _Followed([place for _, place in chosen], votes, shares, newest)
 
     def _look_back(self, T_map_odom: Floats) -> Floats32:
@@ -279,30 +284,30 @@ class PlaceScorer:
             self._scatter.append(np.full(4, np.nan))
             return np.empty(0)
         scans = [*self._scans, scan]
-        structure, free = np.mean([each.patches for each in scans], axis=0)
+        structure, free = np.mean([at.patches for at in scans], axis=0)
         most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
-        chance, kept = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
+        chance, distant = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
         self._scatter.append(scatter(observed.shares[first]))
         sample, over_time = self._over_time(observed, first, scan)
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             spread = np.mean(measured, axis=0) * left_in_mean(over_time[chance[sample]])
-            background = estimate_background(observed.shares[first][chance], spread, mean[kept], most)
+            background = estimate_background(observed.shares[first][chance], spread, mean[distant], most)
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
             # places around the leader share what it explains
-            chance, kept = (_apart(each, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for each in (places, poses))
+            chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
         return ratios
 
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
         """Return a sample (N,) of the places, and the observations (N, W, 7) of all keyframes there."""
         sample = np.linspace(0, len(first) - 1, min(len(first), _CHANCE)).astype(np.int64)
-        past = self._look_back(scan.transforms(observed.poses[first[sample]]))
-        return sample, np.concatenate([past, observed.shares[first[sample]][:, None]], axis=1)
+        history = self._look_back(scan.transforms(observed.poses[first[sample]]))
+        return sample, np.concatenate([history, observed.shares[first[sample]][:, None]], axis=1)
 
 
 def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bools:

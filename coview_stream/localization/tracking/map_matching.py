@@ -69,25 +69,25 @@ def find_rivals(
     level = config.gravity_sigma**-2
     cloud = scan.cloud.every(_EVERY)
     upright, scales = np.diag([level, level, 0.0, 0.0, 0.0, 0.0]), tuple(s for s in config.search if s <= _WIDEST)
-    taken, found = [here], [T_map_odom]
+    tried, transforms = [here], [T_map_odom]
     for _ in range(count):
-        ratios[np.linalg.norm(poses[:, :2] - taken[-1][:2], axis=1) < 0.5 * ALERT_METRES] = -np.inf
+        ratios[np.linalg.norm(poses[:, :2] - tried[-1][:2], axis=1) < 0.5 * ALERT_METRES] = -np.inf
         best = int(ratios.argmax())
         if not np.isfinite(ratios[best]):
             break
-        taken.append(poses[best])
+        tried.append(poses[best])
         start = scan.transforms(poses[best][None])[0]
         settings = (config, scales or config.search[-1:], Prior(start, upright), T_odom_body[:3, 3])
         other = register(cloud, start, target, *settings)
         if other is None:
             continue
         T = other.T_map_source
-        if all(_beside(T @ T_odom_body, each @ T_odom_body) for each in found):
-            found.append(T)
-    if len(found) == 1:
+        if all(_beside(T @ T_odom_body, T_other @ T_odom_body) for T_other in transforms):
+            transforms.append(T)
+    if len(transforms) == 1:
         return []
-    ratio = place.ratios(scan, np.stack(found))
-    return [Rival(found[k], float(ratio[k])) for k in np.argsort(-ratio, kind="stable") if k]
+    ratio = place.ratios(scan, np.stack(transforms))
+    return [Rival(transforms[k], float(ratio[k])) for k in np.argsort(-ratio, kind="stable") if k]
 
 
 def _beside(T_map_body: Pose, T_map_other: Pose) -> bool:
@@ -170,7 +170,7 @@ class MapMatcher:
         target: LocalMap,
         scales: tuple[float, ...],
         predicted: Estimate,
-        beside: int = 1,
+        rivals_wanted: int = 1,
     ) -> MapMatch:
         """Register (eq. 13), verify and judge; where registration fails, the belief stays.
 
@@ -180,7 +180,7 @@ class MapMatcher:
             target: the map around it.
             scales: largest correspondence distance of each scale, metres.
             predicted: pose and covariance by the graph, which the innovation is measured from.
-            beside: so many rivals at most are looked for.
+            rivals_wanted: largest number of rivals to search for.
         """
         settings, acceptance = self.config.registration, self.config.acceptance
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
@@ -190,26 +190,26 @@ class MapMatcher:
         prior = Prior(T_start, information)
         registration = register(scan.cloud, T_start, target, settings, scales, prior, scan.body)
         T_map_odom = T_start if registration is None else registration.T_map_source
-        seen, evidence = self.place.observe(scan, T_map_odom), scan.evidence(self.base_map.field, T_map_odom)
-        rivals = find_rivals(self.place, scan, T_map_odom, target, settings, beside) if beside else []
-        seen = replace(seen, rival=max([0.0, *(rival.ratio for rival in rivals)]))
-        cause, reason = self._judge(seen, evidence)
+        observation, evidence = self.place.observe(scan, T_map_odom), scan.evidence(self.base_map.field, T_map_odom)
+        rivals = find_rivals(self.place, scan, T_map_odom, target, settings, rivals_wanted) if rivals_wanted else []
+        observation = replace(observation, rival=max([0.0, *(rival.ratio for rival in rivals)]))
+        cause, reason = self._judge(observation, evidence)
         if registration is None:
             if cause is RejectionReason.VERIFIED:
-                return _failed(belief, "too few points have a partner in the map", evidence, seen)
-            return MapMatch.without_registration(MatchVerdict(cause, reason, evidence, None, seen), belief)
+                return _failed(belief, "too few points have a partner in the map", evidence, observation)
+            return MapMatch.without_registration(MatchVerdict(cause, reason, evidence, None, observation), belief)
         tilt = tilt_of(T_map_odom)
         if tilt > acceptance.max_tilt:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
             T_map_body = T_map_odom @ scan.T_odom_body
-            own = remove_prior(T_map_body, registration.information, belief.T_map_body, information, settings)
-            covariance = registration_covariance(own.information, settings)
-            innovation = predicted.innovation(own.T_map_body, covariance)
+            measured = remove_prior(T_map_body, registration.information, belief.T_map_body, information, settings)
+            covariance = registration_covariance(measured.information, settings)
+            innovation = predicted.innovation(measured.T_map_body, covariance)
         except InputError as error:
-            return _failed(belief, str(error), evidence, seen)
-        verdict = MatchVerdict(cause, reason, evidence, innovation, seen)
-        return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target, tuple(rivals))
+            return _failed(belief, str(error), evidence, observation)
+        verdict = MatchVerdict(cause, reason, evidence, innovation, observation)
+        return MapMatch(verdict, measured.T_map_body, covariance, innovation, scan, target, tuple(rivals))
 
     def match_widely(
         self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, predicted: Estimate
@@ -228,17 +228,23 @@ class MapMatcher:
         """
         scales = self.config.registration.search[1:]
         tries = [first, self.match(scan, belief, target, scales, predicted, _MAX_RIVALS)]
-        rivals = sorted((rival for each in tries for rival in each.rivals), key=lambda rival: -rival.ratio)
+        rivals = sorted((rival for attempt in tries for rival in attempt.rivals), key=lambda rival: -rival.ratio)
         for rival in rivals:
             T_map_body = rival.T_map_odom @ scan.T_odom_body
-            if all(matters(*off_by(each.T_map_body, T_map_body)) for each in tries):
+            if all(matters(*off_by(attempt.T_map_body, T_map_body)) for attempt in tries):
                 start = Estimate(T_map_body, belief.covariance)
                 tries.append(self.match(scan, start, target, scales, predicted, 0))
                 break
-        return [self._against(each, tries) for each in tries]
+        return [self._against(attempt, tries) for attempt in tries]
 
     def against_odometry(
-        self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], led: Pose, belief: Estimate, travelled: float
+        self,
+        match: MapMatch,
+        scan: ObservedScan,
+        tries: list[MapMatch],
+        T_map_predicted: Pose,
+        belief: Estimate,
+        travelled: float,
     ) -> MapMatch:
         """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
@@ -252,16 +258,19 @@ class MapMatcher:
             match: the best of ``tries``.
             scan: the registered one.
             tries: all matches of the scan.
-            led: (4, 4) where odometry leads, or a match that did not contradict it.
+            T_map_predicted: (4, 4) pose by odometry, or by a match that did not contradict it.
             belief: pose and covariance that odometry leads to.
             travelled: metres driven.
         """
         rule = self.config.acceptance
         plausible = match.innovation <= rule.max_innovation
-        metres, degrees = off_by(match.T_map_body, led)
+        metres, degrees = off_by(match.T_map_body, T_map_predicted)
         if plausible and not matters(metres, degrees):
             return match
-        gap, spread = match.T_map_body[:3, 3] - led[:3, 3], belief.covariance[3:, 3:] + match.covariance[3:, 3:]
+        gap, spread = (
+            match.T_map_body[:3, 3] - T_map_predicted[:3, 3],
+            belief.covariance[3:, 3:] + match.covariance[3:, 3:],
+        )
         rare = chdtrc(6, rule.max_innovation)  # probability beyond which nothing is plausible
         here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
         if here and not matters(0.0, degrees):
@@ -271,12 +280,12 @@ class MapMatcher:
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]
-            right = self.dispute.settle(scan, led, places, travelled, rule.risk)
+            right = self.dispute.settle(scan, T_map_predicted, places, travelled, rule.risk)
             if right is not None:
                 verified = [other for other in tries if other.verdict.verified]
                 match = min(verified, key=lambda other: off_by(right, other.T_map_body)[0], default=match)
                 moves = not matters(*off_by(right, match.T_map_body))
-                metres, degrees = off_by(match.T_map_body, led)
+                metres, degrees = off_by(match.T_map_body, T_map_predicted)
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         if not moves:
             reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
@@ -286,8 +295,8 @@ class MapMatcher:
     def _against(self, match: MapMatch, others: list[MapMatch]) -> MapMatch:
         """Hold a match against those of the same scan that ended elsewhere."""
         verdict = match.verdict
-        seen, evidence = verdict.observation, verdict.evidence
-        if seen is None or evidence is None or match.scan is None:
+        observation, evidence = verdict.observation, verdict.evidence
+        if observation is None or evidence is None or match.scan is None:
             return match
         elsewhere = [
             other.verdict.observation.ratio
@@ -295,26 +304,26 @@ class MapMatcher:
             if other.scan is not None and other.verdict.observation is not None
             and matters(*off_by(other.T_map_body, match.T_map_body))
         ]  # fmt: skip
-        seen = replace(seen, rival=max([seen.rival, *elsewhere]))
-        verdict = replace(verdict, observation=seen)
+        observation = replace(observation, rival=max([observation.rival, *elsewhere]))
+        verdict = replace(verdict, observation=observation)
         if verdict.verified:
-            cause, reason = self._judge(seen, evidence)
+            cause, reason = self._judge(observation, evidence)
             verdict = replace(verdict, cause=cause, reason=reason)
         return replace(match, verdict=verdict)
 
-    def _judge(self, seen: Observation, evidence: Evidence) -> tuple[RejectionReason, str]:
+    def _judge(self, observation: Observation, evidence: Evidence) -> tuple[RejectionReason, str]:
         """Judge a scan at a pose: a cause, and a clause."""
-        if seen.against_elsewhere > 0.0:
+        if observation.against_elsewhere > 0.0:
             return RejectionReason.VERIFIED, "verified"
-        if seen.ratio > 0.0:
+        if observation.ratio > 0.0:
             return RejectionReason.FITNESS, "what is seen fits as well metres beside"
         return self.baseline.explain(evidence)
 
 
 def _failed(
-    belief: Estimate, reason: str, evidence: Evidence | None = None, seen: Observation | None = None
+    belief: Estimate, reason: str, evidence: Evidence | None = None, observation: Observation | None = None
 ) -> MapMatch:
-    verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence, None, seen)
+    verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence, None, observation)
     return MapMatch.without_registration(verdict, belief)
 
 

@@ -92,9 +92,9 @@ class DriftEstimator:
         """The rates as they seem to be now."""
         factors = np.sqrt(np.clip(self._sums / self._metres, _MIN_FACTOR**2, _MAX_FACTOR**2))
         tilt, yaw, position, height = factors.tolist()
-        known = self._nominal
+        base = self._nominal
         return Drift(
-            position * known.position, height * known.height, tilt * known.tilt, yaw * known.yaw, yaw * known.turn
+            position * base.position, height * base.height, tilt * base.tilt, yaw * base.yaw, yaw * base.turn
         )  # fmt: skip
 
     def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
@@ -109,7 +109,7 @@ class DriftEstimator:
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
         # one by one less than nothing at times; only so is their mean right
-        seen = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
+        squares = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
             if driven < _MIN_STEP and rows != [2]:
@@ -119,7 +119,7 @@ class DriftEstimator:
             # by how much it can tell: a registration that hardly knows a direction says nothing of its drift
             weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
             fade = exp(-weight / self._config.drift_memory)
-            ratio = float((seen[rows] / nominal[rows]).mean())
+            ratio = float((squares[rows] / nominal[rows]).mean())
             self._sums[group] = fade * self._sums[group] + weight * ratio
             self._metres[group] = fade * self._metres[group] + weight
 

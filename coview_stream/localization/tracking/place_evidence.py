@@ -48,8 +48,8 @@ class Observation:
     @property
     def against_elsewhere(self) -> float:
         """Log-likelihood ratio of "the robot is here" against "it is metres beside, or anywhere"."""
-        beside = math.log(_BESIDE) + max(self.rival, 0.0)
-        return self.ratio - float(np.logaddexp(math.log1p(-_BESIDE), beside))
+        rival = math.log(_BESIDE) + max(self.rival, 0.0)
+        return self.ratio - float(np.logaddexp(math.log1p(-_BESIDE), rival))
 
 
 class _Around(NamedTuple):
@@ -109,8 +109,8 @@ class PlaceEvidence:
     def _ratios(self, likelihoods: Floats) -> Floats:
         """Return the log-likelihood ratios (P,) with the nuisances that are presumed."""
         top = likelihoods.max(axis=(1, 2, 3))
-        each = self._presumed() * np.exp(likelihoods - top[:, None, None, None])
-        return np.asarray(top + np.log(each.sum(axis=(1, 2, 3))))
+        weighted = self._presumed() * np.exp(likelihoods - top[:, None, None, None])
+        return np.asarray(top + np.log(weighted.sum(axis=(1, 2, 3))))
 
     def _presumed(self) -> Floats:
         """Return the probabilities (Q, D, L) of the nuisances at the next registration."""

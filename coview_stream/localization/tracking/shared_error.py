@@ -97,12 +97,12 @@ def clustered_covariance(
     return np.asarray(inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 6))
 
 
-def _equal_weights(found: Bools, above: Bools) -> Floats:
+def _equal_weights(paired: Bools, above: Bools) -> Floats:
     """Weights (N,) of points: 0 for those without a partner, and equal sums for both kinds."""
-    weights = np.zeros(len(found))
+    weights = np.zeros(len(paired))
     for kind in (above, ~above):
-        some = kind & found
-        weights[some] = 1.0 / max(1, int(some.sum()))
+        rows = kind & paired
+        weights[rows] = 1.0 / max(1, int(rows.sum()))
     return weights
 
 

@@ -76,9 +76,9 @@ class Dispute:
         np.maximum.at(self._newest, owners[1:], ratios[len(self._poses) :])
         total = self._before + self._newest
         best = int(total.argmax())
-        here = [each @ scan.T_odom_body for each in self._poses]
+        here = [T @ scan.T_odom_body for T in self._poses]
         # a place near enough to the best contradicts it only if it is odometry's
-        apart = np.array([k == 0 or matters(*off_by(each, here[best])) for k, each in enumerate(here)])
+        apart = np.array([k == 0 or matters(*off_by(T, here[best])) for k, T in enumerate(here)])
         if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):
             return None
         return here[best]
@@ -90,12 +90,12 @@ class Dispute:
             if k == 0:
                 self._poses[:1] = [T @ T_body_odom]
                 self._before = self._before if len(self._before) else np.zeros(1)
-            elif all(matters(*off_by(each @ T_odom_body, T)) for each in self._poses):
+            elif all(matters(*off_by(T_place @ T_odom_body, T)) for T_place in self._poses):
                 self._poses.append(T @ T_body_odom)
                 self._before = np.append(self._before, self._before[0])
         owners = [0]
         for T in T_map_body[1:]:
-            gaps = [off_by(each @ T_odom_body, T) for each in self._poses]
+            gaps = [off_by(T_place @ T_odom_body, T) for T_place in self._poses]
             owners.append(
                 min(range(len(gaps)), key=lambda k: max(gaps[k][0] / ALERT_METRES, gaps[k][1] / ALERT_DEGREES))
             )
@@ -175,6 +175,6 @@ def share_on_map(points: Points, position: Floats, T: Pose, target: LocalMap) ->
     wanted = np.flatnonzero(between & (points[:, 2] > floor + _HEIGHT))
     if len(wanted) < _MIN_POINTS:
         return None
-    some = wanted[np.linspace(0, len(wanted) - 1, min(_POINTS, len(wanted))).astype(np.int64)]
-    distance, _ = kernels.nearest(target.grid, transform(T, points[some]), _REACH)
+    sample = wanted[np.linspace(0, len(wanted) - 1, min(_POINTS, len(wanted))).astype(np.int64)]
+    distance, _ = kernels.nearest(target.grid, transform(T, points[sample]), _REACH)
     return float((distance < _REACH).mean())

@@ -129,14 +129,14 @@ class Tracker:
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.clear()
         self._shared_error.clear()
-        own = registration_covariance(registration.information, self.config.registration)
-        found = T_odom_body if T_odom_found is None else T_odom_found
-        step = registration.T_map_source[:3, :3] @ (T_odom_body[:3, 3] - found[:3, 3])
+        registered = registration_covariance(registration.information, self.config.registration)
+        T_odom_keyframe = T_odom_body if T_odom_found is None else T_odom_found
+        step = registration.T_map_source[:3, :3] @ (T_odom_body[:3, 3] - T_odom_keyframe[:3, 3])
         drifted = self.odometry.drift.covariance(
-            self.odometry.travelled - travelled, abs(yaw_of(inverse(found) @ T_odom_body))
+            self.odometry.travelled - travelled, abs(yaw_of(inverse(T_odom_keyframe) @ T_odom_body))
         )
         drifted += self._calibration.motion_covariance(step)
-        covariance = propagate(own + _START, step) + drifted
+        covariance = propagate(registered + _START, step) + drifted
         self._restart(registration.T_map_source @ T_odom_body, covariance, T_odom_body)
 
     def match_to_map(
@@ -162,9 +162,9 @@ class Tracker:
         points = self.ground.lower(points)
         newest = self._scans.newest
         # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
-        seen = 0 if newest is None else min(len(points.points), len(newest))
-        if seen < _MIN_POINTS:
-            verdict = MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register")
+        count = 0 if newest is None else min(len(points.points), len(newest))
+        if count < _MIN_POINTS:
+            verdict = MatchVerdict(RejectionReason.BLIND, f"only {count} points to register")
             return MapMatch.without_registration(verdict, belief)
         scan = ObservedScan.of(points, self._calibration.calibration.level(cloud), T_odom_body)
         match = self._matcher.match(scan, belief, target, self.config.registration.track, belief)
@@ -174,8 +174,10 @@ class Tracker:
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
             match = max(tries, key=_rank)
         if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
-            led = tries[0] if match.innovation <= limit and not self._disputed else belief
-            return self._matcher.against_odometry(match, scan, tries, led.T_map_body, belief, self.odometry.travelled)
+            predicted = tries[0] if match.innovation <= limit and not self._disputed else belief
+            return self._matcher.against_odometry(
+                match, scan, tries, predicted.T_map_body, belief, self.odometry.travelled
+            )
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
@@ -253,14 +255,14 @@ class Tracker:
     def _learn(self, match: MapMatch, position: Floats) -> None:
         """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat."""
         verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
-        evidence, seen = verdict.evidence, verdict.observation
-        if evidence is None or seen is None or scan is None or target is None or newest is None:
+        evidence, observation = verdict.evidence, verdict.observation
+        if evidence is None or observation is None or scan is None or target is None or newest is None:
             raise ValueError("nothing can be learned from a match without a registration")
         self._doubt = self._matcher.baseline.fallen(evidence)
         self._matcher.baseline.learn(evidence)
         if self.odometry.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
             self._learned_at = self.odometry.travelled
-            self._matcher.place.learn(seen)
+            self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)

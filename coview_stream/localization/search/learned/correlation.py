@@ -89,8 +89,8 @@ def correlate_turned(
     per_block = 8 * len(transforms[0].spectra) * headings
     for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
         if len(group):
-            for each, part in zip(transforms, np.split(scores, len(transforms), axis=2), strict=True):
-                _score(part, group, index, each, min_coverage)
+            for transform, part in zip(transforms, np.split(scores, len(transforms), axis=2), strict=True):
+                _score(part, group, index, transform, min_coverage)
     return np.asarray(scores.transpose(2, 0, 1))
 
 
@@ -209,7 +209,7 @@ def _corners(size: int, yaws: tuple[float, ...]) -> tuple[Ints, Floats32]:
     col = u[..., None] * c + v[..., None] * s + (half + 0.5)
     row = v[..., None] * c - u[..., None] * s + (half + 0.5)
     inside = (np.hypot(u, v) <= half)[..., None]
-    i, j = (np.clip(np.floor(each), 0, size).astype(np.int64) for each in (row, col))
+    i, j = (np.clip(np.floor(position), 0, size).astype(np.int64) for position in (row, col))
     down, right = row - i, col - j
     at = (i * (size + 2) + j).ravel()
     shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]) * inside

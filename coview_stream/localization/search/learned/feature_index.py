@@ -69,8 +69,8 @@ class FeatureIndex:
         self._features = features
         everything = np.arange(len(self))
         bins = block * (block // 2 + 1)
-        kept = bins * self.dimensions * len(self) * 8 <= max_bytes
-        self._spectra = self._block_spectra(everything) if kept else None
+        fits = bins * self.dimensions * len(self) * 8 <= max_bytes
+        self._spectra = self._block_spectra(everything) if fits else None
         self._gapless = np.array([bool(self._cut(self.surveyed, k).all()) for k in everything])
 
     def __len__(self) -> int:
@@ -102,20 +102,20 @@ class FeatureIndex:
     def cells_of(self, block: int | np.integer) -> tuple[slice, slice]:
         """Return the map's rows and columns in the valid part of a block."""
         down, across = divmod(int(block), self.blocks_across)
-        top, left = down * self.valid, across * self.valid
-        return slice(top, min(top + self.valid, self.height)), slice(left, min(left + self.valid, self.width))
+        row, column = down * self.valid, across * self.valid
+        return slice(row, min(row + self.valid, self.height)), slice(column, min(column + self.valid, self.width))
 
     def blocks_near(self, xy: npt.ArrayLike, radius: float) -> Ints:
         """Find the blocks whose valid part has a cell centre within ``radius`` metres of any position (N, 2)."""
         cells = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.corner) / self.cell - 0.5
-        found = []
+        near = []
         for block in range(len(self)):
             rows, cols = self.cells_of(block)
             low, high = np.array([cols.start, rows.start]), np.array([cols.stop - 1, rows.stop - 1])
             gap = np.maximum(np.maximum(low - cells, cells - high), 0.0)
             if (np.hypot(gap[:, 0], gap[:, 1]) * self.cell <= radius).any():
-                found.append(block)
-        return np.array(found, dtype=np.int64)
+                near.append(block)
+        return np.array(near, dtype=np.int64)
 
     def _block_spectra(self, blocks: Ints) -> Complexes:
         out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.dimensions), dtype=np.complex64)
@@ -127,11 +127,11 @@ class FeatureIndex:
     def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> Floats32:
         """Cut the cells (..., block, block) of a block from an image (..., H, W); 0 beyond the map."""
         rows, cols = self.cells_of(block)
-        top, left = rows.start - self.margin, cols.start - self.margin
+        row, column = rows.start - self.margin, cols.start - self.margin
         out = np.zeros((*image.shape[:-2], self.block, self.block), dtype=np.float32)
-        bottom, right = min(top + self.block, self.height), min(left + self.block, self.width)
-        first, second = max(top, 0), max(left, 0)
-        out[..., first - top : bottom - top, second - left : right - left] = image[..., first:bottom, second:right]
+        bottom, right = min(row + self.block, self.height), min(column + self.block, self.width)
+        first, second = max(row, 0), max(column, 0)
+        out[..., first - row : bottom - row, second - column : right - column] = image[..., first:bottom, second:right]
         return out
 
 

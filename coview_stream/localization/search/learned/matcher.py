@@ -172,11 +172,11 @@ class FeatureMatcher:
             inside = self.index.blocks_near((area.x, area.y), area.radius)
             blocks = np.intersect1d(self._feature_blocks, inside)
         coarse = correlate_turned(turned.coarse, self.index, True, blocks)
-        named, groups = self._named(coarse, turned)
+        candidates, groups = self._named(coarse, turned)
         if area is not None:
-            within = area.holds(self.stations[named[0]])
-            named, groups = (named[0][within], named[1][within]), groups[within]
-        return FeatureVote(query.centre, self.rasters.fine, self.cells, turned.images, named, groups)
+            within = area.holds(self.stations[candidates[0]])
+            candidates, groups = (candidates[0][within], candidates[1][within]), groups[within]
+        return FeatureVote(query.centre, self.rasters.fine, self.cells, turned.images, candidates, groups)
 
     def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
         """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
@@ -209,14 +209,14 @@ class FeatureMatcher:
         """
         similarity = self.features.place.astype(np.float32) @ query.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
-        found, number = np.unique(tile, axis=0, return_inverse=True)
-        best = np.full(len(found), -np.inf, dtype=np.float32)
+        tiles_at, number = np.unique(tile, axis=0, return_inverse=True)
+        best = np.full(len(tiles_at), -np.inf, dtype=np.float32)
         np.maximum.at(best, number.reshape(-1), similarity)
         if area is not None:
             reached = replace(area, radius=area.radius + _TILE_RADIUS)
-            met = reached.holds((found + 0.5) * (TILE * LOCAL_CELL))
-            found, best = found[met], best[met]
-        chosen = found[np.argsort(-best, kind="stable")[: self.config.shortlist]]
+            met = reached.holds((tiles_at + 0.5) * (TILE * LOCAL_CELL))
+            tiles_at, best = tiles_at[met], best[met]
+        chosen = tiles_at[np.argsort(-best, kind="stable")[: self.config.shortlist]]
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
         middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])
         return self.index.blocks_near(middles, _TILE_RADIUS)
@@ -242,11 +242,11 @@ class LearnedRecognizer:
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on every storey that they may be on: from above these look alike."""
-        found: dict[tuple[int | None, int | None], Hypothesis] = {}
+        places: dict[tuple[int | None, int | None], Hypothesis] = {}
         for peak in self.consensus.hypotheses():
-            for each in self._storeys(replace(peak, learned=True)):
-                found.setdefault((each.station, each.shift), each)
-        return list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
+            for place in self._storeys(replace(peak, learned=True)):
+                places.setdefault((place.station, place.shift), place)
+        return list(places.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
         """Return a peak, and the same at the stations above and below."""

@@ -64,7 +64,7 @@ class FeatureVote:
         raster: WindowRaster,
         cells: StationCells,
         images: WindowImages,
-        named: tuple[Ints, Ints],
+        candidates: tuple[Ints, Ints],
         groups: Ints,
     ) -> None:
         """Compare with a map.
@@ -74,8 +74,8 @@ class FeatureVote:
             raster: the map's features and whether it knows a cell, its margin half an image.
             cells: of the stations.
             images: the query at each shift, its features and its weight.
-            named: stations and shifts (N,) that may be candidates.
-            groups: (N,) equal numbers where only the best is one.
+            candidates: stations and shifts (N,).
+            groups: (N,) group numbers; only the best of a group stays a candidate.
         """
         self.centre = centre
         self.images = images
@@ -84,7 +84,7 @@ class FeatureVote:
         self._half = images.side // 2
         self._total = np.maximum(images.images[..., WEIGHT].sum(axis=(1, 2), dtype=np.int64), 1) * 127.0
         self._median, self._deviation = self._standard()
-        self.named = self._best_of(named, groups)
+        self.named = self._best_of(candidates, groups)
 
     @property
     def sectors(self) -> int:
@@ -98,10 +98,10 @@ class FeatureVote:
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return z-scores (K,); 0 where nothing was compared."""
         scores = self.scores(stations, shifts)
-        found = np.zeros(len(scores), dtype=np.float32)
+        z_scores = np.zeros(len(scores), dtype=np.float32)
         compared = np.isfinite(scores)
-        found[compared] = (self._median - scores[compared]) * np.float32(1.0 / self._deviation)
-        return found
+        z_scores[compared] = (self._median - scores[compared]) * np.float32(1.0 / self._deviation)
+        return z_scores
 
     def at_all(self, requests: Sequence[Request[FeatureVote]]) -> list[Floats32]:
         """Return what :meth:`at` of each does, one after the other."""
@@ -109,15 +109,15 @@ class FeatureVote:
 
     def scores(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return scores (K,), higher is better: of a station's block the best cell; -inf where nothing was compared."""
-        found = np.full(len(stations), -np.inf, dtype=np.float32)
-        known = np.flatnonzero(stations >= 0)
-        first, size = self._cells.first[stations[known]], self._cells.size[stations[known]]
+        best = np.full(len(stations), -np.inf, dtype=np.float32)
+        rows = np.flatnonzero(stations >= 0)
+        first, size = self._cells.first[stations[rows]], self._cells.size[stations[rows]]
         for down, across in np.ndindex(*size.max(axis=0, initial=0)):
             at = first + np.array([down, across])
             inside = ((down, across) < size).all(axis=1) & ((at >= 0) & (at < self._cells.shape)).all(axis=1)
-            there = known[inside]
-            found[there] = np.maximum(found[there], self._products(at[inside], shifts[there]))
-        return found
+            there = rows[inside]
+            best[there] = np.maximum(best[there], self._products(at[inside], shifts[there]))
+        return best
 
     def _products(self, cells: Ints, shifts: Ints) -> Floats32:
         """Score cells (K, 2) of the raster."""
@@ -138,15 +138,15 @@ class FeatureVote:
         median = np.median(scores)
         return median, np.float32(1.4826 * np.median(np.abs(scores - median)) + 1e-6)
 
-    def _best_of(self, named: tuple[Ints, Ints], groups: Ints) -> tuple[Ints, Ints]:
+    def _best_of(self, candidates: tuple[Ints, Ints], groups: Ints) -> tuple[Ints, Ints]:
         """Return the best stations and shifts, one of each group and each once, best first."""
-        scores = self.scores(*named)
+        scores = self.scores(*candidates)
         order = np.argsort(-scores, kind="stable")
-        kept = order[: int(np.isfinite(scores).sum())]
-        for number in (groups, named[0] * self.sectors + named[1]):
-            _, first = np.unique(number[kept], return_index=True)
-            kept = kept[np.sort(first)]
-        return named[0][kept], named[1][kept]
+        chosen = order[: int(np.isfinite(scores).sum())]
+        for number in (groups, candidates[0] * self.sectors + candidates[1]):
+            _, first = np.unique(number[chosen], return_index=True)
+            chosen = chosen[np.sort(first)]
+        return candidates[0][chosen], candidates[1][chosen]
 
 
 @dataclass(frozen=True)
@@ -174,16 +174,16 @@ class FeatureRasters:
         """Make them of a map, in cells of ``cell`` metres, for queries that reach ``half`` cells from their middle."""
         axes = principal_axes(features.sample(_TILES), _ENERGY, WEIGHT)
         fine, corner = features.coarse(cell, axes)
-        known = np.asarray((fine != 0).any(axis=0))
-        raster = np.zeros((*known.shape, WEIGHT + 1), dtype=np.int8)
+        filled = np.asarray((fine != 0).any(axis=0))
+        raster = np.zeros((*filled.shape, WEIGHT + 1), dtype=np.int8)
         raster[..., : len(axes)] = _bytes(_BYTE * fine).transpose(1, 2, 0)
-        raster[..., WEIGHT] = _BYTE * known
-        count = _pooled(known[None].astype(np.float32))
+        raster[..., WEIGHT] = _BYTE * filled
+        count = _pooled(filled[None].astype(np.float32))
         coarse = _pooled(fine) / np.maximum(count, 1.0)
         margin = -(-half // _COARSE)
         block = _BLOCK * margin
         index = FeatureIndex(coarse, corner, _COARSE * cell, surveyed=count[0] > 0, block=block, margin=margin)
-        return cls(axes, corner, cell, known.shape, WindowRaster(raster, half), index)
+        return cls(axes, corner, cell, filled.shape, WindowRaster(raster, half), index)
 
 
 @dataclass(frozen=True)
@@ -219,8 +219,8 @@ def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio
     scaled = _bytes(turned * np.float32(_BYTE / max(float(turned[..., -1].max()), 1e-9))).transpose(2, 0, 1, 3)
     images[:half, ..., :dimensions], images[:half, ..., WEIGHT] = scaled[..., :-1], scaled[..., -1]
     images[half:] = images[:half, ::-1, ::-1]
-    every = 2 if half >= 12 else 1  # 20 degrees are enough for coarse cells
-    return TurnedQuery(WindowImages(images), _halved(turned[:, :, ::every]), np.arange(0, half, every))
+    stride = 2 if half >= 12 else 1  # 20 degrees are enough for coarse cells
+    return TurnedQuery(WindowImages(images), _halved(turned[:, :, ::stride]), np.arange(0, half, stride))
 
 
 def _bytes(values: Floats32) -> Floats32:
