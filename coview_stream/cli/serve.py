@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
     from coview_stream.stream.node.engine_process import start_children
 
-    tables = _settings(args)
+    tables = settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)
     try:
@@ -168,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
             child.close()
 
 
-def _settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Complete the arguments from ``--config`` and the defaults, and return the file's tables.
 
     Raises:
@@ -188,15 +188,12 @@ def _settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:
-    import logging
+def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -> ServeOptions:
+    """Return the node's options from complete arguments and the tables of ``--config``, see :func:`settings`."""
     import os
     import socket
 
     from coview_stream.basemap.signature import read_verify_key
-    from coview_stream.cli.logs import start_logging
-    from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.cli.view import open_sinks
     from coview_stream.config import LocalizerConfig
     from coview_stream.config.settings_file import with_table
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
@@ -204,7 +201,6 @@ def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: 
     from coview_stream.stream.transport.keys import check_chunk, node_keys, robot_keys
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-    start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
@@ -239,7 +235,7 @@ def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: 
     default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
     by_default = not (args.connect or args.listen or args.zenoh_config)
     opened = open_map_argument(args)
-    options = ServeOptions(
+    return ServeOptions(
         map_path=opened.path,
         keys=keys,
         network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.zenoh_config),
@@ -255,6 +251,17 @@ def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: 
         node_keys=node_keys(args.base, args.node_name or default_node),
         metrics=args.metrics,
     )
+
+
+def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:
+    import logging
+
+    from coview_stream.cli.logs import start_logging
+    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.view import open_sinks
+
+    start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
+    options = serve_options(args, tables)
     sinks = open_sinks(args)
     hangups: list[int] = []
     try:

@@ -15,12 +15,11 @@ from coview_stream.errors import CloudError
 
 @pytest.fixture
 def command(monkeypatch):
-    """Replaces the registered commands by one, ``act``, that does what the test says."""
+    """Puts another command in the place of ``info``."""
 
-    def install(act):
-        module = SimpleNamespace(HELP="acts", add_arguments=lambda parser: None, run=lambda args: act())
-        monkeypatch.setattr(cli, "COMMANDS", ("act",))
-        monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
+    def install(run, add_arguments=lambda parser: None):
+        module = SimpleNamespace(HELP="acts", add_arguments=add_arguments, run=run)
+        monkeypatch.setitem(sys.modules, "coview_stream.cli.info", module)
 
     return install
 
@@ -60,8 +59,8 @@ def test_bad_usage_is_one_line_and_exit_two(argv, capsys):
     ],
 )
 def test_errors_are_printed_as_one_line(command, capsys, error, code, text):
-    command(lambda: _raise(error))
-    assert cli.main(["act"]) == code
+    command(lambda args: _raise(error))
+    assert cli.main(["info"]) == code
     err = capsys.readouterr().err
     assert text in err
     assert err.count("\n") == 1
@@ -69,31 +68,24 @@ def test_errors_are_printed_as_one_line(command, capsys, error, code, text):
 
 
 def test_command_exit_code_is_returned(command):
-    command(lambda: 1)
-    assert cli.main(["act"]) == 1
+    command(lambda args: 1)
+    assert cli.main(["info"]) == 1
 
 
 def test_unexpected_exception_keeps_its_traceback(command):
-    command(lambda: _raise(ZeroDivisionError()))
+    command(lambda args: _raise(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
-        cli.main(["act"])
+        cli.main(["info"])
 
 
 @pytest.mark.slow
-def test_closed_stdout_pipe_is_quiet():
+def test_closed_stdout_pipe_is_quiet(world_file):
     reader, writer = os.pipe()
     os.close(reader)
     # a command that prints, for argparse swallows the error while it prints its own help
-    script = "import sys; from coview_stream import cli; cli._dispatch = print; sys.exit(cli.main(['row']))"
+    command = [sys.executable, "-m", "coview_stream", "info", str(world_file)]
     with os.fdopen(writer) as stdout:
-        done = subprocess.run(
-            [sys.executable, "-c", script],
-            stdout=stdout,
-            stderr=subprocess.PIPE,
-            env=ENVIRONMENT,
-            text=True,
-            check=False,
-        )
+        done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, env=ENVIRONMENT, text=True, check=False)
     assert done.returncode == 141
     assert done.stderr == ""
 
@@ -127,8 +119,8 @@ def test_closed_stdout_is_no_reason_to_fail(world_file):
     assert "Traceback" not in done.stderr
 
 
-def test_lists_that_begin_with_a_negative_number_are_values(monkeypatch, capsys):
-    seen = []
+def test_lists_that_begin_with_a_negative_number_are_values(command):
+    given = []
 
     def add(parser):
         parser.add_argument("--around")
@@ -136,11 +128,9 @@ def test_lists_that_begin_with_a_negative_number_are_values(monkeypatch, capsys)
         parser.add_argument("--initial", action="append")
         parser.add_argument("site")
 
-    module = SimpleNamespace(HELP="acts", add_arguments=add, run=lambda args: seen.append(args) or 0)
-    monkeypatch.setattr(cli, "COMMANDS", ("act",))
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
+    command(lambda args: given.append(args) or 0, add)
     words = ["--around", "-162.5,111,100", "--level", "-3", "--initial", "-.5,-2", "--initial=-1,2", "site"]
-    assert cli.main(["act", *words]) == 0
-    (args,) = seen
+    assert cli.main(["info", *words]) == 0
+    (args,) = given
     assert (args.around, args.level, args.initial, args.site) == ("-162.5,111,100", -3.0, ["-.5,-2", "-1,2"], "site")
-    assert cli.main(["act", "-1,2,3", "site"]) == 2
+    assert cli.main(["info", "-1,2,3", "site"]) == 2

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import shutil
-import sys
 
 import numpy as np
 import pytest
 from fake_robot import Robot
+from sockets import free_endpoint, until
 
-from coview_stream.cli import build_parser, main, replay, serve
+from coview_stream.cli import main
 from coview_stream.clouds.files import read_cloud, write_cloud
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount, parse_mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.transforms import inverse, transform
+from coview_stream.messages import decode_cloud
 from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.lidar_runs import open_bare_run
 from coview_stream.recordings.open_run import open_run
+from coview_stream.stream.transport.zenoh_transport import open_transport
 
 MOUNT = "180,10,90,0.3,-0.2,0.5"
 
@@ -81,29 +83,18 @@ def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():
     assert np.allclose(deskewed(turned(points), parse_mount(MOUNT)), body, atol=1e-3)
 
 
-def test_serve_and_replay_pass_the_option_on(world_file, world_run, monkeypatch):
-    asked = []
-    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options.node.mount) or True)
-    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", f"--mount={MOUNT}"]) == 0
-    assert main(["serve", str(world_file), "--robot", "r1", "--no-state"]) == 0
-    assert asked == [parse_mount(MOUNT), NodeConfig().mount]
-
-
-@pytest.mark.parametrize(("given", "opener"), [([], "open_run"), (["--odometry", "none"], "open_bare_run")])
-def test_replay_reads_clouds_into_the_body_frame(world_run, monkeypatch, given, opener):
-    def stop(*args, mount=None):
-        raise _Stopped(mount or args[-1])
-
-    module = sys.modules[{"open_run": open_run, "open_bare_run": open_bare_run}[opener].__module__]
-    monkeypatch.setattr(module, opener, stop)
-    command = ["replay", str(world_run), "--robot", "r1", f"--mount={MOUNT}", *given]
-    with pytest.raises(_Stopped) as caught:
-        replay.run(build_parser().parse_args(command))
-    assert caught.value.args == (parse_mount(MOUNT),)
-
-
-class _Stopped(Exception):
-    pass
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [[], ["--odometry", "none"]])
+def test_replay_sends_clouds_in_the_body_frame(world_run, turned_run, given):
+    sent, endpoint = [], free_endpoint()
+    node = open_transport(listen=[endpoint])
+    node.subscribe("coview/r1/in/cloud", lambda sample: sent.append(decode_cloud(sample).points), "all")
+    command = ["replay", str(turned_run), "--robot", "r1", "--connect", endpoint, "--rate", "50"]
+    assert main([*command, f"--mount={MOUNT}", *given]) == 0
+    until(lambda: len(sent) == 7)
+    node.close()
+    for here, there in zip(open_run(world_run), sent, strict=True):
+        assert np.allclose(here.points, there, atol=1e-4)
 
 
 @pytest.mark.parametrize("wrong", ["1,2", "0,0,x", "0,400,0", ""])

@@ -8,7 +8,7 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import load, save
-from coview_stream.cli import main, serve
+from coview_stream.cli import main
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.network import network
 from coview_stream.localization.localizer import Localizer
@@ -30,14 +30,6 @@ def test_serve_reloc_learned_on_map_without_features_fails_before_opening(world_
     given = ["serve", str(world_file), "--robot", "r1", "--reloc", "learned", "--no-state", "--quiet"]
     assert main(given) == 2
     assert "build it again" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("given", "wanted"), [([], "auto"), (["--reloc", "learned"], "learned")])
-def test_serve_passes_reloc_option_to_engines(world_file, monkeypatch, given, wanted):
-    asked = []
-    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
-    assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
-    assert [options.localizer.reloc for options in asked] == [wanted]
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from any_risk import NEVER
 
-from coview_stream.cli import build_parser, main, serve
+from coview_stream.cli import build_parser, main
 from coview_stream.cli.options import acceptance_config
 from coview_stream.config import AcceptanceConfig
 from coview_stream.config.localizer import LEAST_RISK
@@ -38,14 +38,6 @@ def test_risk_that_is_no_small_probability_is_refused_before_anything_is_read(tm
 
 def test_smallest_risk_is_what_is_told_apart_in_words():
     assert LEAST_RISK == acceptance_config("1e-6").risk > LEAST
-
-
-@pytest.mark.parametrize(("given", "wanted"), [([], 1e-4), (["--risk", "1e-6"], 1e-6)])
-def test_serve_passes_risk_option_to_engines(world_file, monkeypatch, given, wanted):
-    asked = []
-    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
-    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", *given]) == 0
-    assert [options.localizer.acceptance.risk for options in asked] == [wanted]
 
 
 def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path, monkeypatch):

@@ -103,15 +103,6 @@ def test_node_that_does_not_close_is_abandoned(monkeypatch):
     assert command._serve(None, Stop(True)) is False
 
 
-def test_error_while_opening_is_raised_to_caller(monkeypatch):
-    def fail(*_):
-        raise ConfigError("no such thing")
-
-    monkeypatch.setattr(serve, "open_node", fail)
-    with pytest.raises(ConfigError, match="no such thing"):
-        command._serve(None, Stop(False))
-
-
 @pytest.mark.parametrize(
     ("args", "message"),
     [
@@ -147,31 +138,6 @@ def test_unreadable_map_is_refused(tmp_path, capsys):
     path.write_bytes(b"no map")
     assert main(["serve", str(path), "--robot", "r1", "--listen", free_endpoint()]) == 2
     assert "broken.coview" in capsys.readouterr().err
-
-
-def test_serve_options_reach_node_config(monkeypatch, world_file):
-    asked = []
-
-    class Node:
-        def close(self, patience):
-            return True
-
-    def open_node(options, cancelled, children, notifier):
-        asked.append(options)
-        os.kill(os.getpid(), signal.SIGTERM)
-        return Node()
-
-    monkeypatch.setattr(serve, "open_node", open_node)
-    options = ["--odometry-timeout", "1.5", "--max-speed", "9", "--max-outage", "7", "--max-payload", "99"]
-    options += ["--odometry", "kiss-icp", "--gravity", "0,0.1,-9.8"]
-    names = ["--preset", "rmw_zenoh", "--humble", "--robot", "r1"]
-    assert main(["serve", str(world_file), *names, *options]) == 0
-    node = asked[0].node
-    assert (node.odometry_timeout, node.max_gap, node.max_speed, node.max_outage) == (1.5, 1.5, 9.0, 7.0)
-    assert node.max_payload == 99
-    assert asked[0].keys[0].pose.endswith("/TypeHashNotSupported")
-    lidar = asked[0].lidar
-    assert (lidar.gravity, lidar.max_speed) == ((0.0, 0.1, -9.8), 9.0)
 
 
 def test_max_payload_reaches_the_transport(monkeypatch, world_file):

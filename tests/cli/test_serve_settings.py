@@ -2,54 +2,66 @@
 
 from __future__ import annotations
 
-import argparse
-
 import pytest
 
-from coview_stream.cli import main, serve
-from coview_stream.stream.node import serve as node_serve
+from coview_stream.cli import build_parser, main, serve
+from coview_stream.config.mount import parse_mount
+from coview_stream.config.node import NodeConfig
+from coview_stream.errors import ConfigError
 
 
-@pytest.fixture
-def opened(monkeypatch, world_file):
-    """Options that ``serve`` would open a node with, for the arguments given."""
-    found = []
-
-    def refuse(options, *_):
-        found.append(options)
-        raise node_serve.CancelledError
-
-    monkeypatch.setattr(node_serve, "open_node", refuse)
-    monkeypatch.setattr("coview_stream.stream.node.engine_process.start_children", lambda lidar: {})
-    monkeypatch.setattr("coview_stream.cli.signals.Stop.wait", lambda self, seconds: bool(found))
-
-    def open_with(*argv):
-        assert main(["serve", *argv]) == 0
-        return found[-1]
-
-    return open_with
+def options_of(*argv):
+    """Return the options of the node that ``serve`` opens for these arguments."""
+    args = build_parser("serve").parse_args(["serve", *map(str, argv)])
+    return serve.serve_options(args, serve.settings(args))
 
 
-def test_a_file_sets_options_and_tables(opened, world_file, tmp_path):
+@pytest.mark.parametrize(
+    ("given", "read", "wanted"),
+    [
+        ([], lambda o: o.localizer.reloc, "auto"),
+        (["--reloc", "learned"], lambda o: o.localizer.reloc, "learned"),
+        ([], lambda o: o.localizer.acceptance.risk, 1e-4),
+        (["--risk", "1e-6"], lambda o: o.localizer.acceptance.risk, 1e-6),
+        ([], lambda o: o.localizer.registration.method, "trimmed-icp"),
+        (["--registration", "gicp"], lambda o: o.localizer.registration.method, "gicp"),
+        ([], lambda o: o.node.mount, NodeConfig().mount),
+        (["--mount=180,10,90,0.3,-0.2,0.5"], lambda o: o.node.mount, parse_mount("180,10,90,0.3,-0.2,0.5")),
+        (["--odometry-timeout", "1.5"], lambda o: (o.node.odometry_timeout, o.node.max_gap), (1.5, 1.5)),
+        (["--max-payload", "99"], lambda o: o.node.max_payload, 99),
+        (["--max-outage", "7"], lambda o: o.node.max_outage, 7.0),
+        (
+            ["--odometry", "kiss-icp", "--gravity", "0,0.1,-9.8", "--max-speed", "9"],
+            lambda o: (o.lidar.gravity, o.lidar.max_speed, o.node.max_speed),
+            ((0.0, 0.1, -9.8), 9.0, 9.0),
+        ),
+        (["--preset", "rmw_zenoh", "--humble"], lambda o: o.keys[0].pose.rpartition("/")[2], "TypeHashNotSupported"),
+    ],
+)
+def test_an_option_reaches_the_node(world_file, given, read, wanted):
+    assert read(options_of(world_file, "--robot", "r1", "--no-state", *given)) == wanted
+
+
+def test_a_file_sets_options_and_tables(world_file, tmp_path):
     path = tmp_path / "node.toml"
     path.write_text(
         f'map = "{world_file}"\nrobot = ["a", "b"]\nlisten = "tcp/127.0.0.1:0"\nno_state = true\npose-rate = 20\n'
         'cloud_key = "lidar/{robot}"\nmount = "180,0,0"\n[node]\nmax_outage = 7\n[localizer]\nreloc = "coview"\n'
         "[localizer.acceptance]\nrisk = 1e-5\n"
     )
-    options = opened("--config", str(path))
+    options = options_of("--config", path)
     assert [keys.cloud for keys in options.keys] == ["lidar/a", "lidar/b"]
     assert (options.node.pose_rate, options.node.max_outage, options.node.mount.option) == (20.0, 7.0, "180,0,0")
     assert (options.localizer.reloc, options.localizer.acceptance.risk) == ("coview", 1e-5)
     assert options.state is None
 
 
-def test_the_command_line_goes_before_the_file(opened, world_file, tmp_path):
+def test_the_command_line_goes_before_the_file(world_file, tmp_path):
     path = tmp_path / "node.toml"
     path.write_text(
         'robot = "a"\nbase = "there"\nno_state = true\n[node]\npose_rate = 5\n[localizer.acceptance]\nrisk = 0.01\n'
     )
-    options = opened(str(world_file), "--config", str(path), "--base", "coview", "--robot", "b", "--pose-rate", "3")
+    options = options_of(world_file, "--config", path, "--base", "coview", "--robot", "b", "--pose-rate", "3")
     assert options.keys[0].pose == "coview/b/out/pose"
     assert (options.node.pose_rate, options.localizer.acceptance.risk) == (3.0, 0.01)
 
@@ -67,12 +79,12 @@ def test_the_command_line_goes_before_the_file(opened, world_file, tmp_path):
         ("[node]\n", "--robot is missing"),
     ],
 )
-def test_mistakes_are_named(text, message, world_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("coview_stream.stream.node.engine_process.start_children", lambda lidar: {})
+def test_mistakes_are_named(text, message, world_file, tmp_path):
     path = tmp_path / "node.toml"
     path.write_text(text)
-    assert main(["serve", str(world_file), "--config", str(path), "--no-state"]) == 2
-    assert message in capsys.readouterr().err
+    with pytest.raises(ConfigError) as error:
+        options_of(world_file, "--config", path, "--no-state")
+    assert message in str(error.value)
 
 
 def test_help_fits_a_screen_and_help_all_has_the_rest(capsys):
@@ -81,9 +93,8 @@ def test_help_fits_a_screen_and_help_all_has_the_rest(capsys):
     assert len(short.splitlines()) <= 50
     assert main(["serve", "--help-all"]) == 0
     everything = capsys.readouterr().out
-    parser = argparse.ArgumentParser()
-    serve.add_arguments(parser)
-    for action in parser._actions:
-        for option in action.option_strings[-1:]:
-            assert option in everything
-    assert "--cloud-key" not in short
+    for option in ("--cloud-key", "--domain", "--gravity", "--no-deskew", "--registration", "--reloc", "--max-speed"):
+        assert option in everything
+        assert option not in short
+    for option in ("--robot", "--config", "--state", "--metrics"):
+        assert option in short

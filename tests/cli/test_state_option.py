@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import threading
 from pathlib import Path
 
 import pytest
+from sockets import free_endpoint
 
 from coview_stream.cli import main, serve
 from coview_stream.cli import options as state
-from coview_stream.stream.node import serve as opening
-from coview_stream.stream.node.engine_process import EngineProcess
-from coview_stream.stream.transport import zenoh_transport
+from coview_stream.stream.node.serve import NetworkOptions, ServeOptions, open_node
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 
-def folder(*args):
+def folder(*args, find=state.state_folder):
     parser = argparse.ArgumentParser()
     serve.add_arguments(parser)
-    return state.state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+    return find(parser.parse_args(["site.coview", "--robot", "r1", *args]))
 
 
 def test_state_folder_defaults_to_user_state_directory(monkeypatch, tmp_path):
@@ -37,21 +37,16 @@ def test_state_and_no_state_together_are_refused(capsys):
 
 
 def test_without_home_directory_no_pose_is_saved(monkeypatch, caplog):
-    def homeless():
-        raise RuntimeError("no home")
-
-    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
-    monkeypatch.delenv("LOCALAPPDATA", raising=False)
-    monkeypatch.setattr(Path, "home", homeless)
+    for name in ("XDG_STATE_HOME", "LOCALAPPDATA", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setitem(sys.modules, "pwd", None)
     assert folder() is None
     assert "--state DIR" in caplog.text
     assert folder("--state", "/var/lib/coview") == Path("/var/lib/coview")
 
 
 def ready(*args):
-    parser = argparse.ArgumentParser()
-    serve.add_arguments(parser)
-    return state.writable_state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+    return folder(*args, find=state.writable_state_folder)
 
 
 def test_state_directory_is_created_tested_and_logged(tmp_path, caplog):
@@ -86,14 +81,12 @@ def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, ca
     assert "--state DIR or --no-state" in line
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tmp_path, kept):
-    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args, **more: MemoryTransport())
-    for name in ("start", "wait_ready", "close"):
-        monkeypatch.setattr(EngineProcess, name, lambda self, *args: None)
-    options = opening.ServeOptions(world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None)
-    node = opening.open_node(options)
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", [True, False])
+def test_serve_runs_last_pose_keeper_unless_no_state(world_file, tmp_path, folder):
+    keys, network = [robot_keys("native", "coview", "r1")], NetworkOptions(listen=[free_endpoint()])
+    node = open_node(ServeOptions(world_file, keys, network, state=tmp_path if folder else None))
     try:
-        assert ("coview-last-pose" in [t.name for t in node._threads]) == kept
+        assert ("coview-last-pose" in [thread.name for thread in threading.enumerate()]) == folder
     finally:
         node.close(5.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
@@ -14,7 +16,6 @@ import pytest
 from sockets import free_endpoint
 
 from coview_stream.cli import main
-from coview_stream.cli.watch import _Watch
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import Encoded, PoseMessage
@@ -69,31 +70,36 @@ def node():
     made.close()
 
 
-@pytest.fixture
-def watch(monkeypatch):
-    """Run the command until it took, drew or said something so many times; 20 s at most."""
+class Screen(io.StringIO):
+    """Output that asks the command to end once it has so many lines, or so many of a text."""
 
-    def run(endpoint, *options, after="_show", times=1):
-        inner, left = getattr(_Watch, after), [times]
+    def __init__(self, times=np.inf, text="\n", terminal=False):
+        super().__init__()
+        self.times, self.text, self.isatty = times, text, lambda: terminal
 
-        def counted(self, *arguments):
-            inner(self, *arguments)
-            left[0] -= 1
-            if left[0] <= 0:
-                os.kill(os.getpid(), signal.SIGTERM)
+    @property
+    def enough(self):
+        return self.getvalue().count(self.text) >= self.times
 
-        monkeypatch.setattr(_Watch, after, counted)
-        code = main(["watch", "--connect", endpoint, "--seconds", "20", *options])
-        assert left[0] <= 0, "it ran into its time limit"
-        return code
-
-    return run
+    def write(self, text):
+        count = super().write(text)
+        if self.enough:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return count
 
 
-def test_watch_prints_json_lines_of_all_robots(node, watch, capsys):
-    assert watch(node.endpoint, "--json", times=24) == 0
-    captured = capsys.readouterr()
-    records = [json.loads(line) for line in captured.out.splitlines()]
+def watch(endpoint, *options, out=None, err=None):
+    """Run the command until one of the screens has enough, 20 s at most; return what they show."""
+    out, err = out or Screen(), err or Screen()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        assert main(["watch", "--connect", endpoint, "--seconds", "20", *options]) == 0
+    assert out.enough or err.enough, "it ran into its time limit"
+    return out.getvalue(), err.getvalue()
+
+
+def test_watch_prints_json_lines_of_all_robots(node):
+    out, err = watch(node.endpoint, "--json", out=Screen(24))
+    records = [json.loads(line) for line in out.splitlines()]
     assert {r["key"] for r in records} == {f"coview/{n}/out/{w}" for n in ("r1", "r2") for w in ("pose", "status")}
     pose = next(r for r in records if r["key"] == "coview/r1/out/pose")
     assert pose["robot"] == "r1"
@@ -102,13 +108,13 @@ def test_watch_prints_json_lines_of_all_robots(node, watch, capsys):
     assert len(pose["covariance"]) == 36
     status = next(r for r in records if r["key"] == "coview/r2/out/status")
     assert status == {"key": "coview/r2/out/status", "robot": "r2", **STATUS}
-    assert captured.err == ""
+    assert err == ""
 
 
 @pytest.mark.slow
-def test_watch_prints_lines_without_terminal(node, watch, capsys):
-    assert watch(node.endpoint, "--robot", "r1", after="_draw") == 0
-    header, line = capsys.readouterr().out.splitlines()
+def test_watch_prints_lines_without_terminal(node):
+    out, _ = watch(node.endpoint, "--robot", "r1", out=Screen(2))
+    header, line = out.splitlines()
     assert header.split()[:3] == ["robot", "state", "x"]
     cells = line.split()
     assert cells[:6] == ["r1", "TRACKING", "12.34", "-5.00", "1.70", "28.6"]
@@ -117,11 +123,9 @@ def test_watch_prints_lines_without_terminal(node, watch, capsys):
 
 
 @pytest.mark.slow
-def test_watch_redraws_terminal_in_place(node, watch, capsys, monkeypatch):
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+def test_watch_redraws_terminal_in_place(node, monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
-    assert watch(node.endpoint, after="_draw", times=2) == 0
-    out = capsys.readouterr().out
+    out, _ = watch(node.endpoint, out=Screen(2, "\x1b[J", terminal=True))
     frames = out.split("\x1b[J")[1:]
     assert len(frames) == 2
     assert frames[0].endswith("\x1b[5F")  # back over the header and two robots with their reasons
@@ -132,54 +136,40 @@ def test_watch_redraws_terminal_in_place(node, watch, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["cdr", "foxglove"])
-def test_watch_reads_poses_in_other_formats(name, watch, capsys):
-    node = Node(pose_format=name)
-    try:
-        assert watch(node.endpoint, "--json", "--robot", "r1", "r2", times=12) == 0
-    finally:
-        node.close()
-    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+def test_watch_reads_poses_in_other_formats(name):
+    with contextlib.closing(Node(pose_format=name)) as node:
+        out, _ = watch(node.endpoint, "--json", "--robot", "r1", "r2", out=Screen(12))
+    records = [json.loads(line) for line in out.splitlines()]
     poses = [r for r in records if r["key"].endswith("pose")]
     assert {r["robot"] for r in poses} == {"r1", "r2"}
     assert poses[0]["position"] == pytest.approx([12.34, -5.0, 1.7])
     assert poses[0]["confidence"] is None
 
 
-def test_watch_reads_poses_of_a_preset(watch, capsys):
-    node = Node(("r1",), preset="ros2dds")
-    try:
-        assert watch(node.endpoint, "--json", "--robot", "r1", "--preset", "ros2dds", times=6) == 0
-    finally:
-        node.close()
-    keys = {json.loads(line)["key"] for line in capsys.readouterr().out.splitlines()}
+def test_watch_reads_poses_of_a_preset():
+    with contextlib.closing(Node(("r1",), preset="ros2dds")) as node:
+        out, _ = watch(node.endpoint, "--json", "--robot", "r1", "--preset", "ros2dds", out=Screen(6))
+    keys = {json.loads(line)["key"] for line in out.splitlines()}
     assert keys == {"r1/coview/pose", "coview/r1/out/status"}
 
 
-def test_undecodable_messages_are_reported_once_per_key(watch, capsys):
+def test_undecodable_messages_are_reported_once_per_key():
     bad = [("coview/r1/out/pose", Encoded(b"\xff\x00")), ("coview/r1/out/status", Encoded(b"[]"))]
-    node = Node((), extra=bad)
-    try:
-        assert watch(node.endpoint, "--json", times=8) == 0
-    finally:
-        node.close()
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert len(captured.err.splitlines()) == 2
-    assert "coview/r1/out/pose" in captured.err
+    with contextlib.closing(Node(("r2",), extra=bad)) as node:
+        out, err = watch(node.endpoint, "--json", out=Screen(8))
+    assert {json.loads(line)["robot"] for line in out.splitlines()} == {"r2"}
+    assert len(err.splitlines()) == 2
+    assert "coview/r1/out/pose" in err
 
 
-def test_watch_explains_missing_messages(watch, capsys, monkeypatch):
-    monkeypatch.setattr("coview_stream.cli.watch._SILENCE", 0.2)
-    node = Node(())
-    try:
-        assert watch(node.endpoint, "--base", "site/a", after="_print_silence") == 0
-    finally:
-        node.close()
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    assert "nothing yet on site/a/*/out/pose, site/a/*/out/status; connected to 1 other(s)" in captured.err
-    assert node.endpoint in captured.err
+@pytest.mark.slow
+def test_watch_explains_missing_messages():
+    with contextlib.closing(Node(())) as node:
+        out, err = watch(node.endpoint, "--base", "site/a", err=Screen(1))
+    assert out == ""
+    assert err.count("\n") == 1
+    assert "nothing yet on site/a/*/out/pose, site/a/*/out/status; connected to 1 other(s)" in err
+    assert node.endpoint in err
 
 
 def process(endpoint, *options):
