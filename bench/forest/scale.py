@@ -93,11 +93,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
     chain = Chain(base_map, config)
     for side, limit in list(LIMITS.items())[: 1 if asked.quick else None]:
         large = Enlarged(base_map, side)
+        assert large.learned is not None
         begin = time.perf_counter()
         learned = SearchIndex.of(large, config).learned
         assert learned is not None
         learned.prepare()
-        peaks = replace(config.consensus, mode="consensus", peaks=BEST)
+        peaks = replace(config.consensus, peaks=BEST)
         consensus = Consensus(StationGrid(large.stations, base_map.config.block), peaks)
         prepared = time.perf_counter() - begin
         spent: list[list[float]] = []

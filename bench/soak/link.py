@@ -1,4 +1,4 @@
-"""A TCP link that goes bad: a proxy on loopback in a process of its own."""
+"""A proxy on loopback whose TCP link can be spoilt; it runs in a process of its own."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ import socket
 import time
 from multiprocessing.connection import Connection
 
-MODES = ("open", "cut", "flapping", "silent", "slow", "thin", "lossy", "corrupt")
-"""``silent``: half-open, nothing passes and nothing ends; ``slow``: 200 ms each way; ``thin``: 1 Mbit/s each way;
-``lossy``: a fifth of the pieces is held up as TCP does that sends them again; ``corrupt``: flipped bits."""
-
+# modes: open; cut; flapping, a cut every 2 s; silent, half-open: nothing passes or ends; slow, 200 ms each way; thin,
+# 1 Mbit/s each way; lossy, a fifth of the pieces comes 200 ms later, as TCP's repeats do; corrupt, flipped bits
 _PIECE, _QUEUED = 16_384, 64  # bytes; pieces
-_WINDOW = 65_536  # bytes that TCP takes in before they are forwarded: a thin link does not hold seconds of data
+_WINDOW = 65_536  # bytes of the receive buffer: a thin link must not hold seconds of data
 _SLOW, _THIN, _AGAIN, _EVERY, _FLIPS = 0.2, 125_000.0, 0.2, 2.0, 0.05  # s, bytes per s, s, s, share of pieces
 
 
 class Link:
-    """Forwards connections from ``port`` to ``target``, both on loopback, in its mode."""
+    """Forwards connections from ``port`` to ``target``, both on loopback."""
 
     def __init__(self, port: int, target: int, seed: int) -> None:
         self._port, self._target = port, target
@@ -27,7 +25,7 @@ class Link:
         self._open: set[asyncio.StreamWriter] = set()
 
     async def run(self, conn: Connection) -> None:
-        """Forward until None is received; anything else is the mode from now on."""
+        """Forward until None is received; every other order is a mode."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
         def order() -> None:
@@ -114,5 +112,5 @@ class Link:
 
 
 def forward(conn: Connection, port: int, target: int, seed: int) -> None:
-    """Be a link until None is received."""
+    """Run a link until None is received."""
     asyncio.run(Link(port, target, seed).run(conn))

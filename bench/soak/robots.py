@@ -1,4 +1,4 @@
-"""Simulated robots that drive for ever, with faulty senders on demand; and the record of the nodes' answers."""
+"""Simulated robots that drive without end and send faulty messages on demand; the record of the nodes' answers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from bench.harness import worlds
 from bench.harness.files import fingerprint, remembered
 from bench.integrity.kinds import built, draw, size_of, surveyed
@@ -21,26 +19,24 @@ from bench.integrity.work import SITE_CODE
 from bench.stream.processes import EPOCH_NS, Drive, RobotPlan, open_session, stamp_of
 from bench.stream.scores import Posed, errors
 from coview_stream.clouds import read_tum, write_cloud, write_tum
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_pose, encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.sim import SimulationConfig
 
-_LENGTH = 60.0  # metres of a deceptive drive
-_SENSOR = "vlp16"
+LENGTH, SENSOR = 60.0, "vlp16"  # metres and lidar of a drive through a deceptive site
+
+KINDS = ("town", "boxes", "yard")
+"""Sites of the robots, in turns; all containers of ``yard`` were moved since the survey."""
 
 
 class Site(NamedTuple):
-    """A world on disk (``run/``, ``truth.tum``) and its map; on a deceptive one, no pose is right."""
+    """A world on disk (``run/``, ``truth.tum``) and its map; on a deceptive site no pose is right."""
 
     name: str
     world: Path
     map: Path
     deceptive: bool
-
-
-KINDS = ("town", "boxes", "yard")
-"""In which the robots are, in turns; ``yard``: all its containers were moved since the survey."""
 
 
 def prepare(below: Path, kind: str, seed: int, quick: bool) -> Site:
@@ -52,7 +48,7 @@ def prepare(below: Path, kind: str, seed: int, quick: bool) -> Site:
         return Site(kind, world, worlds.map_of(below, config), deceptive=False)
     world = below / f"soak-{kind}-{seed}"
     spec = {
-        "site": [kind, seed, _LENGTH, _SENSOR],
+        "site": [kind, seed, LENGTH, SENSOR],
         "code": fingerprint(*SITE_CODE, "bench/integrity", "bench/soak/robots.py"),
     }
     remembered(world / "made.json", spec, lambda: _make(world, kind, seed))
@@ -63,7 +59,7 @@ def _make(world: Path, kind: str, seed: int) -> None:
     size = size_of(kind)
     (world / "run" / "frames").mkdir(parents=True, exist_ok=True)
     built(surveyed(draw(kind, seed, size, 0.0), seed)).save(world / "site.coview")
-    drive = through(draw(kind, seed, size, 1.0 if kind == "yard" else 0.0), _SENSOR, seed, _LENGTH)
+    drive = through(draw(kind, seed, size, 1.0 if kind == "yard" else 0.0), SENSOR, seed, LENGTH)
     for k in range(len(drive)):
         write_cloud(world / "run" / "frames" / f"{k:06d}.pcd", drive.frame(k))
     write_tum(world / "run" / "odometry.tum", drive.stamps, drive.odometry)
@@ -71,13 +67,12 @@ def _make(world: Path, kind: str, seed: int) -> None:
 
 
 CLOUD_PERIOD, ODOMETRY_PERIOD = 0.1, 0.02
-REOPEN = "reopen"  # makes a robot open its session anew, as after a restart
-SIGNED = b"stranger"  # attachment of the stranger's messages on the robots' outputs
+REOPEN = "reopen"  # order to open the session again, as after a restart
 
 FALSE_METRES, FALSE_DEGREES = 3.0, 5.0  # a pose further from the truth than either is false
-_LATE = 0.5  # seconds after which a message that the network held up is not sent any more
-_FED = 2.0  # seconds since the last of its messages, within which they arrive
-_FAR = 60.0  # seconds between a pose's stamp and its arrival, above which it belongs to no sent frame
+_LATE = 0.5  # seconds after which a delayed message is dropped
+_FED = 2.0  # seconds without a message after which a robot counts as disconnected
+_FAR = 60.0  # seconds between stamp and arrival above which a pose belongs to no sent frame
 
 
 @dataclass(frozen=True)
@@ -86,36 +81,27 @@ class Manner:
 
     clouds: bool = True
     odometry: bool = True
-    frozen: bool = False  # odometry stands while the robot drives
-    stopped: bool = False  # the stamps stand
-    unit_ns: int = 1  # nanoseconds of one unit of its stamps; a million if it stamps in milliseconds
-    offset: float = 0.0  # seconds that its sensor clock is ahead of its start
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres and radians between odometry frames, now and then
+    frozen: bool = False  # odometry repeats one pose while the robot drives
+    stopped: bool = False  # all stamps are equal
+    unit_ns: int = 1  # nanoseconds per unit of the stamps; a million for stamps in milliseconds
+    offset: float = 0.0  # seconds that the sensor clock is ahead
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of the odometry frame, metres and radians
     cloud_period: float = CLOUD_PERIOD
 
 
 def stamp(content: float, manner: Manner) -> int:
-    """Stamp of a robot's clock at a moment of its drive."""
+    """Return the sensor's stamp at a moment of the drive."""
     return (EPOCH_NS + round((content + manner.offset) * 1e6) * 1000) // manner.unit_ns
 
 
 def content_of(stamp_ns: int, manners: list[Manner], near: float) -> float:
-    """Moment of the drive that a stamp means in one of the manners: the nearest to ``near``."""
+    """Return the moment of the drive that a stamp means: of all manners, the nearest to ``near``."""
     moments = [(stamp_ns * manner.unit_ns - EPOCH_NS) / 1e9 - manner.offset for manner in manners]
     return min(moments, key=lambda content: abs(content - near))
 
 
-def shifted(T_odom_body: Floats, shift: tuple[float, float, float]) -> Floats:
-    """Pose in an odometry frame that is shifted and turned."""
-    x, y, yaw = shift
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:2, 3] = x, y
-    return np.asarray(T @ T_odom_body)
-
-
 def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
-    """Send until None is received; a :class:`Manner` changes the sender, :data:`REOPEN` its session."""
+    """Send until None is received; the other orders are a :class:`Manner` and :data:`REOPEN`."""
     import zenoh
 
     drive = Drive(world, RobotPlan(name, float("inf")))
@@ -152,7 +138,8 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
         if kind == "cloud":
             message = encode_cloud(CloudMessage(at, drive.cloud(content)), "xyz")
         else:
-            pose = shifted(drive.T_odom_body(since if manner.frozen else content), manner.shift)
+            x, y, yaw = manner.shift
+            pose = pose_from(rot_z(yaw), [x, y, 0.0]) @ drive.T_odom_body(since if manner.frozen else content)
             message = encode_odometry(OdometryMessage(at, pose), "json")
         session.put(
             f"coview/{name}/in/{kind}", message.payload, encoding=message.encoding, attachment=message.attachment,
@@ -163,19 +150,18 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
 
 @dataclass
 class Robot:
-    """Record of a robot: messages that arrived from and for it so far."""
+    """Record of a robot: the messages from it and for it."""
 
     name: str
     site: Site
     start: float = math.inf  # monotonic time at which its drive begins
-    manners: list[Manner] = field(default_factory=lambda: [Manner()])  # so far
+    manners: list[Manner] = field(default_factory=lambda: [Manner()])
     poses: int = 0
     false: list[tuple[float, float, float]] = field(default_factory=list)  # seconds, metres, degrees
     unreadable: int = 0
     worst: tuple[float, float] = (0.0, 0.0)
     fed_at: dict[str, float] = field(default_factory=lambda: {"odom": -math.inf, "cloud": -math.inf})
-    garbled: int = 0  # false or unreadable while the nodes' link flips bits
-    corrected: float = -math.inf  # moment of the newest frame that a pose came from
+    corrected: float = -math.inf  # moment of the newest frame behind a pose
     latencies: list[float] = field(default_factory=list)  # seconds
     state: str = ""
     states: Counter[str] = field(default_factory=Counter)
@@ -186,15 +172,15 @@ class Robot:
         self.drive = Drive(self.site.world, RobotPlan(self.name, math.inf))
 
     def expect(self, moment: float) -> None:
-        """Wait for a pose from a frame that was taken at a monotonic time or later."""
+        """Wait for a pose from a frame of this monotonic time or later."""
         self.awaited, self.recovered = moment - self.start, None
 
     def fed(self, now: float) -> bool:
-        """Whether its odometry and clouds arrive at the router."""
+        """Tell whether odometry and clouds of the robot arrive at the router."""
         return now - min(self.fed_at.values()) < _FED
 
     def take_status(self, payload: bytes) -> None:
-        """Note a status."""
+        """Record a status."""
         try:
             state = str(json.loads(payload)["state"])
         except (ValueError, KeyError, TypeError):
@@ -204,10 +190,10 @@ class Robot:
         self.state = state
 
     def take_pose(self, at: float, sample: Sample) -> None:
-        """Judge a pose by the truth at its stamp."""
+        """Compare a pose with the truth at its stamp."""
         try:
             pose = decode_pose(sample)
-        except Exception:  # whatever a node may publish
+        except Exception:  # a node may publish anything
             self.unreadable += 1
             return
         due = at - self.start
@@ -230,42 +216,34 @@ class Robot:
 
 
 class Watch:
-    """Subscriber of all outputs, straight at the router; :meth:`update` judges the messages since the last time."""
+    """Subscriber to all outputs at the router; :meth:`update` judges the messages since the last call."""
 
     def __init__(self, endpoint: str, robots: list[Robot]) -> None:
         import zenoh
 
         self.robots = {robot.name: robot for robot in robots}
         self.session = open_session("client", connect=[endpoint])
-        self.flipping = False  # whether bits may be flipped on the way from the nodes
-        self._came: deque[tuple[float, str, bytes, str]] = deque()
+        self._arrived: deque[tuple[float, str, bytes, str]] = deque()
         direct = zenoh.handlers.Callback(self._take, indirect=False)
         keys = ("coview/*/out/pose", "coview/*/out/status", "coview/*/in/odom", "coview/*/in/cloud")
-        self._held = [self.session.declare_subscriber(key, direct) for key in keys]
+        self._subscribers = [self.session.declare_subscriber(key, direct) for key in keys]
 
     def _take(self, sample: Any) -> None:
-        at = time.monotonic()
-        if sample.attachment is None or sample.attachment.to_bytes() != SIGNED:
-            key = str(sample.key_expr)
-            payload = b"" if "/in/" in key else sample.payload.to_bytes()
-            self._came.append((at, key, payload, str(sample.encoding)))
+        at, key = time.monotonic(), str(sample.key_expr)
+        payload = b"" if "/in/" in key else sample.payload.to_bytes()
+        self._arrived.append((at, key, payload, str(sample.encoding)))
 
     def update(self) -> None:
-        """Judge the messages since the last time."""
-        while self._came:
-            at, key, payload, encoding = self._came.popleft()
+        """Judge the messages since the last call."""
+        while self._arrived:
+            at, key, payload, encoding = self._arrived.popleft()
             _, name, way, kind = key.split("/")
-            robot = self.robots.get(name)
-            if robot is None:
+            if name not in self.robots:
                 continue
-            before = len(robot.false), robot.unreadable
+            robot = self.robots[name]
             if way == "in":
                 robot.fed_at[kind] = at
             elif kind == "status":
                 robot.take_status(payload)
             else:
                 robot.take_pose(at, Sample(key, payload, encoding))
-            if self.flipping:
-                robot.garbled += len(robot.false) - before[0] + robot.unreadable - before[1]
-                del robot.false[before[0] :]
-                robot.unreadable = before[1]

@@ -1,9 +1,9 @@
 """Robots that drive for hours with a fault every minute: false poses, stuck states, time to recover, leaks.
 
-A router, a node for each site (through the command line), robots that replay simulated drives for ever, and faults
-drawn from the whole matrix, each kind once before any comes again. Robots drive in a town, in which they have to be
-found again within 60 s of a fault, and in deceptive sites, in which only no pose is right: a yard of equal boxes, and
-one whose containers were all moved. An interrupted soak prints its rows so far. Needs the extra ``bench``.
+A router, a node per site (``coview-stream serve``) and robots that replay simulated drives without end. Every fault
+comes once before any comes again. In a town the robots have to be localized again within 60 s of a fault. In two
+deceptive sites (a yard of equal boxes, and a yard whose containers were all moved) no pose is right. An interrupted
+soak prints its rows. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -22,35 +22,42 @@ import numpy as np
 
 from bench.harness.files import folder
 from bench.harness.rows import Row, judged, table
-from bench.soak.faults import ENDS_PROCESSES, FAULTS
-from bench.soak.robots import KINDS, prepare
-from bench.soak.stage import Node, Stage, slope
+from bench.soak.robots import KINDS, Robot, prepare
+from bench.soak.stage import ENDS_PROCESSES, FAULTS, Node, Stage, slope
 from coview_stream.errors import InputError
 
 STUCK = 60.0  # seconds without a pose after a fault, while frames arrive
-FIRST_FIX = 90.0  # seconds, of a machine that starts everything at once
-WARM = 600.0  # seconds of a process that its slopes leave out
-MIN_HOURS = 0.25  # below which a slope is no evidence
-LEAKS = (("megabytes", 1.0, "MB/h"), ("descriptors", 1.0, "per h"))  # figure, and its target per hour
+FIRST_FIX = 90.0  # seconds, on a machine that starts everything at once
+WARM = 600.0  # seconds at a process's start that its slope leaves out
+MIN_HOURS = 0.25  # a slope over less is no evidence
+LEAKS = (("megabytes", 1.0, "MB/h"), ("descriptors", 1.0, "per h"))  # figure, target per hour, unit
 
 
 @dataclass
 class Event:
-    """One fault: when it began, and the recovery of every robot that has to be found again."""
+    """One fault: its start, and the recovery of every robot in the town."""
 
     fault: str
     begin: float  # seconds since the first robot drove
-    recoveries: dict[str, float | None] = field(default_factory=dict)  # None: not in STUCK seconds
-    stuck: list[str] = field(default_factory=list)  # of those, the robots whose frames arrived
-    unfed: list[str] = field(default_factory=list)  # of those, the robots whose frames did not reach the router
+    recoveries: dict[str, float | None] = field(default_factory=dict)  # seconds; None: not within STUCK
+    stuck: list[str] = field(default_factory=list)  # robots that did not recover although frames arrived
+    unfed: list[str] = field(default_factory=list)  # robots whose frames did not reach the router
     false: int = 0
     crashes: int = 0
-    skipped: str = ""  # error of the bench
+    skipped: str = ""  # an error of the benchmark
+
+    def text(self) -> str:
+        """Describe the fault's outcome."""
+        if self.skipped:
+            return f"skipped: {self.skipped}"
+        back = [f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in self.recoveries.items()]
+        marks = [f"{self.false} FALSE"] * bool(self.false) + [f"{self.crashes} CRASHES"] * bool(self.crashes)
+        return "; ".join([*(back or ["no robot to localize"]), *marks])
 
 
 def options(parser: ArgumentParser) -> None:
     """Add duration, robots and faults."""
-    parser.add_argument("--minutes", type=float, default=60.0, help="after all robots have been found (60)")
+    parser.add_argument("--minutes", type=float, default=60.0, help="from the first fixes on (60)")
     parser.add_argument("--robots", type=int, default=2, help="in a town, a yard of equal boxes, a rearranged yard ...")
     parser.add_argument("--every", type=float, default=60.0, metavar="S", help="seconds from fault to fault (60)")
     parser.add_argument("--seed", type=int, default=3101, help="of worlds and faults (3101)")
@@ -58,9 +65,9 @@ def options(parser: ArgumentParser) -> None:
 
 
 def chosen(words: Sequence[str], seed: int) -> Iterator[str]:
-    """Yield names of faults for ever, each once before any comes again, in an order drawn anew each time.
+    """Yield names of faults without end, in random order, each once per round.
 
-    Every other round, from the second on, ends no process of a node, because leaks show only in old processes.
+    Every other round, from the second on, ends no process of a node: leaks show only in old processes.
     """
     names = [name for name in FAULTS if not words or any(word in name for word in words)]
     if not names:
@@ -73,23 +80,29 @@ def chosen(words: Sequence[str], seed: int) -> Iterator[str]:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Run the soak; an interrupted one has a summary as well."""
+    """Run the soak; yield the events, then the summary, also after an interruption."""
     faults = chosen(asked.faults, asked.seed)
     first = next(faults)
     if asked.robots < 1:
         raise InputError(f"--robots {asked.robots}: at least one")
     kinds = [KINDS[k % len(KINDS)] for k in range(asked.robots)]
-    made = {kind: prepare(folder(), kind, asked.seed, asked.quick) for kind in dict.fromkeys(kinds)}
-    stage = Stage([made[kind] for kind in kinds], folder() / "soak", asked.seed)
+    sites = {kind: prepare(folder(), kind, asked.seed, asked.quick) for kind in dict.fromkeys(kinds)}
+    stage = Stage([sites[kind] for kind in kinds], folder() / "soak", asked.seed)
+    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
     begin, events, ended = time.monotonic(), list[Event](), list[float]()
     try:
         try:
-            yield first_fixes(stage)
+            stage.wait(120.0, lambda: all(robot.state for robot in stage.robots))
+            stage.begin()
+            recovered(stage, wanted, time.monotonic(), FIRST_FIX)
+            fixes = {robot.name: robot.recovered and round(robot.recovered - robot.start, 1) for robot in wanted}
+            text = "; ".join(f"{name} {seconds}" for name, seconds in fixes.items())
+            yield Row("soak/first fix, s", text=text, details=fixes)
             begin = time.monotonic()
             stage.wait(min(10.0, asked.every / 3))
             for name in itertools.chain([first], faults):
-                events.append(play(stage, name, begin, asked.every))
-                yield Row(f"soak/{len(events)}: {name}", text=_text(events[-1]), details=asdict(events[-1]))
+                events.append(play(stage, wanted, name, begin, asked.every))
+                yield Row(f"soak/{len(events)}: {name}", text=events[-1].text(), details=asdict(events[-1]))
                 if time.monotonic() > begin + 60 * asked.minutes:
                     break
         except KeyboardInterrupt:
@@ -97,39 +110,31 @@ def rows(asked: Namespace) -> Iterator[Row]:
     finally:
         ended = stage.close()
     hours = (time.monotonic() - begin) / 3600
-    yield from held(stage, hours)
+    for robot in stage.robots:
+        yield from figures(robot, hours)
     yield from survived(events)
     yield from processes(stage.nodes, hours)
     yield Row("soak/end after SIGTERM, worst s", max(ended, default=math.nan))
 
 
-def first_fixes(stage: Stage) -> Row:
-    """Wait until the robots of the town are found for the first time."""
-    stage.wait(120.0, lambda: all(robot.state for robot in stage.robots))
-    stage.begin()
-    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
-    for robot in wanted:
-        robot.expect(robot.start)
-    stage.wait(FIRST_FIX, lambda: all(robot.recovered for robot in wanted))
-    fixes = {robot.name: robot.recovered and round(robot.recovered - robot.start, 1) for robot in wanted}
-    text = "; ".join(f"{name} {seconds}" for name, seconds in fixes.items())
-    return Row("soak/first fix, s", text=text, details=fixes)
+def recovered(stage: Stage, robots: Sequence[Robot], since: float, seconds: float) -> None:
+    """Wait until all robots have a pose from a frame after ``since``, at most some seconds."""
+    for robot in robots:
+        robot.expect(max(since, robot.start))
+    stage.wait(seconds, lambda: all(robot.recovered for robot in robots))
 
 
-def play(stage: Stage, name: str, start: float, every: float) -> Event:
-    """Make one fault, and wait until all robots are found again and the next fault is due."""
-    begin = time.monotonic()
-    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
-    event, false, crashes = Event(name, begin - start), _false(stage), _crashes(stage)
+def play(stage: Stage, wanted: Sequence[Robot], name: str, start: float, every: float) -> Event:
+    """Make one fault; wait until all robots have recovered and the next fault is due."""
+    begin, event = time.monotonic(), Event(name, time.monotonic() - start)
+    false, crashes = _false(stage), _crashes(stage)
     try:
         whole = FAULTS[name](stage)
-    except Exception as error:  # of the bench, not of the product; the soak goes on
+    except Exception as error:  # the benchmark's own error; the soak goes on
         traceback.print_exc()
         event.skipped = f"{type(error).__name__}: {error}"
     else:
-        for robot in wanted:
-            robot.expect(whole)
-        stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
+        recovered(stage, wanted, whole, STUCK)
         now = time.monotonic()
         for robot in wanted:
             event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
@@ -139,9 +144,7 @@ def play(stage: Stage, name: str, start: float, every: float) -> Event:
         node.revive()
     if event.stuck or event.unfed:  # counted; the next fault needs working robots
         stage.rescue()
-        for robot in wanted:
-            robot.expect(time.monotonic())
-        stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
+        recovered(stage, wanted, time.monotonic(), STUCK)
     stage.wait(max(5.0 if every >= 30 else 1.0, begin + every - time.monotonic()))
     event.false, event.crashes = _false(stage) - false, _crashes(stage) - crashes
     return event
@@ -155,36 +158,25 @@ def _crashes(stage: Stage) -> int:
     return sum(len(node.crashes) for node in stage.nodes)
 
 
-def _text(event: Event) -> str:
-    if event.skipped:
-        return f"skipped: {event.skipped}"
-    back = [f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in event.recoveries.items()]
-    marks = [f"{event.false} FALSE"] * bool(event.false) + [f"{event.crashes} CRASHES"] * bool(event.crashes)
-    return "; ".join([*(back or ["no robot had to be found"]), *marks])
-
-
-def held(stage: Stage, hours: float) -> Iterator[Row]:
-    """Yield poses, false ones and latency of every robot."""
-    for robot in stage.robots:
-        name = f"soak/{robot.name} ({robot.site.name})"
-        details = {"states": dict(robot.states), "false": robot.false[:100], "unreadable": robot.unreadable}
-        yield Row(f"{name}: poses", robot.poses, text=f"{robot.poses} in {hours:.2f} h", details=details)
-        wrong = len(robot.false) + robot.unreadable
-        yield judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
-        if robot.garbled:
-            yield Row(f"{name}: false or unreadable while the nodes' link flips bits", robot.garbled)
-        yield Row(f"{name}: worst pose, m / degrees", text=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}")
-        if robot.latencies:
-            parts = np.percentile(1e3 * np.array(robot.latencies), (50, 95, 99))
-            yield Row(f"{name}: cloud to pose p50 / p95 / p99, ms", text=" / ".join(f"{part:.0f}" for part in parts))
+def figures(robot: Robot, hours: float) -> Iterator[Row]:
+    """Yield poses, false poses and latency of a robot."""
+    name = f"soak/{robot.name} ({robot.site.name})"
+    details = {"states": dict(robot.states), "false": robot.false[:100], "unreadable": robot.unreadable}
+    yield Row(f"{name}: poses", robot.poses, text=f"{robot.poses} in {hours:.2f} h", details=details)
+    wrong = len(robot.false) + robot.unreadable
+    yield judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
+    yield Row(f"{name}: worst pose, m / degrees", text=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}")
+    if robot.latencies:
+        parts = np.percentile(1e3 * np.array(robot.latencies), (50, 95, 99))
+        yield Row(f"{name}: cloud to pose p50 / p95 / p99, ms", text=" / ".join(f"{part:.0f}" for part in parts))
 
 
 def survived(events: Sequence[Event]) -> Iterator[Row]:
     """Yield the faults, and the robots that did not recover."""
-    made = [event for event in events if not event.skipped]
-    times = [seconds for event in made for seconds in event.recoveries.values() if seconds is not None]
-    stuck, unfed = (sum(len(getattr(event, name)) for event in made) for name in ("stuck", "unfed"))
-    yield Row("soak/faults", len(made), text=f"{len(made)} of {len({event.fault for event in made})} kinds")
+    played = [event for event in events if not event.skipped]
+    times = [seconds for event in played for seconds in event.recoveries.values() if seconds is not None]
+    stuck, unfed = (sum(len(getattr(event, name)) for event in played) for name in ("stuck", "unfed"))
+    yield Row("soak/faults", len(played), text=f"{len(played)} of {len({event.fault for event in played})} kinds")
     if times:
         yield Row("soak/back after, median / worst s", text=f"{np.median(times):.1f} / {max(times):.1f}")
     yield judged("soak/stuck for 60 s while frames came", f"{stuck} of {len(times) + stuck}", "0", stuck == 0, stuck)
@@ -194,7 +186,7 @@ def survived(events: Sequence[Event]) -> Iterator[Row]:
 
 
 def processes(nodes: Sequence[Node], hours: float) -> Iterator[Row]:
-    """Yield crashes, and the slopes of memory and descriptors of all nodes' processes."""
+    """Yield crashes, and the growth of memory and descriptors of all nodes' processes."""
     crashes = [f"{node.site.name}: {crash}" for node in nodes for crash in node.crashes]
     text = "; ".join(crashes) or "0"
     yield judged("soak/ended by themselves, or not when asked", text, "0", not crashes, len(crashes))
@@ -204,7 +196,7 @@ def processes(nodes: Sequence[Node], hours: float) -> Iterator[Row]:
     for node in nodes:
         parts = sorted({part for part, _ in node.samples})
         for figure, most, unit in LEAKS:
-            slopes = {p: slope([s for (own, _), s in node.samples.items() if own == p], figure, WARM) for p in parts}
+            slopes = {p: slope([s for (of, _), s in node.samples.items() if of == p], figure, WARM) for p in parts}
             known = [value for value in slopes.values() if value is not None]
             total = sum(known) if known else math.nan
             text = "; ".join(f"{part} {'-' if value is None else f'{value:+.2f}'}" for part, value in slopes.items())
@@ -219,13 +211,14 @@ def processes(nodes: Sequence[Node], hours: float) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Lay out the faults by kind."""
+    """Return one table: a line per kind of fault."""
     events = [row.details for row in rows if "recoveries" in row.details]
     body = []
     for name in sorted({event["fault"] for event in events}):
-        own = [event for event in events if event["fault"] == name and not event["skipped"]]
-        times = [s for event in own for s in event["recoveries"].values() if s is not None]
-        lost = sum(len(event["stuck"]) + len(event["unfed"]) + event["crashes"] > 0 for event in own)
+        played = [event for event in events if event["fault"] == name and not event["skipped"]]
+        times = [s for event in played for s in event["recoveries"].values() if s is not None]
+        lost = sum(len(event["stuck"]) + len(event["unfed"]) + event["crashes"] > 0 for event in played)
         spent = [f"{np.median(times):.1f}", f"{max(times):.1f}"] if times else ["-", "-"]
-        body.append([name, str(len(own)), str(len(own) - lost), *spent, str(sum(event["false"] for event in own))])
+        false = str(sum(event["false"] for event in played))
+        body.append([name, str(len(played)), str(len(played) - lost), *spent, false])
     return {"": table(["fault", "times", "survived", "back after, median s", "worst s", "false poses"], body)}

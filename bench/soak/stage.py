@@ -1,15 +1,20 @@
-"""Router, links, nodes, robots and a stranger of a soak, as processes; and the time that passes between them."""
+"""Router, links, nodes and robots of a soak, as processes; and the faults.
+
+A fault acts on all robots, nodes and links. It returns the monotonic time from which robots have to be localized again:
+the end of the damage, or the moment of a fault without duration.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from dataclasses import dataclass, field, replace
+from math import pi
 from pathlib import Path
 from random import Random
 from subprocess import STDOUT
@@ -21,19 +26,17 @@ import psutil
 
 from bench.harness.files import ROOT, environment
 from bench.soak.link import forward
-from bench.soak.robots import REOPEN, SIGNED, Manner, Robot, Site, Watch, drive_on
-from bench.stream.processes import EPOCH_NS, Helper, free_port, open_session, route, rubbish
-from coview_stream.messages import encode_pose
-from coview_stream.messages.types import PoseMessage
+from bench.soak.robots import REOPEN, Manner, Robot, Site, Watch, drive_on
+from bench.stream.processes import Helper, free_port, route, vandalise
 
 MAIN, TRACK, SEARCH = "main", "track", "search"
 _KINDS = (TRACK, SEARCH, "odometry")
 _SAMPLED, _STEP, _GRACE = 10.0, 0.1, 10.0  # seconds: between samples of memory; of waiting; from SIGTERM to SIGKILL
-_KEPT = 1000  # samples of a process that a slope is made of
+_MOST = 1000  # samples per process in a slope
 
 
 class Sampled(NamedTuple):
-    """Anonymous memory of a process, no page of a file, and its open descriptors."""
+    """Memory of a process without pages of files, and its open descriptors."""
 
     at: float
     megabytes: float
@@ -42,7 +45,7 @@ class Sampled(NamedTuple):
 
 @dataclass
 class Node:
-    """``coview-stream serve`` as a process, restarted by hand; ``map`` is its own copy, which faults may damage."""
+    """``coview-stream serve`` as a process; ``map`` is a copy that faults may damage."""
 
     site: Site
     robots: Sequence[str]
@@ -54,7 +57,7 @@ class Node:
     crashes: list[str] = field(default_factory=list)
 
     def start(self) -> None:
-        """Start it; it is not waited for."""
+        """Start the node; do not wait for it."""
         command = [
             sys.executable, "-P", "-m", "coview_stream", "serve", str(self.map), "--state", str(self.state),
             "--robot", *self.robots, "--connect", self.endpoint,
@@ -63,13 +66,13 @@ class Node:
             self.process = psutil.Popen(command, stdout=log, stderr=STDOUT, env=environment(), cwd=ROOT)
 
     def revive(self) -> None:
-        """Start it again if it ended by itself, which counts as a crash."""
+        """Count a crash and start the node again if it ended by itself."""
         if self.process.poll() is not None:
             self.crashes.append(f"exit code {self.process.poll()}")
             self.start()
 
     def family(self) -> dict[str, psutil.Process]:
-        """Return its living processes by their part; a zombie is none."""
+        """Return the living processes by part."""
         parts: dict[str, psutil.Process] = {}
         with contextlib.suppress(psutil.Error):
             if self.process.poll() is None:
@@ -82,7 +85,7 @@ class Node:
         return parts
 
     def send(self, part: str, number: int) -> psutil.Process | None:
-        """Send a signal to one of its processes and return that; None if there is none."""
+        """Send a signal to a process of the node; return the process, or None if there is none."""
         process = self.family().get(part)
         if process is not None:
             with contextlib.suppress(psutil.Error):
@@ -90,15 +93,17 @@ class Node:
         return process
 
     def sample(self) -> None:
-        """Note memory and descriptors of all its processes."""
+        """Record memory and descriptors of all processes."""
         at = time.monotonic()
         for part, process in self.family().items():
             with contextlib.suppress(psutil.Error, OSError):
-                row = Sampled(at, anonymous(process), process.num_fds())
+                lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+                memory = sum(int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "VmSwap:")))
+                row = Sampled(at, memory * 1024 / 1e6, process.num_fds())
                 self.samples.setdefault((part, process.pid), []).append(row)
 
     def end(self, number: int = signal.SIGTERM) -> float:
-        """End it by a signal; the seconds that took, infinite if it had to be killed after its grace."""
+        """End the node by a signal; return the seconds until it ended, infinite if it had to be killed."""
         family, begin = list(self.family().values()), time.monotonic()
         with contextlib.suppress(psutil.Error):
             self.process.send_signal(number)
@@ -116,29 +121,20 @@ class Node:
         return seconds
 
 
-def anonymous(process: psutil.Process) -> float:
-    """Megabytes of a process that are of no file, swapped out or not."""
-    page = Path(f"/proc/{process.pid}/status")
-    if not page.is_file():
-        return float(process.memory_full_info().uss / 1e6)
-    lines = dict(line.split(":", 1) for line in page.read_text().splitlines() if ":" in line)
-    return sum(int(lines[name].split()[0]) * 1024 / 1e6 for name in ("RssAnon", "VmSwap") if name in lines)
-
-
 def slope(rows: Sequence[Sequence[Sampled]], figure: str, warm: float, apart: float = 300.0) -> float | None:
-    """Change per hour of the processes of one part: weighted median over pairs of samples of the same process.
+    """Return the change per hour of one part: the weighted median over pairs of samples of the same process.
 
-    Pairs are at least ``apart`` seconds apart and weigh their distance; no sample is of the first ``warm`` seconds of
-    its process. None without a pair.
+    Pairs are at least ``apart`` seconds apart; the weight is that time. The first ``warm`` seconds of a process do not
+    count. None without a pair.
     """
     slopes, weights = [np.zeros(0)], [np.zeros(0)]
     for samples in rows:
-        kept = [sample for sample in samples if sample.at - samples[0].at >= warm]
-        kept = kept[:: 1 + len(kept) // _KEPT]
-        at = np.array([sample.at for sample in kept])
-        value = np.array([float(getattr(sample, figure)) for sample in kept])
-        i, j = np.triu_indices(len(kept), 1)
-        far = at[j] - at[i] >= apart if len(kept) else np.zeros(0, bool)
+        counted = [sample for sample in samples if sample.at - samples[0].at >= warm]
+        counted = counted[:: 1 + len(counted) // _MOST]
+        at = np.array([sample.at for sample in counted])
+        value = np.array([float(getattr(sample, figure)) for sample in counted])
+        i, j = np.triu_indices(len(counted), 1)
+        far = at[j] - at[i] >= apart if len(counted) else np.zeros(0, bool)
         i, j = i[far], j[far]
         slopes.append((value[j] - value[i]) / (at[j] - at[i]) * 3600)
         weights.append(at[j] - at[i])
@@ -150,54 +146,16 @@ def slope(rows: Sequence[Sequence[Sampled]], figure: str, warm: float, apart: fl
     return float(change[order][np.searchsorted(total, total[-1] / 2)])
 
 
-def roam(conn: Connection, endpoint: str, robots: Sequence[str]) -> None:
-    """Be a stranger on the network: do the deeds that are received, ``(name, seconds)``, until None."""
-    far = np.eye(4)
-    far[:3, 3] = 1e5
-    message = PoseMessage(EPOCH_NS, robots[0], "TRACKING", far, np.eye(6), 1.0, "0" * 64)
-    spoof, source = encode_pose(message, "json"), rubbish(7)
-    outputs = [f"coview/{r}/{o}" for r in robots for o in ("out/pose", "out/status", "rpc/reset", "alive")]
-    inputs = [f"coview/{robot}/in/{kind}" for robot in robots for kind in ("odom", "cloud")]
-    with open_session("client", connect=[endpoint]) as session:
-        conn.send("ready")
-        while (order := conn.recv()) is not None:
-            name, seconds = order
-            end, held = time.monotonic() + seconds, []
-            with contextlib.suppress(Exception):  # whatever the network does to it
-                if name == "claim":
-                    held = [session.liveliness().declare_token(f"coview/{robot}/alive") for robot in robots]
-                    held.append(session.declare_queryable("coview/*/rpc/*", lambda q: q.reply(q.key_expr, b"\xff")))
-                while time.monotonic() < end:
-                    if name == "ask":
-                        for key in ("**", "coview/**", "*/*/rpc/reset"):
-                            list(session.get(key, timeout=2.0))
-                    for key in outputs if name == "spoof" else ():
-                        session.put(key, spoof.payload, encoding=spoof.encoding, attachment=SIGNED)
-                    for key in ("**", *inputs) if name == "delete" else ():
-                        session.delete(key, attachment=SIGNED)
-                    for key in inputs if name == "flood" else ():
-                        trash = next(source)
-                        session.put(key, trash.payload, encoding=trash.encoding or None, attachment=trash.attachment)
-                    time.sleep(0.02 if name == "flood" else 0.1)
-            for declared in held:
-                declared.undeclare()
-            conn.send(name)
-
-
 class Actor(Helper):
-    """A process that takes orders and may answer."""
+    """A process that takes orders."""
 
     def send(self, order: Any) -> None:
         """Give an order."""
         self._ours.send(order)
 
-    def answered(self) -> bool:
-        """Whether an answer was not read yet."""
-        return self._ours.poll()
-
 
 class Stage:
-    """All processes of a soak; robots reach the router over one link that can go bad, nodes over another."""
+    """All processes of a soak. Robots reach the router over one link, nodes over another; both can go bad."""
 
     def __init__(self, sites: Sequence[Site], log: Path, seed: int) -> None:
         self.rng = Random(seed)
@@ -207,17 +165,16 @@ class Stage:
         self.port = free_port()
         self.start_router()
         ports = {name: free_port() for name in ("robots", "nodes")}
-        self.links = {name: self._helper(forward, port, self.port, seed) for name, port in ports.items()}
-        here = f"tcp/127.0.0.1:{self.port}"
+        self.links = {name: self.helper(forward, port, self.port, seed) for name, port in ports.items()}
+        self.here = f"tcp/127.0.0.1:{self.port}"
         over = {name: f"tcp/127.0.0.1:{port}" for name, port in ports.items()}
         self.robots = [Robot(f"r{k + 1}", site) for k, site in enumerate(sites)]
-        self.watch = Watch(here, self.robots)
+        self.watch = Watch(self.here, self.robots)
         log.mkdir(parents=True, exist_ok=True)
         self.nodes = [self._node(site, over["nodes"], log / f"{site.name}.log") for site in dict.fromkeys(sites)]
         self.senders = {
-            robot.name: self._helper(drive_on, over["robots"], robot.site.world, robot.name) for robot in self.robots
+            robot.name: self.helper(drive_on, over["robots"], robot.site.world, robot.name) for robot in self.robots
         }
-        self.stranger = self._helper(roam, here, [robot.name for robot in self.robots])
         self.manner = Manner()
 
     def _node(self, site: Site, endpoint: str, log: Path) -> Node:
@@ -230,13 +187,14 @@ class Stage:
         node.start()
         return node
 
-    def _helper(self, work: Any, *args: Any) -> Actor:
+    def helper(self, work: Any, *args: Any) -> Actor:
+        """Start a process that ends with the stage."""
         self._helpers.append(Actor(work, *args))
         return self._helpers[-1]
 
     def start_router(self) -> None:
-        """Start the router; also again, at the same port."""
-        self.router = self._helper(route, self.port)
+        """Start the router, or restart it at the same port."""
+        self.router = self.helper(route, self.port)
 
     def begin(self) -> None:
         """Let all robots drive."""
@@ -244,14 +202,14 @@ class Stage:
             robot.start = self.senders[robot.name].begin()
 
     def set_manner(self, manner: Manner) -> None:
-        """Let all robots send like that from now on."""
+        """Change how all robots send."""
         for robot in self.robots:
             if manner not in robot.manners:
                 robot.manners.append(manner)
             self.senders[robot.name].send(manner)
 
     def rescue(self) -> None:
-        """Start all nodes again, and let all robots open their sessions anew, as an operator would."""
+        """Restart all nodes and reopen all robots' sessions, as an operator would."""
         for node in self.nodes:
             node.end()
             node.start()
@@ -259,7 +217,7 @@ class Stage:
             sender.send(REOPEN)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let time pass while all is watched; a condition ends it early and is returned."""
+        """Wait and watch; end early on a condition, and return it."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.watch.update()
@@ -273,7 +231,7 @@ class Stage:
         return until()
 
     def close(self) -> list[float]:
-        """End everything; the seconds from SIGTERM to the end of each node."""
+        """End everything; return the seconds from SIGTERM to the end of each node."""
         seconds = []
         for node in self.nodes:
             with contextlib.suppress(psutil.Error):
@@ -287,3 +245,141 @@ class Stage:
                 helper.kill()
         shutil.rmtree(self.folder, ignore_errors=True)
         return seconds
+
+
+def router(stage: Stage) -> float:
+    """Kill the router; start it again three seconds later."""
+    stage.router.kill()
+    stage.wait(3.0)
+    stage.start_router()
+    return time.monotonic()
+
+
+def kill(stage: Stage, part: str) -> float:
+    """SIGKILL a process of every node; restart a main process at once, as a supervisor would."""
+    moment = time.monotonic()
+    for node in stage.nodes:
+        if part == MAIN:
+            node.end(signal.SIGKILL)
+            node.start()
+        else:
+            node.send(part, signal.SIGKILL)
+    return moment if part != MAIN else time.monotonic()
+
+
+def freeze(stage: Stage, part: str, seconds: float = 10.0) -> float:
+    """SIGSTOP a process of every node for a while."""
+    frozen = [node.send(part, signal.SIGSTOP) for node in stage.nodes]
+    stage.wait(seconds)
+    for process in frozen:
+        if process is not None and process.is_running():
+            process.send_signal(signal.SIGCONT)
+    return time.monotonic()
+
+
+def restart(stage: Stage) -> float:
+    """End every node with SIGTERM and start it again."""
+    for node in stage.nodes:
+        seconds = node.end()
+        if seconds > 2.0:
+            node.crashes.append(f"ended {seconds:.1f} s after SIGTERM")
+        node.start()
+    return time.monotonic()
+
+
+def badly(stage: Stage, seconds: float, **changes: object) -> float:
+    """Change how all robots send, for some seconds; 0: for good."""
+    manner, moment = replace(stage.manner, **changes), time.monotonic()  # type: ignore[arg-type]
+    stage.set_manner(manner)
+    if not seconds:
+        stage.manner = manner
+        return moment
+    stage.wait(seconds)
+    stage.set_manner(stage.manner)
+    return time.monotonic()
+
+
+def jump(stage: Stage) -> float:
+    """Move the odometry frame."""
+    x, y = stage.rng.uniform(-40, 40), stage.rng.uniform(-40, 40)
+    return badly(stage, 0.0, shift=(x, y, stage.rng.uniform(-pi, pi)))
+
+
+def clock(stage: Stage, seconds: float) -> float:
+    """Step the sensor clocks."""
+    return badly(stage, 0.0, offset=stage.manner.offset + seconds)
+
+
+def flood(stage: Stage, seconds: float) -> float:
+    """Send rubbish to all inputs."""
+    rogues = [stage.helper(vandalise, stage.here, robot.name, 50.0) for robot in stage.robots]
+    for rogue in rogues:
+        rogue.begin()
+    stage.wait(seconds)
+    for rogue in rogues:
+        rogue.stop()
+    return time.monotonic()
+
+
+def link(stage: Stage, mode: str, seconds: float) -> float:
+    """Spoil the link of the robots or of the nodes."""
+    name = stage.rng.choice(sorted(stage.links))
+    stage.links[name].send(mode)
+    stage.wait(seconds)
+    stage.links[name].send("open")
+    return time.monotonic()
+
+
+def map_file(stage: Stage, hangup: bool) -> float:
+    """Replace every node's map by half of it, or unlink it, then restore it; ``hangup``: send SIGHUP each time."""
+    gone = not hangup and stage.rng.random() < 0.5
+    for whole in (False, True):
+        for node in stage.nodes:
+            part = node.map.with_suffix(".new")
+            if whole:
+                shutil.copy(node.site.map, part)
+            else:
+                content = node.site.map.read_bytes()
+                part.write_bytes(content[: len(content) // 2])
+            part.replace(node.map)
+            if gone and not whole:
+                node.map.unlink()
+            if hangup:
+                node.send(MAIN, signal.SIGHUP)
+        stage.wait(0.0 if whole else 8.0)
+    return time.monotonic()
+
+
+_P = functools.partial
+
+FAULTS: dict[str, Callable[[Stage], float]] = {
+    "router killed, back after 3 s": router,
+    "tracking engine SIGKILL": _P(kill, part=TRACK),
+    "search engine SIGKILL": _P(kill, part=SEARCH),
+    "node SIGKILL, started again": _P(kill, part=MAIN),
+    "node SIGTERM, started again": restart,
+    "tracking engine SIGSTOP 10 s": _P(freeze, part=TRACK),
+    "search engine SIGSTOP 10 s": _P(freeze, part=SEARCH),
+    "node SIGSTOP 8 s": _P(freeze, part=MAIN, seconds=8.0),
+    "no clouds for 10 s": _P(badly, seconds=10.0, clouds=False),
+    "no odometry for 5 s": _P(badly, seconds=5.0, odometry=False),
+    "odometry jumps": jump,
+    "odometry frozen for 8 s": _P(badly, seconds=8.0, frozen=True),
+    "stamps in ms for 8 s": _P(badly, seconds=8.0, unit_ns=1_000_000),
+    "stamps frozen for 5 s": _P(badly, seconds=5.0, stopped=True),
+    "sensor clock steps 1 h ahead": _P(clock, seconds=3600.0),
+    "sensor clock steps 10 min back": _P(clock, seconds=-600.0),
+    "100 frames a second for 8 s": _P(badly, seconds=8.0, cloud_period=0.01),
+    "flood of rubbish for 10 s": _P(flood, seconds=10.0),
+    "link cut for 5 s": _P(link, mode="cut", seconds=5.0),
+    "link cut every 2 s, 10 s": _P(link, mode="flapping", seconds=10.0),
+    "link half-open for 12 s": _P(link, mode="silent", seconds=12.0),
+    "link of 200 ms, 10 s": _P(link, mode="slow", seconds=10.0),
+    "link of 1 Mbit/s, 10 s": _P(link, mode="thin", seconds=10.0),
+    "link that loses 20 %, 10 s": _P(link, mode="lossy", seconds=10.0),
+    "map file gone or half": _P(map_file, hangup=False),
+    "SIGHUP for half a map, and for the whole": _P(map_file, hangup=True),
+}
+
+ENDS_PROCESSES = [name for name in FAULTS if "SIGKILL" in name or "SIGTERM" in name]
+"""Faults that end processes of nodes, whose memory cannot be watched any longer."""

@@ -15,10 +15,9 @@ from nightly import nightly
 
 from bench.harness.files import ROOT, environment
 from bench.harness.rows import Row
-from bench.soak.faults import ENDS_PROCESSES, FAULTS
 from bench.soak.robots import Manner, Robot, Site, content_of, stamp
 from bench.soak.soak import chosen
-from bench.soak.stage import Sampled, slope
+from bench.soak.stage import ENDS_PROCESSES, FAULTS, Sampled, slope
 from coview_stream.clouds import write_tum
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
