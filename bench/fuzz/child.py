@@ -1,24 +1,188 @@
-"""Process that fuzzes a target or replays inputs: ``python -m bench.fuzz.child NAME CORPUS FOUND SECONDS WAY SEED``.
+"""Fuzzing targets, and the process that runs them: ``python -m bench.fuzz.child NAME CORPUS FOUND SECONDS WAY SEED``.
 
-Its memory is limited, and an input that takes too long ends it. An exception that is no CoViewError is a finding: the
-input is kept in FOUND, once for each place that raised, and the fuzzing goes on. ``FOUND/result.json`` is written now
-and then, because an input may end the process. With 0 seconds it replays the corpora of several targets, separated by
-commas, once. It imports the product late: atheris instruments modules as they are imported.
+A target is a function of bytes that returns a value or raises a CoViewError. Any other exception is a finding: the input
+is kept in FOUND, once per place in the code. Memory is limited, and an input that takes too long ends the process, so
+``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME (separated
+by commas). It imports the product late, because atheris instruments modules on import.
 """
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import hashlib
 import json
+import logging
 import os
 import random
 import resource
 import sys
+import tempfile
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
+
+Target = Callable[[bytes], object]
+
+
+def _file(name: str, read: Callable[[Path], object]) -> Target:
+    """Return a target that reads a file with these bytes, in memory where the machine has /dev/shm."""
+    place = Path("/dev/shm")
+    folder = Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=place if os.access(place, os.W_OK) else None))
+    path = folder / name
+
+    def run(data: bytes) -> object:
+        path.write_bytes(data)
+        return read(path)
+
+    return run
+
+
+def _cloud(name: str) -> Target:
+    import laspy  # noqa: F401 - now, so its coverage is seen
+
+    from coview_stream.clouds import read_cloud
+
+    return _file(name, read_cloud)
+
+
+def _message(kind: str, codec: str) -> Target:
+    from coview_stream import messages
+    from coview_stream.messages.types import Sample
+
+    decode: Any = getattr(messages, f"decode_{kind}")
+
+    def run(data: bytes) -> object:
+        size = data[0] % 41 if data else 0  # of the attachment
+        return decode(Sample("coview/r1/in", data[1 + size :], "", data[1 : 1 + size] or None), codec)
+
+    return run
+
+
+def _encoding() -> Target:
+    from coview_stream import messages
+    from coview_stream.errors import CoViewError
+    from coview_stream.messages.types import Sample
+
+    def run(data: bytes) -> object:
+        encoding, _, rest = data.partition(b"\n")
+        key, _, payload = rest.partition(b"\n")
+        sample = Sample(key.decode("utf-8", "replace"), payload, encoding.decode("utf-8", "replace"))
+        for decode in (messages.decode_cloud, messages.decode_odometry, messages.decode_pose):
+            try:
+                decode(sample)
+            except CoViewError:
+                continue
+        return None
+
+    return run
+
+
+def _trajectory() -> Target:
+    from coview_stream.clouds.trajectory import read_kitti_poses, read_times, read_tum
+
+    readers = [_file("a.txt", reader) for reader in (read_tum, read_kitti_poses, read_times)]
+    return lambda data: readers[data[0] % 3](data[1:]) if data else None
+
+
+def _map() -> Target:
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.errors import MapError
+
+    def use(path: Path) -> object:
+        with contextlib.suppress(MapError):  # nearly always the checksum: an attacker would have it right
+            BaseMap.load(path)
+        loaded = BaseMap.load(path, check=False)
+        if loaded.learned is not None:
+            loaded.learned.check()
+        loaded.surveyed(np.zeros((1, 2)))
+        return loaded.crop(np.zeros(3), 5.0)
+
+    return _file("a.coview", use)
+
+
+def _state() -> Target:
+    from coview_stream.stream.node import last_place
+
+    logging.getLogger("coview_stream").setLevel(logging.CRITICAL)
+    name = last_place.file_of(Path(), "r1", "0" * 64).name
+    return _file(name, lambda path: last_place.load(path.parent, "r1", "0" * 64))
+
+
+def _bag(name: str) -> Target:
+    import rosbags.rosbag1
+    import rosbags.rosbag2  # noqa: F401 - as above
+
+    from coview_stream.recordings.open_run import open_run
+
+    def use(path: Path) -> object:
+        run = open_run(path)
+        return run.read(0) if len(run) else None
+
+    return _file(name, use)
+
+
+def _rpc() -> Target:
+    from coview_stream.errors import CoViewError
+    from coview_stream.messages.json_messages import read_object
+    from coview_stream.stream.client.fleet_table import FleetTable
+    from coview_stream.stream.node.status import NodeIdentity
+    from coview_stream.stream.transport import zenoh_io
+    from coview_stream.stream.transport.error_guard import RateLimitedErrors
+    from coview_stream.stream.transport.transport import MAX_REPLY
+
+    log = logging.getLogger("coview_stream")
+    log.setLevel(logging.CRITICAL)
+
+    def ignore(*_: object, **__: object) -> None:
+        """Take a reply."""
+
+    def run(data: bytes) -> object:
+        text = data.decode("utf-8", "replace")
+        pairs = [(name, value) for name, _, value in (part.partition("=") for part in text.split(";"))]
+        answers = zenoh_io.Answers(RateLimitedErrors(log))
+        query = SimpleNamespace(parameters=pairs, key_expr="k", reply=ignore, reply_err=ignore)
+        answers.callback("k", dict)(query)
+        answers.end()
+        answers.run()
+        zenoh_io._error_of(data)
+        NodeIdentity.read(data)
+        with contextlib.suppress(CoViewError):
+            table = FleetTable()
+            table.add_status("r1", read_object(data), 1.0)
+            table.table(2.0)
+        return zenoh_io._json_object("k", data, MAX_REPLY)
+
+    return run
+
+
+TARGETS: dict[str, Callable[[], Target]] = {
+    **{
+        f"{kind}-{codec}": (lambda kind=kind, codec=codec: _message(kind, codec))  # type: ignore[misc]
+        for kind, codecs in {
+            "cloud": ("xyz", "xyzi", "foxglove", "cdr", "keelson"),
+            "odometry": ("json", "foxglove", "cdr", "keelson"),
+            "pose": ("json", "foxglove", "cdr", "keelson"),
+        }.items()
+        for codec in codecs
+    },
+    "encoding": _encoding,
+    **{suffix: (lambda suffix=suffix: _cloud(f"a.{suffix}")) for suffix in ("las", "laz", "ply", "pcd", "npy", "bin")},  # type: ignore[misc]
+    "trajectory": _trajectory,
+    "map": _map,
+    "state": _state,
+    "mcap": lambda: _bag("a.mcap"),
+    "db3": lambda: _bag("a.db3"),
+    "bag": lambda: _bag("a.bag"),
+    "rpc": _rpc,
+}
+"""Functions that make a target and import its libraries, by name."""
+
 
 LIMIT_S = 10  # seconds of one input of a few kB: a hundred times more than any of them needs
 MEMORY = 2 << 30  # bytes besides the libraries: LAZ and PCD may unpack to a hundred times
@@ -27,7 +191,7 @@ _ODD = (bytes(4), b"\xff" * 4, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\xff"
 
 
 class Watch:
-    """A target with its books: executions, accepted inputs, findings by place."""
+    """A target and its counts: executions, accepted inputs, findings by place."""
 
     def __init__(self, target: Any, found: Path) -> None:
         from coview_stream.errors import CoViewError
@@ -55,20 +219,20 @@ class Watch:
             self.write()
 
     def within_time(self, data: bytes) -> None:
-        """Run one input, which is kept as ``current`` in case it ends the process."""
+        """Run one input; keep it as ``current`` in case it ends the process."""
         (self._found / "current").write_bytes(data)
         faulthandler.dump_traceback_later(LIMIT_S, exit=True)
         self(data[:MAX_INPUT])
         faulthandler.cancel_dump_traceback_later()
 
     def write(self) -> None:
-        """Write the books."""
+        """Write the counts."""
         self._written = time.monotonic()
         (self._found / "result.part").write_text(json.dumps(self.books))
         (self._found / "result.part").replace(self._found / "result.json")
 
     def end(self) -> None:
-        """Note that no input ended the process."""
+        """Record that no input ended the process."""
         (self._found / "current").unlink(missing_ok=True)
         self.books["done"] = True
         self.write()
@@ -104,8 +268,6 @@ def mutated(rng: random.Random, seeds: list[bytes]) -> bytes:
 
 def main(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: int) -> None:
     """Fuzz one target, or replay several."""
-    from bench.fuzz.targets import TARGETS
-
     if way == "atheris" and seconds:
         import atheris
 
@@ -119,13 +281,14 @@ def main(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: 
         atheris.Setup([sys.argv[0], *options, str(found / "corpus"), str(corpus)], watch)
         atheris.Fuzz()
         return
-    rng, end = random.Random(seed), time.monotonic() + seconds
+    rng = random.Random(seed)
     for name in names.split(","):
         place, own = (found, corpus) if seconds else (found / name, corpus / name)
         place.mkdir(exist_ok=True)
         seeds = [path.read_bytes() for path in sorted(own.iterdir())]
         watch = Watch(TARGETS[name](), place)
         limit_memory()
+        end = time.monotonic() + seconds
         for data in [] if seconds else seeds:
             watch.within_time(data)
         while time.monotonic() < end:

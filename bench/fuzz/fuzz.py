@@ -20,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from bench.fuzz.targets import TARGETS
+from bench.fuzz.child import TARGETS
 from bench.harness.files import ROOT
 from bench.harness.rows import Row, table
 from coview_stream.errors import InputError

@@ -156,3 +156,24 @@ def _figure(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return NOTHING
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def upper(events: int, runs: int, confidence: float = 0.95) -> float:
+    """Return Clopper-Pearson's one-sided upper bound of a share; 1 without runs."""
+    from scipy.stats import beta
+
+    _checked(events, runs)
+    return 1.0 if events == runs else float(beta.ppf(confidence, events + 1, runs - events))
+
+
+def lower(events: int, runs: int, confidence: float = 0.95) -> float:
+    """Return Clopper-Pearson's one-sided lower bound of a share; 0 without runs."""
+    from scipy.stats import beta
+
+    _checked(events, runs)
+    return 0.0 if events == 0 else float(beta.ppf(1.0 - confidence, events, runs - events + 1))
+
+
+def _checked(events: int, runs: int) -> None:
+    if not 0 <= events <= runs:
+        raise ValueError(f"{events} events of {runs} runs: use 0 to {runs} events")

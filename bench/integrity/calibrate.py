@@ -18,11 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.rows import table
+from bench.harness.rows import table, upper
 from bench.integrity.plan import Site, plan
-from bench.integrity.run import Drive, drive_of
-from bench.integrity.tables import upper
-from bench.integrity.work import map_of
+from bench.integrity.run import Drive, drive_of, map_of
 from coview_stream import BaseMap, Localizer
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, to_local

@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bench.integrity import enclosed, estates
+from bench.integrity import made_up
 from coview_stream import BaseMap
 from coview_stream.descriptors.network import VIEW_NAMES, network
 from coview_stream.errors import CoViewError
@@ -66,14 +66,14 @@ MORE: dict[str, Kind] = {
 """Made of the simulator's parts; all numbers are set by hand."""
 
 DRAWN: dict[str, Callable[[int, float, float], Scene]] = {
-    "terraces": estates.terraces,
-    "plantation": estates.plantation,
-    "yard": estates.yard,
-    "rows": estates.rows,
-    "boxes": estates.boxes,
-    "avenue": enclosed.avenue,
-    "court": enclosed.court,
-    "storey": enclosed.storey,
+    "terraces": made_up.terraces,
+    "plantation": made_up.plantation,
+    "yard": made_up.yard,
+    "rows": made_up.rows,
+    "boxes": made_up.boxes,
+    "avenue": made_up.avenue,
+    "court": made_up.court,
+    "storey": made_up.storey,
 }
 """(seed, size, changed) -> scene."""
 

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 from bench.harness import worlds
 from bench.harness.files import fingerprint, remembered
 from bench.integrity.kinds import built, draw, size_of, surveyed
-from bench.integrity.run import through
-from bench.integrity.work import SITE_CODE
+from bench.integrity.run import SITE_CODE, through
 from bench.stream.processes import EPOCH_NS, Drive, RobotPlan, open_session, stamp_of
 from bench.stream.scores import Posed, errors
 from coview_stream.clouds import read_tum, write_cloud, write_tum

@@ -6,16 +6,22 @@ scale or stands still while the robot is carried.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.tracking.worlds import World, in_gap
+from bench.accuracy.scores import Track
+from bench.tracking.worlds import Recorded, World, in_gap
+from coview_stream import BaseMap, Localizer
+from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
+from coview_stream.localization.result import Fix
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.sensors import FRAME_PERIOD
@@ -288,3 +294,18 @@ QUICK = (
     Scenario("kidnap/quick", _EASY, partial(kidnapped, to=115.0, until=120.0), 0.01),
 )
 """A smoke test: one small town, two minutes of driving; says little about the targets."""
+
+
+def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
+    """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
+    localizer, seconds = Localizer(BaseMap.load(site)), np.zeros(len(drive))
+    fixes: list[Fix | str] = []
+    for k in range(len(drive)):
+        cloud = seen(recorded.read(int(drive.frames[k])), int(drive.cover[k]), int(drive.frames[k]))
+        begin = time.perf_counter()
+        try:
+            fixes.append(localizer.step(cloud, drive.odometry[k], float(drive.stamps[k])))
+            seconds[k] = time.perf_counter() - begin
+        except (CloudError, RunError) as error:
+            fixes.append(str(error))
+    return Track.of(fixes, drive.stamps, seconds)

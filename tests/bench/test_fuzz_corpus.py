@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from bench.fuzz.child import TARGETS
 from bench.fuzz.fuzz import CORPUS, replayed
-from bench.fuzz.targets import TARGETS
 
 
 def test_every_target_has_a_corpus() -> None:

@@ -6,22 +6,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from bench.harness.rows import lower, upper
 from bench.integrity import integrity
+from bench.integrity.integrity import Tally, class_table, classes, false_list, family_table, plain, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, plan
-from bench.integrity.run import judged, mirrored, scaled, tilted
-from bench.integrity.tables import (
-    Tally,
-    class_table,
-    classes,
-    false_list,
-    family_table,
-    lower,
-    plain,
-    reliability_table,
-    upper,
-)
-from bench.integrity.work import append, read
+from bench.integrity.run import append, judged, mirrored, read, scaled, tilted
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 

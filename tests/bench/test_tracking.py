@@ -8,21 +8,8 @@ from drives_with_truth import track, way
 
 from bench.accuracy.scores import errors, losses, recovery, score
 from bench.tracking import protection, tracking
-from bench.tracking.levels import (
-    AXES,
-    NOMINAL,
-    PRODUCT,
-    Sample,
-    beyond_alert_limit,
-    coverage,
-    pooled,
-    shares,
-    since_fix,
-    spread,
-    squares,
-    tail,
-    upper_bound,
-)
+from bench.tracking.protection import PRODUCT, Sample, beyond_alert_limit, tail
+from bench.tracking.tracking import AXES, NOMINAL, coverage, pooled, shares, since_fix, spread, squares
 from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 
@@ -165,11 +152,6 @@ def test_one_pose_counts_of_each_ten_metres_with_its_reported_level():
     np.testing.assert_allclose(sample.doubt, 1.2)
     np.testing.assert_allclose(sample.level(PRODUCT), [[level.metres, level.degrees]] * 4)
     np.testing.assert_array_equal(Sample.from_json(sample.to_json()).trace, sample.trace)
-
-
-@pytest.mark.parametrize(("hits", "of", "bound"), [(0, 2995, 0.001), (0, 299, 0.01), (1, 4742, 0.001), (3, 3, 1.0)])
-def test_bound_is_the_exact_binomial_one(hits, of, bound):
-    assert upper_bound(hits, of) == pytest.approx(bound, rel=0.01)
 
 
 @pytest.mark.parametrize(("factor", "freedom"), [(1.0, 4.0), (0.7, 3.0), (1.5, 12.0)])
