@@ -1,9 +1,9 @@
 """Fuzzing targets, and the process that runs them: ``python -m bench.fuzz.child NAME CORPUS FOUND SECONDS WAY SEED``.
 
-A target is a function of bytes that returns a value or raises a CoViewError. Any other exception is a finding: FOUND keeps
-the input, once per place in the code. Memory is limited, and an input that takes too long ends the process, so
-``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME (separated
-by commas). It imports the product late, because atheris instruments modules on import.
+A target is a function of bytes that returns a value or raises a CoViewError. Any other exception is a finding, and
+FOUND keeps the input, once per place in the code. Memory is limited, and an input that takes too long ends the process,
+so ``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME
+(separated by commas). It imports the product late, because atheris instruments modules on import.
 """
 
 from __future__ import annotations
