@@ -1,9 +1,8 @@
-"""Ambiguity of a map: at which of its stations the map itself would leave a robot undecided, and for how long.
+"""Ambiguity of a map: the distance that a robot has to drive from its stations before it is localized.
 
-At a station the map is seen as a robot would see it (:func:`virtual_scan`), with a share of the site changed since the
-survey, and the place is searched for by a search's evidence: among the places that the votes of the station's own
-descriptors name, and places around it. Where that leaves an error above the risk, the robot drives on, along the
-longest open way, and the keyframes there are added as a search adds them.
+At a station, a virtual scan of the map (:func:`virtual_scan`), with a share of the site changed since the survey, is
+searched for with a search's evidence: among the places by the votes of the station's descriptors, and places around it.
+While the error exceeds the risk, the robot drives on along the longest open way and adds keyframes.
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
 from coview_stream.localization.search.scoring import AROUND, PlaceScorer, Scored
 
-STATIONS = 1000  # looked at, at most; a twentieth of a second each
-_DRIVES = 100  # simulated drives from stations that are not found at once; the rest copy their nearest neighbour
+STATIONS = 1000  # at most; a twentieth of a second each
+_DRIVES = 100  # simulated drives from stations that are ambiguous at once; the rest copy their nearest neighbour
 _CHANGED = 0.3  # share of the site that has changed since the survey
 _KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
 FARTHEST = _KEYFRAMES[-1]
 """Metres that a robot drives at most."""
 _RIGHT_DISTANCE, _RIGHT_ANGLE = 2.0, np.radians(15.0)  # metres, radians: the place itself
-_HEADINGS = 16  # in which a robot may set out, or go on
-_SHARPEST = np.radians(100.0)  # turn on its way
-_STEP = 1.0  # metres: its way is open if every one has a station
-_SHORTEST = 3  # steps; it does not set out for less
-_TALL, _HALF_WIDTH = 2.0, 0.8  # metres: what stands in its way
+_HEADINGS = 16  # directions of a drive
+_SHARPEST = np.radians(100.0)  # turn between two straights
+_STEP = 1.0  # metres: a way is open if all steps have a station
+_SHORTEST = 3  # steps of a way
+_TALL, _HALF_WIDTH = 2.0, 0.8  # metres: height of obstacles, half width of the robot
 _STOREY = 2.5  # metres
 _KEPT_SCANS = 8
 
 # of a virtual scan
 EYE = 1.7
-"""Metres of the sensor above the ground; set by hand."""
+"""Metres of the sensor above the ground."""
 _RANGE = 40.0  # metres
 _NEAREST = 1.0  # metres
 _BEAM = np.radians(1.0)  # cell of the range image that hides what lies behind
@@ -52,9 +51,9 @@ _COLUMNS = 360  # cells around
 _HOLES = ((7.0, 5), (16.0, 3))  # metres up to which a surface of quarter-metre voxels has gaps so many cells wide
 _SLACK, _SLACK_SLOPE = 0.4, 0.03  # metres, plus so many per metre of range, behind the nearest: still in view
 _NOISE = 0.03  # metres
-_CHANGE_PATCH = 4.0  # metres: what stands in one of them changes together
-_MOVED = (3.0, 6.0)  # metres by which it does
-_TABLE = 64  # patches until their draws repeat
+_CHANGE_PATCH = 4.0  # metres: edge of a patch that changes as one
+_MOVED = (3.0, 6.0)  # metres of its shift
+_TABLE = 64  # patches until the random draws repeat
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -62,19 +61,19 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Ambiguity:
-    """How far a robot has to drive from K stations until it is found.
+    """Driving distances from K stations until a robot is localized.
 
     Attributes:
         station: (K,) indices of the stations.
-        position: (K, 3) where they are; metres, relative to the map's origin.
+        position: (K, 3) their positions, metres, relative to the map's origin.
         drive: (K,) metres; 0 at once, infinite if not within 40 m or to the end of the way.
-        driven: (K,) whether that has been tried from there, or is that of the nearest station tried.
-        evidence: (K,) log-likelihood ratio of the place against chance at once, nats.
-        lead: (K,) how much greater it is than that of the best place elsewhere, nats.
-        error: (K,) probability at once that the robot is elsewhere.
-        wrong: (K,) whether a search would have been sure of another place.
-        risk: probability of an error that is accepted.
-        changed: share of the site that was presumed changed since the survey.
+        driven: (K,) whether ``drive`` was simulated there; otherwise it is the nearest simulated station's.
+        evidence: (K,) log-likelihood ratio of the place against chance at the first keyframe, nats.
+        lead: (K,) its difference to the best place elsewhere, nats.
+        error: (K,) probability at the first keyframe that the robot is elsewhere.
+        wrong: (K,) whether a search would have accepted another place.
+        risk: accepted probability of an error.
+        changed: presumed share of the site that has changed since the survey.
     """
 
     station: Indices
@@ -93,7 +92,7 @@ class Ambiguity:
         return len(self.station)
 
     def share(self, metres: float) -> float:
-        """Return the share of the stations from which the robot is found within so many metres."""
+        """Return the share of the stations from which the robot is localized within so many metres."""
         return float((self.drive <= metres).mean()) if len(self) else 0.0
 
 
@@ -104,14 +103,14 @@ def ambiguity(
     changed: float = _CHANGED,
     progress: Progress | None = None,
 ) -> Ambiguity:
-    """Look at a map from at most ``count`` of its stations, evenly spread.
+    """Measure a map's ambiguity at no more than ``count`` of its stations, evenly spread.
 
     Args:
         base_map: the map.
         config: of the search; its risk decides.
         count: of the stations.
         changed: share of the site that has changed since the survey, in [0, 1].
-        progress: told how many stations are done, and of how many.
+        progress: called with the numbers of finished stations and of all.
 
     Raises:
         MapError: the map's likelihood field cannot be used.
@@ -146,7 +145,7 @@ def ambiguity(
 
 
 def sample(base_map: BaseMap, count: int) -> Indices:
-    """Return at most ``count`` stations, evenly spread: one of each cell of a grid, as fine as that allows."""
+    """Return no more than ``count`` stations, evenly spread: one per cell of the finest possible grid."""
     stations = base_map.stations.astype(np.float64)
     cell = base_map.config.block
     stations -= stations.min(axis=0) - 0.5 * cell
@@ -169,7 +168,7 @@ def _counted(items: Indices, progress: Progress | None) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a search makes of a station: whether it is found, and the numbers of :class:`Ambiguity`."""
+    """Result of a search at a station, with the numbers of :class:`Ambiguity`."""
 
     found: bool
     wrong: bool
@@ -179,7 +178,7 @@ class _Seen:
 
 
 class _Rehearsal:
-    """A search without a robot: keyframes at stations, by the map's own points."""
+    """Search without a robot: keyframes at stations, from the map's points."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, changed: float) -> None:
         self.base_map = base_map
@@ -200,7 +199,7 @@ class _Rehearsal:
         return self._look(self.base_map.stations[station].astype(np.float64), station)
 
     def drive(self, station: int) -> tuple[float, bool]:
-        """Drive on from a station; return after how many metres it is found, and whether another place was."""
+        """Drive on from a station; return the metres until it is localized, and whether another place was accepted."""
         if self.begin(station).wrong:
             return np.inf, True
         for metres, place in self._way(self.base_map.stations[station].astype(np.float64)):
@@ -237,7 +236,7 @@ class _Rehearsal:
         return self._scans[key]
 
     def _way(self, place: Floats) -> Iterator[tuple[float, Floats]]:
-        """Yield the metres driven and the places (3,) on the ground of the keyframes that follow."""
+        """Yield the following keyframes: metres driven and places (3,) on the ground."""
         driven, heading = 0.0, None
         due = deque(_KEYFRAMES)
         while due:
@@ -250,7 +249,7 @@ class _Rehearsal:
             driven, place = driven + len(places) * _STEP, places[-1]
 
     def _straight(self, place: Floats, before: float | None, metres: float) -> tuple[Floats, float]:
-        """Return the longest straight way (N, 3) from a place, a metre from place to place, and its heading."""
+        """Return the longest straight way (N, 3) from a place, in steps of a metre, and its heading."""
         scan = self._scan(place)
         high = np.empty((0, 3)) if scan is None else scan.cloud.points[scan.cloud.above] - place
         obstacle = high[high[:, 2] < _TALL, :2]
@@ -268,7 +267,7 @@ class _Rehearsal:
         return best, chosen
 
     def _with_stations(self, place: Floats, along: Floats, steps: int) -> Floats:
-        """Return the steps (N, 3) from a place along a direction (2,) up to where there are no more stations."""
+        """Return the steps (N, 3) from a place along a direction (2,) to the last one with a station."""
         out = []
         z = place[2]
         for k in range(1, steps + 1):
@@ -302,11 +301,10 @@ def _is_right(place: Hypothesis, body: Floats) -> bool:
 
 
 def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: RegistrationConfig) -> ObservedScan | None:
-    """Return what a sensor at ``eye`` (3,) sees of a map; odometry frame = map frame. None where it sees nothing.
+    """Return a sensor's scan of a map at ``eye`` (3,), odometry frame = map frame; None if it is empty.
 
-    The map's points within 40 m are seen where nothing stands before them in cells of a degree, 22 degrees up and down.
-    A share of the site has changed: in so many of its patches of 4 m, the same ones whenever they are seen, what is
-    there stands 3 to 6 m beside where the map has it.
+    It holds the map's points within 40 m that are not hidden, in cells of a degree, 22 degrees up and down. A share of
+    the site has changed: the points of so many 4 m patches, the same in all scans, are shifted by 3 to 6 m.
 
     Args:
         base_map: the map.
@@ -320,12 +318,12 @@ def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: Registr
         return None
     visible += np.random.default_rng(0).normal(0.0, _NOISE, visible.shape).astype(np.float32)
     cloud = prepare_scan(visible + eye.astype(np.float32), eye, config)
-    # a single return says nothing about a direction, where a lidar would have several
+    # a lidar would have several returns per direction, and a single one is ignored
     return ObservedScan.of(cloud, np.repeat(visible, 2, axis=0), pose_from(np.eye(3), eye))
 
 
 def _rearranged(points: Points, changed: float) -> Points:
-    """Move what is in the changed patches: the same ones in every scan."""
+    """Shift the points of the changed patches, the same in all scans."""
     if changed <= 0.0:
         return points
     x, y = np.floor(points[:, :2] * np.float32(1.0 / _CHANGE_PATCH)).astype(np.int64).T
@@ -338,7 +336,7 @@ def _rearranged(points: Points, changed: float) -> Points:
 
 @lru_cache(maxsize=1)
 def _draws() -> tuple[Floats32, Floats32]:
-    """Return for each patch a number (P,) in [0, 1) and a shift (P, 2), metres."""
+    """Return random numbers (P,) in [0, 1) and shifts (P, 2), metres, by patch."""
     rng = np.random.default_rng(20240)
     draw, turn = rng.random(_TABLE**2), rng.uniform(0.0, 2.0 * np.pi, _TABLE**2)
     distance = rng.uniform(*_MOVED, _TABLE**2)
@@ -347,7 +345,7 @@ def _draws() -> tuple[Floats32, Floats32]:
 
 
 def _in_view(points: Points) -> Points:
-    """Return those of (N, 3) points, relative to the sensor, that it sees."""
+    """Return the visible ones of points (N, 3) relative to the sensor."""
     flat = np.hypot(points[:, 0], points[:, 1])
     steep = np.abs(points[:, 2]) < flat * np.float32(np.tan(_BEAM * max(_UP, _DOWN)))
     points = points[steep & (flat < _RANGE)]
@@ -363,7 +361,7 @@ def _in_view(points: Points) -> Points:
 
 
 def _without_holes(nearest: Floats32) -> Floats32:
-    """Let near surfaces, of which a cell may have no point, hide what is behind them."""
+    """Close gaps in near surfaces, so that they hide the points behind them."""
     out = nearest
     for reach, window in _HOLES:
         near = np.where(nearest < reach, nearest, np.float32(np.inf))

@@ -1,8 +1,8 @@
-"""Refinement: the most probable place registered (eq. 13), and the modes of an accepted one.
+"""Refinement: registration of the most probable place (eq. 13), and the modes of an accepted one.
 
-A place is all poses within two metres of its best. Registration leads to the nearest pose that fits, and where there is
-little to see, or much has changed, that may be a wall's neighbour a metre away. So an accepted place is registered from
-poses all around, and the results are weighed by the log-likelihood ratio of the scan, as places are.
+A place is all poses within two metres of its best. Registration converges to the nearest fitting pose; where the scan
+shows little, or the site has changed, that may lie a metre off. So an accepted place is registered from poses all
+around, and the results are weighed by the log-likelihood ratio of the scan, as places are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 
-_WIDEST = 1.0  # metres: coarser scales are spared, as places are scored at the best pose near them
+_WIDEST = 1.0  # metres: coarser scales are not needed, as places are scored at the best pose near them
 _EVERY = 3  # of the scan's points is registered: the score is the same to 0.002 and the pose to a centimetre
 _AROUND = 1.2  # metres between a place and the poses around it: a little more than registration reaches
 _DIRECTIONS = 8
@@ -39,8 +39,8 @@ class Modes:
 
     Attributes:
         best: the most probable one.
-        distances: (M,) metres of each from that.
-        probabilities: (M,) of each; they add up to one.
+        distances: (M,) metres from the best one.
+        probabilities: (M,), which add up to one.
     """
 
     best: Hypothesis
@@ -49,7 +49,7 @@ class Modes:
 
     @property
     def undecided(self) -> float:
-        """Metres to the most probable mode elsewhere, if those elsewhere are together more probable than the best's."""
+        """Metres to the most probable distant mode, if the distant modes together exceed one half; else 0."""
         elsewhere = self.distances > 0.5 * ALERT_METRES
         if self.probabilities[elsewhere].sum() < 0.5:
             return 0.0

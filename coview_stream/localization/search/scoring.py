@@ -1,10 +1,10 @@
-"""Scores of hypotheses: hundreds for one keyframe at once, and the evidence of the best over all keyframes.
+"""Scoring of hypotheses: hundreds per keyframe, and the evidence of the best ones over all keyframes.
 
-Each hypothesis is moved to the best pose around it, up to three metres and seven degrees away, by looking up the map's
-field (:mod:`coview_stream.localization.evidence.observation`). The best places are followed: every later keyframe
-observes the map from them as well, and earlier keyframes are looked up at new places, so that all places are compared
-on the same observations. The evidence of a place is the log-likelihood ratio of the mean of its observations
-(:mod:`coview_stream.localization.evidence.likelihood`) against the background of all others.
+A hypothesis moves to the best pose within three metres and seven degrees by the map's likelihood field
+(:mod:`coview_stream.localization.evidence.observation`). The best places are followed: later keyframes observe the map
+there too, and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of
+a place is the log-likelihood ratio of its mean observation against the background of all others
+(:mod:`coview_stream.localization.evidence.likelihood`).
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
-_KEPT = 16  # places that stay by their evidence, however the newest keyframe ranks them
-_KEYFRAMES = 12  # whose observations a place has: the newest, and those before that are farthest apart
-_LOOK = 8  # keyframes: each group of these is another chance of an error, and is searched for a moved part
-_CHANCE = 128  # places at which earlier keyframes measure how far chance goes on to fit
-_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share what it explains
+_KEPT = 16  # places that stay by their evidence, whatever their rank at the newest keyframe
+_KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones farthest apart
+_LOOK = 8  # keyframes that count as one chance of an error, and are searched for a moved part
+_CHANCE = 128  # places that measure the correlation of chance over keyframes
+_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
-"""From the leader, metres and radians, within which registration leads to it."""
+"""Metres and radians from the leader within which registration converges to it."""
 
 AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
-"""Shifts of the leader, metres, that are hypotheses too: along a corridor it may be anywhere."""
+"""Shifts of the leader, metres, as further hypotheses: along a corridor it may be anywhere."""
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """All places that one keyframe was scored at, best score first; no two are the same.
+    """All distinct places of one keyframe, best score first.
 
     Attributes:
         T_map_odom: (N, 4, 4).
-        scores: (N,) float32 evidence scores in [0, 1]; those of the best hypotheses from four times as many points.
+        scores: (N,) float32 evidence scores in [0, 1]; the best from four times as many points.
         inside: (N,) float32 shares of the scan in the surveyed area.
     """
 
@@ -64,11 +64,11 @@ class Scored:
     Attributes:
         rivals: all places.
         places: followed places, the most probable first.
-        error: probability that the robot is not at the first of them.
+        error: probability that the robot is not at the first place.
         none: probability that it is at no place of the map.
         by_chance: expected number of chance places as good as the first.
-        second: the most probable place elsewhere than the first, if there is any.
-        moved: part of the scan that fits elsewhere than at the first.
+        second: most probable place elsewhere than the first; None without any.
+        moved: part of the scans that fits elsewhere than at the first.
     """
 
     rivals: Rivals
@@ -80,7 +80,7 @@ class Scored:
     moved: MovedPart = NO_PART
 
     def doubted(self, moved: MovedPart) -> Scored:
-        """Return it with the error that a moved part adds: either part may be the one that stayed."""
+        """Add the error by a moved part: either part may be the unmoved one."""
         return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)
 
 
@@ -90,9 +90,9 @@ class _Followed:
 
     Attributes:
         hypotheses: at the newest keyframe.
-        votes: (P,) newest rank in the votes that named each, from 0.
-        observed: (P, W, 7) at the keyframes, oldest first.
-        newest: (P,) row of each among the newest keyframe's poses.
+        votes: (P,) newest ranks in the votes, from 0.
+        observed: (P, W, 7) observations at the keyframes, oldest first.
+        newest: (P,) rows among the newest keyframe's poses.
     """
 
     hypotheses: list[Hypothesis]
@@ -112,13 +112,13 @@ class _Followed:
 
 @dataclass(frozen=True)
 class _Observed:
-    """H hypotheses of a keyframe, followed ones first, at the best poses near them.
+    """Observations of a keyframe at H hypotheses, followed ones first, moved to the best poses near them.
 
     Attributes:
         poses: (H, 4).
         shares: (H, 7) observations.
         scores: (H,) evidence scores.
-        groups: rows of the hypotheses at each place, its best first, the best place first.
+        groups: rows by place, best hypothesis and best place first.
     """
 
     poses: Floats
@@ -128,7 +128,7 @@ class _Observed:
 
     @property
     def first(self) -> Ints:
-        """(N,) row of the best hypothesis at each place."""
+        """(N,) rows of the places' best hypotheses."""
         return np.array([group[0] for group in self.groups], dtype=np.int64)
 
     @property
@@ -138,7 +138,7 @@ class _Observed:
 
 
 class PlaceScorer:
-    """Places of a search, and the observations of the keyframes so far at them."""
+    """Scorer of a search's places, with the keyframes' observations there."""
 
     def __init__(self, base_map: BaseMap) -> None:
         """Score by a map's likelihood field, which is loaded at the first keyframe."""
@@ -160,13 +160,13 @@ class PlaceScorer:
     def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the followed places.
 
-        Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them.
+        Of hypotheses within 2 m and 5 degrees of each other only the best counts.
 
         Args:
             hypotheses: of ``T_map_odom``; the last ``hints`` are pose hints.
-            votes: rank of each in the votes that named it, from 0; any number for a hint.
-            hints: how many pose hints there are.
-            scan: the keyframe's.
+            votes: ranks of the hypotheses in their votes, from 0; any number for a hint.
+            hints: number of pose hints.
+            scan: of the keyframe.
         """
         followed, voted = self._followed, len(hypotheses) - hints
         count = len(followed.hypotheses)
@@ -201,10 +201,7 @@ class PlaceScorer:
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
 
     def _thin_out(self) -> None:
-        """Forget one of too many keyframes: the one nearest to its neighbours, as it adds least of its own.
-
-        The newest stays, and the first: the view far from here is the least like the present one.
-        """
+        """Drop the keyframe nearest to its neighbours if there are too many; the first and the newest stay."""
         if len(self._scans) <= _KEYFRAMES:
             return
         steps = np.linalg.norm(np.diff([scan.body for scan in self._scans], axis=0), axis=1)
@@ -234,7 +231,7 @@ class PlaceScorer:
             np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "shares", "scores")
         )
         coarse = _Observed(poses, shares, scores, [])
-        # a few points rule out all that is far below the best; more points tell the rest apart
+        # a few points rule out most hypotheses; more points rank the rest
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
         closer = scan.many.look_up(layers, poses[promising], Move.NONE)
         shares[promising], scores[promising] = closer.shares, closer.scores
@@ -243,7 +240,7 @@ class PlaceScorer:
     def _follow(
         self, scan: ObservedScan, observed: _Observed, hypotheses: list[Hypothesis], ranks: Ints, hints: int
     ) -> _Followed:
-        """Choose the places to follow: the best now, the best so far, and those that hints came to."""
+        """Choose the places to follow: the best now, the best so far, and those of hints."""
         before = self._followed
         count = len(before.votes)
         T = scan.transforms(observed.poses)
@@ -252,7 +249,7 @@ class PlaceScorer:
             origin = min(group)
             hinted = hints > 0 and max(group) >= len(hypotheses) - hints
             if number < _FOLLOWED or origin < min(_KEPT, count) or hinted:
-                # the votes for the place, if it has any: a hint that came to it takes none away
+                # the place's votes, if any: a hint there does not remove them
                 hypothesis = next(
                     (hypotheses[k] for k in group if hypotheses[k].station is not None), hypotheses[group[0]]
                 )
@@ -269,7 +266,7 @@ class PlaceScorer:
         return _Followed([place for _, place in chosen], votes, shares, newest)
 
     def _look_back(self, T_map_odom: Floats) -> Floats32:
-        """Return the earlier keyframes' observations (P, W, 7) at new places, the drift since then undone."""
+        """Return the earlier keyframes' observations (P, W, 7) at new places, with the drift since undone."""
         out = np.empty((len(T_map_odom), len(self._scans), len(Share)), dtype=np.float32)
         for k in reversed(range(len(self._scans))):
             scan = self._scans[k]
@@ -298,7 +295,7 @@ class PlaceScorer:
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
-            # places around the leader share what it explains
+            # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
         return ratios
@@ -311,13 +308,13 @@ class PlaceScorer:
 
 
 def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bools:
-    """Tell which of (P, 4) poses are more than ``distance`` metres or ``angle`` radians from a leader (4,)."""
+    """Return a mask of the poses (P, 4) more than ``distance`` metres or ``angle`` radians from a leader (4,)."""
     turn = np.abs((poses[:, 3] - leader[3] + np.pi) % (2.0 * np.pi) - np.pi)
     return np.asarray((np.linalg.norm(poses[:, :3] - leader[:3], axis=1) > distance) | (turn > angle))
 
 
 def _places(pose: Floats, rank: Floats32) -> list[list[int]]:
-    """Group poses (H, 4): rows at each place, its best first, the best place first."""
+    """Group poses (H, 4) into places: lists of rows, best pose and best place first."""
     order = np.argsort(-rank, kind="stable")
     x, y, z, yaw = pose[order].astype(np.float32).T
     cos, sin = np.cos(yaw), np.sin(yaw)

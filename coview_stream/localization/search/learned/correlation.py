@@ -12,10 +12,10 @@ from coview_stream.geometry.arrays import Complexes, Floats, Floats32, Ints, Rea
 from coview_stream.localization.search.learned.feature_index import FeatureIndex, half_spectra
 
 MIN_COVERAGE = 0.6
-"""Share of a query's weight that has to lie on surveyed cells; set by hand: at it, scatter has grown by 1.3."""
+"""Least share of a query's weight on surveyed cells: there the scatter has grown by 1.3."""
 
-_BATCH_BYTES = 32 << 20  # of the products that are transformed back together; set by hand
-_EPSILON = 1e-6  # a smaller weight is none; set by hand
+_BATCH_BYTES = 32 << 20  # of the products that are transformed back together
+_EPSILON = 1e-6  # a smaller weight counts as zero
 
 
 def correlate(
@@ -26,26 +26,24 @@ def correlate(
     blocks: Ints | None = None,
     min_coverage: float | None = MIN_COVERAGE,
 ) -> Floats32:
-    """Average a query's cells' inner products with the map's, for its middle at every cell, at every heading.
+    """Return the mean inner products of a query's features with the map's, at all cells and headings.
 
-    A query that reaches beyond the map has less to be compared with. A mean over all weights would count unsurveyed
-    cells as dissimilar ones, and lose the right place at the map's edge to a wrong one inside. So the mean is over the
-    surveyed cells: the right place scores what it would score anywhere. A mean of few cells scatters more, though, and
-    chance would prefer the map's rim; a place with less than ``min_coverage`` of the weight on surveyed cells is not
-    scored. That is -inf, not 0: wrong places may well score less than 0, and no evidence is none against it. To add up
-    several queries, replace -inf by their median.
+    The mean is over surveyed cells: unsurveyed ones would count as dissimilar, and the right place at the map's edge
+    would lose to a wrong one inside. A mean of few cells scatters more and would favour the rim, so a place with less
+    than ``min_coverage`` of the weight on surveyed cells has no score: -inf, not 0, as wrong places may score below 0.
+    To add up several queries, replace -inf by their median.
 
     Args:
-        query: (C, h, h), h even, each cell's features times its weight (see :func:`downsample`); row along
-            y, column along x of the query's frame, the robot between the four cells in the middle.
-        weight: (h, h) not negative. What lies more than h / 2 cells from the middle is left out.
+        query: (C, h, h), h even, features times weights (see :func:`downsample`); row along y, column along x of the
+            query's frame, the robot between the four cells in the middle.
+        weight: (h, h) not negative; cells more than h / 2 from the middle are left out.
         index: of the same cells and dimensions, with a margin of at least h / 2.
         yaws: (K,) headings of the query's frame in the map, radians.
         blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
         min_coverage: smallest share of the weight on surveyed cells; None divides by all the weight.
 
     Returns:
-        (K, H, W); -inf where nothing was scored. The memory's order is (H, W, K): headings of a cell lie together.
+        (K, H, W); -inf without a score. The memory's order is (H, W, K): headings of a cell lie together.
 
     Raises:
         ValueError: query and map do not fit, or no cell has a weight.
@@ -67,17 +65,17 @@ def correlate_turned(
     blocks: Ints | None = None,
     min_coverage: float | None = MIN_COVERAGE,
 ) -> Floats32:
-    """Do what :func:`correlate` does with a query that has been turned.
+    """Correlate a rotated query as :func:`correlate` does.
 
     Args:
         images: (h + 1, h + 1, K, C + 1), the query at K headings; the weight comes last.
         index: as for :func:`correlate`.
-        opposite: whether each image is also compared turned by half a turn.
+        opposite: whether the images are also compared at the opposite headings.
         blocks: as for :func:`correlate`.
         min_coverage: as for :func:`correlate`.
 
     Returns:
-        (K, H, W), or (2 K, H, W): all images turned by half a turn come behind the others.
+        (K, H, W), or (2 K, H, W): the opposite headings come last.
 
     Raises:
         ValueError: no cell has a weight.
@@ -96,7 +94,7 @@ def correlate_turned(
 
 @dataclass(frozen=True)
 class _QuerySpectra:
-    """Spectra (bins, K, C + 1) to multiply the map's with, and the row and column at which the valid part begins."""
+    """Spectra (bins, K, C + 1) of a query, and the first row and column of the valid part of the product."""
 
     spectra: Complexes
     first: int
@@ -105,7 +103,7 @@ class _QuerySpectra:
 def _query_spectra(
     images: Floats32, index: FeatureIndex, opposite: bool
 ) -> tuple[_QuerySpectra] | tuple[_QuerySpectra, _QuerySpectra]:
-    """Transform the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
+    """Return the query's spectra at its headings, divided by the sum of the weights; the weight's comes last."""
     half = images.shape[0] // 2
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _EPSILON).all():
@@ -157,7 +155,7 @@ def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> 
     """Average ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and the weights.
 
     Returns:
-        (C, H / ratio, W / ratio), (H / ratio, W / ratio): what :func:`correlate` takes.
+        (C, H / ratio, W / ratio), (H / ratio, W / ratio): the input of :func:`correlate`.
 
     Raises:
         ValueError: the ratio does not divide the sides, or the weights have another shape.
@@ -175,11 +173,11 @@ def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> 
 
 
 def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
-    """Sample images on a grid of odd size about their middle, rotated by each heading.
+    """Sample rotated images on a grid of odd size about their middle.
 
     Args:
-        images: (C, h, h), h even: the middle lies between cells. What is farther from it than h / 2 cells is left
-            out, as it would be there at some headings only; beyond the image is 0.
+        images: (C, h, h), h even: the middle lies between cells. Cells more than h / 2 from it are left out, as only
+            some headings would show them; outside the image is 0.
         yaws: (K,) radians, counter-clockwise from x (columns) to y (rows).
 
     Returns:
@@ -201,7 +199,7 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
 
 @lru_cache(maxsize=4)
 def _corners(size: int, yaws: tuple[float, ...]) -> tuple[Ints, Floats32]:
-    """Return the four cells (4, N) between which each sample of a turned image lies, and their shares (4, N, 1)."""
+    """Return the four cells (4, N) around the samples of a rotated image, and their weights (4, N, 1)."""
     half = size // 2
     v, u = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij")
     c, s = np.cos(yaws), np.sin(yaws)

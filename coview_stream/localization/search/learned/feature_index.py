@@ -1,4 +1,4 @@
-"""Feature index: the map's features in overlapping blocks with their spectra, one side of the dense correlation."""
+"""Feature index: the map's features in overlapping blocks with their spectra, for the dense correlation."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ import numpy.typing as npt
 from coview_stream.geometry.arrays import Bools, Complexes, Floats32, Ints, Reals
 
 BLOCK = 96
-"""Edge of a block in cells: fast to transform, and two thirds of it are answers."""
+"""Edge of a block in cells: fast to transform, and two thirds of it are valid."""
 
 MARGIN = 16
-"""Cells that a query of 64 m reaches from its middle, at 2 m."""
+"""Cells of 2 m from the middle of a 64 m query to its edge."""
 
 MAX_BYTES = 512 << 20
-"""Memory for the spectra that are kept; set by hand."""
+"""Memory for the spectra."""
 
 
 class FeatureIndex:
-    """Features of a map on a coarse grid, ready to be correlated with queries.
+    """Features of a map on a coarse grid, for correlation with queries by overlap-save.
 
-    The valid part of a block is ``block - 2 margin`` cells on a side; with the margin around it, it is transformed as
-    one (overlap-save). The spectra of all blocks are kept where they take ``max_bytes`` at most (75 MB per km2
-    with 32 dimensions on cells of 2 m), else made anew for every query.
+    The valid part of a block is ``block - 2 margin`` cells on a side. The spectra of all blocks are kept if they fit
+    into ``max_bytes`` (75 MB per km2 with 32 dimensions on cells of 2 m), else computed for every query.
     """
 
     def __init__(
@@ -44,10 +43,10 @@ class FeatureIndex:
             features: (C, H, W), row along y, column along x; float16 or float32, memory-mapped or not.
             corner: (2,) x and y of the lower corner of cell (0, 0), metres.
             cell: edge of a cell, metres.
-            surveyed: (H, W) cells that the map has points of (default: those with any feature that is not 0).
+            surveyed: (H, W) cells with map points (default: those with a non-zero feature).
             block: cells of a block's edge, margins included.
-            margin: cells that a query may reach from its middle.
-            max_bytes: above it the spectra are not kept.
+            margin: cells from the middle of a query to its edge, at most.
+            max_bytes: limit for keeping the spectra.
 
         Raises:
             ValueError: the map has no cells, the mask another shape, or the margins leave nothing of a block.

@@ -1,4 +1,4 @@
-"""Feature matcher: a scan's learned features compared with a map's at every station and heading."""
+"""Feature matcher: comparison of a scan's learned features with a map's at its stations and headings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SIZE = 64.0
 
 _ROUNDING = 1e-6  # cells
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other
-_NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are looked at closely, at least and of all; set by hand
+_NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are compared finely: least number, share of all
 _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its corners, metres
 
 
@@ -45,7 +45,7 @@ class QueryFeatures:
 
     Attributes:
         features: of an image with ``centre`` in its middle, along the axes of the odometry frame.
-        weight: (h, w) of each cell of the local descriptors; zero beyond the reach.
+        weight: (h, w) of the local descriptors' cells; zero beyond the reach.
         centre: (3,) the ground below the robot, odometry frame, metres.
     """
 
@@ -67,9 +67,9 @@ class QueryFeatures:
 
 
 class FeatureMatcher:
-    """A map's learned features, ready to be searched, and the ground network: what searches of one map share.
+    """Matcher of queries with a map's learned features, shared by all searches of the map.
 
-    Nothing is loaded or made before the first query, or :meth:`prepare`.
+    The network and the spectra are loaded at the first query, or by :meth:`prepare`.
     """
 
     def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
@@ -92,7 +92,7 @@ class FeatureMatcher:
 
     @cached_property
     def rasters(self) -> FeatureRasters:
-        """The map's features in the few dimensions that matter, fine and coarse."""
+        """The map's features in their principal dimensions, fine and coarse."""
         return FeatureRasters.of(self.features, self.config.cell, round(0.5 * _SIZE / self.config.cell))
 
     @property
@@ -102,7 +102,7 @@ class FeatureMatcher:
 
     @cached_property
     def cells(self) -> StationCells:
-        """Fine cells in the blocks of the stations; a block smaller than a cell has the one around its station."""
+        """Fine cells of the stations' blocks; a block smaller than a cell has the cell of its station."""
         xy = (self.stations[:, :2].astype(np.float64) - self.rasters.corner) / self.rasters.cell
         half = 0.5 * self._block / self.rasters.cell
         first, last = (np.ceil(xy + side - 0.5 - _ROUNDING).astype(np.int64) for side in (-half, half))
@@ -112,7 +112,7 @@ class FeatureMatcher:
 
     @cached_property
     def _by_coarse_cell(self) -> tuple[Ints, Ints]:
-        """Stations ordered by the coarse cell that they stand in, and where each cell's begin (cells + 1,)."""
+        """Stations in the order of their coarse cells, and the first row of every cell (cells + 1,)."""
         xy = (self.stations[:, :2].astype(np.float64) - self.index.corner) / self.index.cell
         column, row = np.floor(xy).astype(np.int64).T
         inside = (column >= 0) & (column < self.index.width) & (row >= 0) & (row < self.index.height)
@@ -127,11 +127,11 @@ class FeatureMatcher:
 
     @property
     def dense(self) -> bool:
-        """True if the map is small enough to be searched all over."""
+        """Whether the map is small enough for a search of all cells."""
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
-        """Load the network and make the map's spectra, or the first query does.
+        """Load the network and compute the map's spectra, which the first query would do otherwise.
 
         Raises:
             InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
@@ -142,7 +142,7 @@ class FeatureMatcher:
         _ = self.network, self._feature_blocks if self.dense else self.index, self.cells, self._by_coarse_cell
 
     def encode(self, points: Points, centre: Floats) -> QueryFeatures:
-        """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
+        """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,) on the ground below the robot.
 
         Raises:
             InputError, DependencyError: as :meth:`prepare`.
@@ -155,11 +155,10 @@ class FeatureMatcher:
         return QueryFeatures(features, weight, centre)
 
     def vote(self, query: QueryFeatures, near: npt.ArrayLike = (), area: Circle | None = None) -> FeatureVote:
-        """Return a query's vote, which is asked for scores; shift n means yaw -2 pi n / S.
+        """Return a query's vote; shift n means yaw -2 pi n / S.
 
-        Its candidates are found by correlating coarse cells with the query at some headings. On a map too large to be
-        searched all over that is done around the tiles most similar to the query, and around ``near`` (N, 2), metres.
-        With an ``area`` they are all within it.
+        Its candidates come from a correlation of coarse cells at some headings, on a large map only around the tiles
+        most similar to the query and around ``near`` (N, 2), metres. All candidates lie within ``area``, if given.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
@@ -181,7 +180,7 @@ class FeatureMatcher:
     def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
         """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
 
-        Of each cell the best heading of each half turn counts. The second array (N,) numbers cells and half turns.
+        A cell counts with its best heading of either half turn. The second array (N,) numbers cells and half turns.
         """
         order, begin = self._by_coarse_cell
         halves = coarse.reshape(2, len(turned.headings), -1)
@@ -193,7 +192,7 @@ class FeatureMatcher:
         chosen = chosen[np.isfinite(best.ravel()[chosen])]
         half, cell = np.divmod(chosen, best.shape[1])
         shift = turned.headings[heading.ravel()[chosen]] + half * (self.config.yaws // 2)
-        # every station of a chosen cell, at its heading and those up to the next
+        # all stations of a chosen cell, at its heading and those halfway to the next
         number = begin[cell + 1] - begin[cell]
         group = np.repeat(np.arange(len(chosen)), number)
         station = order[np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number) + begin[cell][group]]
@@ -203,10 +202,7 @@ class FeatureMatcher:
         return (np.repeat(station, len(off)), shifts.ravel()), np.repeat(group, len(off))
 
     def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike, area: Circle | None) -> Ints:
-        """Find the blocks of the index around ``near`` (N, 2) and around the tiles most similar to the query.
-
-        Of an ``area``, if there is one, only tiles that it may meet are compared.
-        """
+        """Return the index blocks around ``near`` (N, 2) and the tiles most similar to the query, within ``area``."""
         similarity = self.features.place.astype(np.float32) @ query.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
         tiles_at, number = np.unique(tile, axis=0, return_inverse=True)
@@ -241,7 +237,7 @@ class LearnedRecognizer:
         self.consensus.vote(self.learned.vote(query, hinted, request.area))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks on every storey that they may be on: from above these look alike."""
+        """Return the consensus' peaks on all storeys below and above them: from above these look alike."""
         places: dict[tuple[int | None, int | None], Hypothesis] = {}
         for peak in self.consensus.hypotheses():
             for place in self._storeys(replace(peak, learned=True)):
@@ -249,7 +245,7 @@ class LearnedRecognizer:
         return list(places.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
-        """Return a peak, and the same at the stations above and below."""
+        """Return a peak, and its copies at the stations above and below."""
         grid = self.consensus.grid
         storeys = [] if peak.station is None else grid.storeys(peak.station)
         if len(storeys) < 2:

@@ -1,8 +1,8 @@
-"""Feature rasters: a map's features in the few dimensions that matter, fine and coarse, and votes of queries on them.
+"""Feature rasters: a map's features in their principal dimensions, fine and coarse, and votes of queries on them.
 
-The score of a station and shift is the mean inner product of a query's features with the map's, over the surveyed
-cells, each with the weight that the query gives it. A query that reaches beyond the map so scores as it would anywhere;
-where less than ``MIN_COVERAGE`` of its weight is compared there is no score, for the mean of few cells scatters.
+The score of a station and shift is the weighted mean inner product of a query's features with the map's over the
+surveyed cells. Where less than ``MIN_COVERAGE`` of the weight is compared there is no score, as the mean of few cells
+scatters.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from coview_stream.localization.search.learned.correlation import MIN_COVERAGE, 
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 
 WEIGHT = 7
-"""Number of the dimension, of the eight of a cell, that is the query's weight, and whether the map knows the cell."""
+"""Dimension, of the eight of a cell, that holds the query's weight, and whether the map has the cell."""
 
-_SAMPLE = 1024  # stations and shifts that scores are standardised by: median and MAD are good to 4 %; set by hand
-_STRIDE = 7  # shifts from one of them to the next
-_ENERGY = 0.995  # of the features on a map that the dimensions in which they are compared hold; set by hand
-_TILES = 64  # of a map from which those are found; set by hand
+_SAMPLE = 1024  # scores from which median and MAD are estimated, good to 4 %
+_STRIDE = 7  # shifts between two of them
+_ENERGY = 0.995  # share of the features' energy in the principal dimensions
+_TILES = 64  # from which the principal dimensions are computed
 _COARSE = 2  # fine cells along the edge of a coarse one
-_BLOCK = 6  # edge of a coarse block over its margin: two thirds of it are answers
+_BLOCK = 6  # edge of a coarse block over its margin: two thirds of it are valid
 _BYTE = 127.0
 
 
 @dataclass(frozen=True)
 class StationCells:
-    """Where stations (M, 3) stand on a raster of cells: their blocks have one cell or more.
+    """Blocks of cells around M stations on a raster.
 
     Attributes:
-        first: (M, 2) row and column of the first cell in a station's block, which may lie off the raster.
+        first: (M, 2) row and column of a block's first cell, which may lie off the raster.
         size: (M, 2) rows and columns of the block.
         shape: (2,) rows and columns of the raster.
     """
@@ -50,12 +50,12 @@ class StationCells:
 
 
 class FeatureVote:
-    """Vote that compares a query's features with the map's where it is asked to.
+    """Vote of one query by its learned features.
 
     Attributes:
         centre: (3,) as :attr:`Vote.centre`.
-        images: the query, turned to each heading.
-        named: stations and shifts (K,) that a coarser comparison has found.
+        images: the query at all headings.
+        named: candidate stations and shifts (K,).
     """
 
     def __init__(
@@ -71,9 +71,9 @@ class FeatureVote:
 
         Args:
             centre: (3,) the ground below the robot, odometry frame, metres.
-            raster: the map's features and whether it knows a cell, its margin half an image.
+            raster: the map's features and mask of cells, its margin half an image.
             cells: of the stations.
-            images: the query at each shift, its features and its weight.
+            images: the query's features and weight at all shifts.
             candidates: stations and shifts (N,).
             groups: (N,) group numbers; only the best of a group stays a candidate.
         """
@@ -104,11 +104,11 @@ class FeatureVote:
         return z_scores
 
     def at_all(self, requests: Sequence[Request[FeatureVote]]) -> list[Floats32]:
-        """Return what :meth:`at` of each does, one after the other."""
+        """Return the results of :meth:`at`, one per request."""
         return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
     def scores(self, stations: Ints, shifts: Ints) -> Floats32:
-        """Return scores (K,), higher is better: of a station's block the best cell; -inf where nothing was compared."""
+        """Return the scores (K,) of the best cells in the stations' blocks, higher is better; -inf without any."""
         best = np.full(len(stations), -np.inf, dtype=np.float32)
         rows = np.flatnonzero(stations >= 0)
         first, size = self._cells.first[stations[rows]], self._cells.size[stations[rows]]
@@ -139,7 +139,7 @@ class FeatureVote:
         return median, np.float32(1.4826 * np.median(np.abs(scores - median)) + 1e-6)
 
     def _best_of(self, candidates: tuple[Ints, Ints], groups: Ints) -> tuple[Ints, Ints]:
-        """Return the best stations and shifts, one of each group and each once, best first."""
+        """Return the best distinct stations and shifts, one per group, best first."""
         scores = self.scores(*candidates)
         order = np.argsort(-scores, kind="stable")
         chosen = order[: int(np.isfinite(scores).sum())]
@@ -151,15 +151,15 @@ class FeatureVote:
 
 @dataclass(frozen=True)
 class FeatureRasters:
-    """A map's features, ready to be searched.
+    """Fine and coarse rasters of a map's features.
 
     Attributes:
-        axes: (D, C) orthonormal directions in which features are compared.
+        axes: (D, C) orthonormal principal directions.
         corner: (2,) x and y of the lower corner of cell (0, 0), metres.
         cell: edge of a fine cell, metres.
         shape: fine rows and columns.
-        fine: the features times 127; the last dimension is 127 where there are any.
-        coarse: the features' means over cells twice as large, with their spectra.
+        fine: features times 127; the last dimension is 127 in cells with features.
+        coarse: means of the features over cells twice as large, with their spectra.
     """
 
     axes: Floats32
@@ -171,7 +171,7 @@ class FeatureRasters:
 
     @classmethod
     def of(cls, features: FeatureMap, cell: float, half: int) -> FeatureRasters:
-        """Make them of a map, in cells of ``cell`` metres, for queries that reach ``half`` cells from their middle."""
+        """Return a map's rasters with cells of ``cell`` metres, for queries of ``half`` cells from middle to edge."""
         axes = principal_axes(features.sample(_TILES), _ENERGY, WEIGHT)
         fine, corner = features.coarse(cell, axes)
         filled = np.asarray((fine != 0).any(axis=0))
@@ -188,12 +188,12 @@ class FeatureRasters:
 
 @dataclass(frozen=True)
 class TurnedQuery:
-    """A query turned to S headings, half a turn and more by symmetry.
+    """A query at S headings.
 
     Attributes:
-        images: (S, h + 1, h + 1, 8) int8 the weighted features, and the weight in the last dimension.
-        coarse: (g, g, K, D + 1) float32 the same in coarse cells at some headings of the first half turn.
-        headings: (K,) their numbers.
+        images: (S, h + 1, h + 1, 8) int8 weighted features, and the weight in the last dimension.
+        coarse: (g, g, K, D + 1) float32 in coarse cells at some headings of the first half turn.
+        headings: (K,) numbers of the coarse headings.
     """
 
     images: WindowImages
@@ -202,14 +202,14 @@ class TurnedQuery:
 
 
 def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio: int, yaws: Floats) -> TurnedQuery:
-    """Turn a query to headings.
+    """Rotate a query to headings.
 
     Args:
         local: (C, H, W) features.
-        weight: (H, W) of each cell.
-        rasters: of the map that it is compared with.
-        ratio: of its cells along the edge of a fine cell of the map.
-        yaws: (S,) even in number; the second half is that of the first half a turn on.
+        weight: (H, W) of the cells.
+        rasters: of the map.
+        ratio: number of query cells along the edge of a fine cell of the map.
+        yaws: (S,) even in number; the second half is opposite to the first.
     """
     reduced, shares = downsample(np.tensordot(rasters.axes, local, 1), weight, ratio)
     half = len(yaws) // 2
@@ -224,7 +224,7 @@ def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio
 
 
 def _bytes(values: Floats32) -> Floats32:
-    """Round to what a signed byte holds: features of norm 1 that were rounded before may come to more."""
+    """Round to the range of a signed byte, which rounded features of norm 1 may exceed."""
     return np.rint(np.clip(values, -_BYTE, _BYTE))
 
 
@@ -251,10 +251,9 @@ def _halved(images: Floats32) -> Floats32:
 
 
 def principal_axes(vectors: Floats32, energy: float, most: int) -> Floats32:
-    """Find the fewest orthonormal directions (D, C) that hold a share of the energy of vectors (C, N), best first.
+    """Return the fewest orthonormal directions (D, C) with the share ``energy`` of vectors (C, N), best first.
 
-    Inner products with the vectors change little where a query is reduced to them: what they leave out of a vector of
-    unit norm is ``1 - energy`` of its square in the mean. There are ``most`` directions at most.
+    They leave out ``1 - energy`` of the squares of the vectors in the mean. ``most`` limits their number.
     """
     values, directions = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
     share = np.cumsum(values[::-1]) / max(float(values.sum()), 1e-30)
