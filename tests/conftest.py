@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 import small_world
@@ -20,6 +23,41 @@ def state_home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder))
         yield folder
+
+
+@pytest.fixture
+def no_pauses(monkeypatch):
+    """No pause before a second try to fetch; a map server looks for changes every 0.05 s, its clients wait for 5 s."""
+    for name, seconds in {
+        "basemap.site.fetch._WAIT": 0.0,
+        "clouds.fetch._WAIT": 0.0,
+        "stream.maps.map_server._LOOK": 0.05,
+        "stream.maps.zenoh_source._TIMEOUT": 5.0,
+    }.items():
+        monkeypatch.setattr(f"coview_stream.{name}", seconds)
+
+
+@pytest.fixture
+def available_cores(monkeypatch):
+    """Sets the number of cores that the system allows this process."""
+    return lambda count: monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(count)), raising=False)
+
+
+@pytest.fixture
+def full_disk():
+    """Context in which a file takes so many bytes and no more, as on a full disk."""
+    resource = pytest.importorskip("resource", reason="limits of processes are of POSIX")
+
+    @contextmanager
+    def limited(size):
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

@@ -132,9 +132,8 @@ def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> 
 
 
 def test_servers_and_files_that_cannot_be_used_are_named(
-    server: str, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: str, site: Path, tmp_path: Path, no_pauses: None
 ) -> None:
-    monkeypatch.setattr("coview_stream.clouds.fetch._WAIT", 0.0)
     with pytest.raises(CloudError, match=r"none\.laz: the server answers 404"):
         fetch_cloud(f"{server}/none.laz", tmp_path)
     with pytest.raises(CloudError, match="cannot be reached"):

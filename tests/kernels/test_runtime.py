@@ -230,8 +230,8 @@ def test_workers_are_at_least_one(monkeypatch):
     assert 1 <= runtime.workers() <= 16
 
 
-def test_coview_threads_bounds_the_workers(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+def test_coview_threads_bounds_the_workers(monkeypatch, available_cores):
+    available_cores(8)
     for asked, given in (("", 8), ("1", 1), ("3", 3), ("64", 8)):
         monkeypatch.setenv("COVIEW_THREADS", asked)
         assert runtime.workers() == given

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame
@@ -15,15 +16,21 @@ from coview_stream.recordings import bag_reader
 from coview_stream.recordings.bag_reader import BagReader, bounded
 from coview_stream.recordings.open_run import open_run
 
+Limit = Callable[[int], None]
+
+
+@pytest.fixture
+def limit(monkeypatch: pytest.MonkeyPatch) -> Limit:
+    return lambda size: monkeypatch.setattr(bag_reader, "LIMIT", size)
+
+
 WORDS = [b"", b"a", b"abc" * 1000]
 
 
 @pytest.mark.parametrize(
     ("pack", "make"), [(bz2.compress, bz2.BZ2Decompressor), (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor)]
 )
-def test_frames_come_back_whole_and_no_longer_than_allowed(
-    monkeypatch: pytest.MonkeyPatch, pack: object, make: object
-) -> None:
+def test_frames_come_back_whole_and_no_longer_than_allowed(limit: Limit, pack: object, make: object) -> None:
     unpack = bounded(make)
     for word in WORDS:
         assert unpack(pack(word)) == word
@@ -31,36 +38,36 @@ def test_frames_come_back_whole_and_no_longer_than_allowed(
     bomb = pack(bytes(10**7))
     with pytest.raises(ValueError, match="early"):
         unpack(bomb[: len(bomb) // 2])
-    monkeypatch.setattr(bag_reader, "LIMIT", 10**7)
+    limit(10**7)
     assert len(unpack(bomb)) == 10**7
-    monkeypatch.setattr(bag_reader, "LIMIT", 10**7 - 1)
+    limit(10**7 - 1)
     with pytest.raises(ValueError, match="more than"):
         unpack(bomb)
 
 
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", "MESSAGE"), ("mcap", "STORAGE"), ("sqlite3", "MESSAGE")])
 def test_a_recording_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: str, compression: str
+    tmp_path: Path, limit: Limit, storage: str, compression: str
 ) -> None:
     points = np.zeros((5000, 3), np.float32)
     topics = {"/points": [cloud(k * 10**8, points) for k in range(3)],
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(3)]}  # fmt: skip
     bag = write_bag(tmp_path / "a", topics, storage, compression)
     assert len(open_run(bag)) == 3
-    monkeypatch.setattr(bag_reader, "LIMIT", 1000)
+    limit(1000)
     with pytest.raises(CoViewError, match=r"unpacks to more than|not one"):
         open_run(bag)
 
 
-def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, limit: Limit) -> None:
     points = np.zeros((50_000, 3), np.float32)
     topics = {"/points": [cloud(k * 10**8, points) for k in range(5)],
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(5)]}  # fmt: skip
     bag = write_bag(tmp_path / "a", topics, "sqlite3", "FILE")
     packed = next(bag.glob("*.zstd")).stat().st_size
-    monkeypatch.setattr(bag_reader, "LIMIT", 10_000_000)
+    limit(10_000_000)
     assert len(open_run(bag)) == 5
-    monkeypatch.setattr(bag_reader, "LIMIT", 0)
+    limit(0)
     assert 5 * points.nbytes > bag_reader.RATIO * packed
     with pytest.raises(CoViewError, match="a hundred times its size"):
         open_run(bag)

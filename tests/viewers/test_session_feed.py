@@ -20,9 +20,8 @@ from coview_stream.messages.json_messages import encode_hypotheses
 from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
-from coview_stream.viewers import session_feed
 from coview_stream.viewers.scene import PoseTrack, Sink
-from coview_stream.viewers.session_feed import SessionFeed, asked_of_node, topics_of_base, topics_of_robots
+from coview_stream.viewers.session_feed import MAX_ROBOTS, SessionFeed, asked_of_node, topics_of_base, topics_of_robots
 
 VIEW = MapView(np.zeros(3), np.ones((4, 3), dtype=np.float32), np.ones(4, dtype=bool), None, SHA)
 
@@ -121,17 +120,16 @@ def test_a_sink_that_hangs_holds_up_no_publisher(net, kept):
         going_on.set()
 
 
-def test_names_from_the_network_fill_no_memory(net, kept, monkeypatch):
-    monkeypatch.setattr(session_feed, "MAX_ROBOTS", 3)
+def test_names_from_the_network_fill_no_memory(net, kept):
     with feed(net, kept, topics_of_base("coview")) as made:
-        for k in range(20):
+        for k in range(MAX_ROBOTS + 20):
             put_status(net, f"coview/r{k}/out/status", state="LOST")
             net.publish(cloud(0.0, keys=robot_keys("native", "coview", f"c{k}")))
         kept.wait("status", 1)
         put_status(net, "coview/r0/out/status", state="TRACKING")
         until(lambda: ("r0", {"state": "TRACKING"}) in kept.wait("status"))
-        assert len({robot for robot, _ in kept.wait("status")}) <= 3
-        assert len(made._robots) + len(made._next_scan) <= 6
+        assert len({robot for robot, _ in kept.wait("status")}) <= MAX_ROBOTS
+        assert len(made._robots) + len(made._next_scan) <= 2 * MAX_ROBOTS
 
 
 def test_rubbish_ends_nothing(net, kept):

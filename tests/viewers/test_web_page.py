@@ -16,9 +16,9 @@ from sockets import until
 
 from coview_stream.errors import ConfigError
 from coview_stream.messages.types import PoseMessage
-from coview_stream.stream.transport import http_server
-from coview_stream.stream.transport.http_server import known_host
+from coview_stream.stream.transport.http_server import MAX_CONNECTIONS, known_host
 from coview_stream.viewers.web_page import WebPage
+from coview_stream.viewers.web_sink import MAX_PAGES
 
 
 @pytest.fixture
@@ -104,18 +104,15 @@ def test_events_come_as_they_are_published(served):
             break
 
 
-def test_too_many_pages_are_told_so(served, monkeypatch):
-    monkeypatch.setattr("coview_stream.viewers.web_sink.MAX_PAGES", 2)
-    kept = [get(served, "/events") for _ in range(2)]
+def test_too_many_pages_are_told_so(served):
+    kept = [get(served, "/events") for _ in range(MAX_PAGES)]
     assert get(served, "/events")[0].status == 503
     assert get(served, "/")[0].status == 200
     del kept
 
 
 @pytest.mark.slow
-def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served, monkeypatch):
-    monkeypatch.setattr(http_server, "_SEND_TIMEOUT", 0.2)
-    monkeypatch.setattr(http_server, "_SEND_BUFFER", 4096)
+def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served):
     with socket.create_connection(("127.0.0.1", port(served))) as idle:
         idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         idle.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -131,16 +128,16 @@ def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served, monkey
     assert longest < 0.2  # far below the time that the page was waited for by its own thread
 
 
-def test_more_connections_than_allowed_are_hung_up_on(monkeypatch):
-    monkeypatch.setattr(http_server, "_MAX_CONNECTIONS", 1)
-    with (
-        contextlib.closing(WebPage("127.0.0.1:0")) as served,
-        socket.create_connection(("127.0.0.1", port(served)), timeout=5) as first,
-    ):
-        first.sendall(b"GET / HT")  # half a request
-        time.sleep(0.5)  # it has been accepted
-        with socket.create_connection(("127.0.0.1", port(served)), timeout=5) as second:
-            assert second.recv(1) == b""
+def test_more_connections_than_allowed_are_hung_up_on(served):
+    with contextlib.ExitStack() as stack:
+
+        def connect():
+            return stack.enter_context(socket.create_connection(("127.0.0.1", port(served)), timeout=5))
+
+        for _ in range(MAX_CONNECTIONS):
+            connect().sendall(b"GET / HT")  # half a request
+        time.sleep(0.5)  # they have been accepted
+        assert connect().recv(1) == b""
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:99999", "127.0.0.1:x", "203.0.113.9:0"])

@@ -25,7 +25,7 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 log = logging.getLogger("coview_stream.web")
 
 # limits of a server for people and scrapers: far above their use, far below any harm
-_MAX_CONNECTIONS = 32
+MAX_CONNECTIONS = 32
 _MAX_SECONDS = 2.0  # of receiving a request
 _MAX_BYTES = 8192  # of a request
 _SEND_TIMEOUT = 4.0  # seconds for a reader to take more of a reply
@@ -173,7 +173,7 @@ class _Server(ThreadingHTTPServer):
         self.routes, self.host, self.open_to_names = routes, address[0], open_to_names
         self._name = name
         self._errors = RateLimitedErrors(log)
-        self._free = threading.BoundedSemaphore(_MAX_CONNECTIONS)
+        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:

@@ -20,12 +20,7 @@ from coview_stream.basemap.site.store import TileStore
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def no_waiting(cache, monkeypatch):
-    monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache", "no_pauses")]
 
 
 class Faulty(DirectorySource):

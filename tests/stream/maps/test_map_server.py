@@ -41,11 +41,8 @@ def built(map_points, tmp_path_factory):
 
 
 @pytest.fixture
-def site(built, tmp_path, monkeypatch):
+def site(built, tmp_path, monkeypatch, no_pauses):
     monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("coview_stream.basemap.site.fetch._WAIT", 0.0)
-    monkeypatch.setattr("coview_stream.stream.maps.map_server._LOOK", 0.05)
-    monkeypatch.setattr("coview_stream.stream.maps.zenoh_source._TIMEOUT", 5.0)
     return shutil.copytree(built, tmp_path / "yard")
 
 

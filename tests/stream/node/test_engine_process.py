@@ -358,8 +358,8 @@ def test_close_ends_a_running_job():
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, "1"), (2, "1"), (8, "7")])
-def test_searches_leave_a_core_to_the_others(monkeypatch, cores, threads):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+def test_searches_leave_a_core_to_the_others(monkeypatch, available_cores, cores, threads):
+    available_cores(cores)
     monkeypatch.delenv("COVIEW_THREADS", raising=False)
     assert engine_environment("search")["COVIEW_THREADS"] == threads
     assert "COVIEW_THREADS" not in engine_environment("track")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,20 +84,21 @@ def launched(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
-def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_drive, launched, monkeypatch):
+def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_drive, launched):
     """What is not named is compiled when the first job needs it, which takes a second."""
     track, search = TrackEngine(world_map), SearchEngine(world_map)
     asked = {}
-    for engine in (track, search):
 
-        def run(job, engine=engine, run=engine.run):
+    def watched(engine):
+        def run(job):
             launched.clear()
-            result = run(job)
+            result = engine.run(job)
             asked.setdefault(engine, set()).update(launched)
             return result
 
-        monkeypatch.setattr(engine, "run", run)
-    follower = Follower(track, search, "fresh")
+        return SimpleNamespace(run=run)
+
+    follower = Follower(watched(track), watched(search), "fresh")
     follower.follow(world_drive, range(FRAMES))
     assert follower.fixes[-1].state is State.TRACKING
     for engine in (track, search):

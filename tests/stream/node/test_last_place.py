@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,6 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.stream.node import last_place
 from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, forget, load, remove_parts, save
 
 SHA = "0123456789abcdef" * 4
@@ -162,14 +162,9 @@ def test_unreadable_file_is_a_warning(tmp_path, caplog):
     assert str(file_of(tmp_path, "r1", SHA)) in caplog.text
 
 
-def test_failed_save_raises_and_keeps_the_old_pose(tmp_path, monkeypatch):
+def test_failed_save_raises_and_keeps_the_old_pose(tmp_path, full_disk):
     save(tmp_path, "r1", LAST)
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(last_place.os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with full_disk(100), pytest.raises(OSError, match="too large"):
         save(tmp_path, "r1", replace(LAST, stamp_ns=9))
     same(load(tmp_path, "r1", SHA), LAST)
     (tmp_path / "file").write_text("")
@@ -225,22 +220,26 @@ def test_forget_deletes_the_file_of_one_robot(tmp_path):
     assert load(tmp_path, "r2", SHA) is not None
 
 
-def test_default_state_folder_by_platform(monkeypatch, tmp_path):
-    monkeypatch.setattr(last_place.sys, "platform", "linux")
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert default_folder() == tmp_path / "coview-stream"
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for nowhere in ("", "relative"):
-        monkeypatch.setenv("XDG_STATE_HOME", nowhere)
-        assert default_folder() == tmp_path / "home/.local/state/coview-stream"
-    monkeypatch.setattr(last_place.sys, "platform", "win32")
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "AppData"))
-    assert default_folder() == tmp_path / "AppData/coview-stream"
+@pytest.mark.parametrize(
+    ("platform", "variables", "folder"),
+    [
+        ("linux", {"XDG_STATE_HOME": "{}"}, "coview-stream"),
+        ("linux", {"XDG_STATE_HOME": "", "HOME": "{}/home"}, "home/.local/state/coview-stream"),
+        ("linux", {"XDG_STATE_HOME": "relative", "HOME": "{}/home"}, "home/.local/state/coview-stream"),
+        ("win32", {"LOCALAPPDATA": "{}/AppData"}, "AppData/coview-stream"),
+    ],
+)
+def test_default_state_folder_by_platform(monkeypatch, tmp_path, platform, variables, folder):
+    monkeypatch.setattr(sys, "platform", platform)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(tmp_path))
+    assert default_folder() == tmp_path / folder
 
-    def homeless():
-        raise RuntimeError("no home")
 
-    monkeypatch.delenv("LOCALAPPDATA")
-    monkeypatch.setattr(last_place.Path, "home", homeless)
+@pytest.mark.skipif(os.name != "posix", reason="home as in POSIX")
+def test_user_without_a_home_is_named_the_option(monkeypatch):
+    for name in ("XDG_STATE_HOME", "LOCALAPPDATA", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setitem(sys.modules, "pwd", None)
     with pytest.raises(ConfigError, match="--no-state"):
         default_folder()
