@@ -16,7 +16,7 @@ import pytest
 from sockets import until
 
 import coview_stream
-from bench.harness.run import BENCHMARKS
+from bench.__main__ import BENCHMARKS
 from coview_stream import RejectionReason, State
 from coview_stream.cli import build_parser
 from coview_stream.localization.result import KeyframeEvidence

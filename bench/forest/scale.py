@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.forest.methods import BEST, Chain, on_ground, query_of
+from bench.forest.forest import BEST, Chain, on_ground, query_of
 from bench.forest.worlds import drawn, place
 from bench.harness.files import Clock
 from bench.harness.rows import Row, bounded, number, table

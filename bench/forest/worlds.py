@@ -38,7 +38,7 @@ ANSWERS = (
     *WORLDS,
     *(f"coview_stream/{part}" for part in ("config", "descriptors", "odometry", "basemap", "localization")),
     "coview_kernels",
-    *(f"bench/forest/{part}.py" for part in ("methods",)),
+    "bench/forest/forest.py",
 )
 """What answers to single queries depend on as well, but for the weights. Whole runs depend on all of the product."""
 

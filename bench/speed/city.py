@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
-from bench.accuracy.stages import keyframes_of, right
+from bench.accuracy.ablation import keyframes_of, right
 from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered, today
 from bench.harness.rows import Row, against, bounded, informs, judged, reached
 from bench.harness.worlds import MAPPER, prepared_run, world_name

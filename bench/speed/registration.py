@@ -31,7 +31,7 @@ import numpy as np
 
 from bench.harness.rows import Row, against, informs
 from bench.harness.worlds import opened
-from bench.peers.libraries import SmallGicp, small_gicp
+from bench.peers.peers import SmallGicp, small_gicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32

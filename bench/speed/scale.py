@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from bench.accuracy.stages import Seen, keyframes_of, right
+from bench.accuracy.ablation import Seen, keyframes_of, right
 from bench.harness.files import folder, isolated, peak_megabytes
 from bench.harness.rows import Row, bounded, informs
 from bench.harness.worlds import WORLDS, opened, prepare, world_name

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import ablation, accuracy, conditions, odometry
+from bench.accuracy.ablation import Seen, right
 from bench.accuracy.conditions import Variant, rings, spoilt
-from bench.accuracy.stages import Seen, right
 from bench.harness.worlds import TUNED_SEEDS
 from bench.tracking.drives import scenarios
 from coview_stream.errors import InputError

@@ -8,10 +8,10 @@ import pytest
 
 from bench import __main__ as bench
 from bench import results
+from bench.__main__ import BENCHMARKS, Benchmark, run
 from bench.harness import rows
 from bench.harness.files import fingerprint, remembered
 from bench.harness.rows import Row, against, bounded, failed, informs, judged, medians, reached
-from bench.harness.run import BENCHMARKS, Benchmark, run
 from bench.speed import stages
 from coview_stream.errors import InputError
 

@@ -7,8 +7,7 @@ import pytest
 from drives_with_truth import track
 
 from bench.forest import runs
-from bench.forest.forest import STEPS, false, metric_table, recall, success
-from bench.forest.methods import METHODS, distinct
+from bench.forest.forest import METHODS, STEPS, distinct, false, metric_table, recall, success
 from bench.forest.recognition import rank, read_sites, recalls
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
