@@ -18,13 +18,13 @@ from coview_stream.localization.search.scoring import Rivals, Scored
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
-"""What an evidence's reason ends with where learned features have named the best hypothesis."""
+"""End of an evidence's reason where the best hypothesis came from learned features."""
 
 IN_CIRCLE = " (searched in the circle given)"
-"""What a reason for no pose contains where nothing outside of a circle was searched."""
+"""End of a reason for no pose where only a circle was searched."""
 
 
-MAX_PLACES = 20  # more cannot be told apart on a screen, and a message of them stays below 3 kB
+MAX_PLACES = 20  # as many as a screen shows clearly; the message stays below 3 kB
 
 
 @dataclass(frozen=True)

@@ -49,19 +49,19 @@ def find_rivals(
     config: RegistrationConfig,
     count: int = 1,
 ) -> list[Rival]:
-    """Return the most probable poses beside a registered one (4, 4) that do not lead back there; perhaps none.
+    """Return the most probable poses beside a registered one that do not converge to it; perhaps none.
 
-    Registration starts where odometry leads. After a slip that is beside the right place, and a wall that was moved
-    since the survey may hold it there. So the map is looked up on rings of poses around, and the most probable one is
-    registered, too: a place has to explain the scan better than the best of those.
+    Registration starts at odometry's prediction. After a slip that lies beside the right place, and a wall moved since
+    the survey may hold it there. So the map is looked up on rings of poses around, and the most probable one is
+    registered, too: a place has to explain the scan better than its best rival.
 
     Args:
-        place: how well the map usually explains scans here.
-        scan: the registered one.
-        T_map_odom: (4, 4) where.
+        place: evidence of the tracked place.
+        scan: the registered scan.
+        T_map_odom: (4, 4) its registration.
         target: the map around it.
         config: of the registration.
-        count: so many at most; where more than one is asked for, other headings are tried, too.
+        count: largest number of rivals; above 1 other headings are tried, too.
     """
     T_odom_body = scan.T_odom_body
     here = scan.poses(T_map_odom[None])[0]
@@ -91,7 +91,7 @@ def find_rivals(
 
 
 def _beside(T_map_body: Pose, T_map_other: Pose) -> bool:
-    """Tell whether two poses are so far apart on the ground that it matters: wheels slip along it, not upwards."""
+    """Return whether two poses differ by too much on the ground, where wheels slip."""
     along = T_map_body.copy()
     along[2, 3] = T_map_other[2, 3]
     return matters(*off_by(along, T_map_other))
@@ -105,23 +105,23 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
     return np.asarray(pose + np.concatenate([around + np.array([0.0, 0.0, 0.0, turn]) for turn in turns]))
 
 
-_MAX_RIVALS = 2  # that are looked for where something is wrong
+_MAX_RIVALS = 2  # searched for in a doubtful match
 
 
 @dataclass(frozen=True)
 class MapMatch:
-    """One registration while tracking, and the verdict on it.
+    """Registration while tracking, with its verdict.
 
     Attributes:
-        verdict: whether it is believed, and why not.
-        T_map_body: (4, 4) as the map alone has it.
-        covariance: (6, 6) of that, over (rx, ry, rz, x, y, z) along the map's axes.
-        innovation: squared Mahalanobis distance from where the graph predicts the pose.
-        scan: the registered one; None where registration failed.
+        verdict: the decision and its reason.
+        T_map_body: (4, 4) with the prior removed.
+        covariance: (6, 6) of the pose, over (rx, ry, rz, x, y, z) along the map's axes.
+        innovation: squared Mahalanobis distance from the graph's prediction.
+        scan: the registered scan; None if registration failed.
         target: the map around it; None likewise.
-        rivals: poses metres beside it, the most probable first, as far as they were looked for.
-        moves_place: it contradicts odometry, and is believed in its place.
-        confirms_search: it is the first at an accepted place; verified, it adds nothing to the search's evidence.
+        rivals: poses metres beside it, the most probable first, if they were searched for.
+        moves_place: it contradicts odometry, and is believed instead.
+        confirms_search: it is the first at an accepted place and adds no evidence to the search's.
     """
 
     verdict: MatchVerdict
@@ -141,14 +141,14 @@ class MapMatch:
 
 
 class MapMatcher:
-    """Registers, verifies and judges scans on a base map.
+    """Matcher that registers, verifies and judges scans on a base map.
 
     Attributes:
-        base_map: knows where it has been surveyed.
+        base_map: with the likelihood field.
         config: of registration and acceptance.
-        place: evidence of a scan for the place, against chance.
-        dispute: which place is right while odometry is contradicted.
-        baseline: usual shares, for reasons in words.
+        place: evidence of the tracked place, against chance.
+        dispute: evidence of the possible places while odometry is contradicted.
+        baseline: usual evidence, for reasons in words.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
@@ -246,13 +246,12 @@ class MapMatcher:
         belief: Estimate,
         travelled: float,
     ) -> MapMatch:
-        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
+        """Judge a match that fits, but contradicts odometry: the place moves if the scans support it.
 
-        Where the two places are so near that either is good enough, the lidar's is believed, without a pose until the
-        next frame agrees. Where odometry is known to drift so far, it contradicts nothing: the other place is the one
-        that registration from there converges to. Where the headings alone differ, odometry is wrong: moved objects do
-        not turn about the robot. Where the heights differ by more than odometry drifts, it is not: no wheel slips
-        upwards.
+        If the two places are near enough for either to be right, the lidar's is believed, without a pose until the next
+        frame agrees. Within odometry's drift there is no contradiction. If the headings alone differ, odometry is
+        wrong, as moved objects do not turn about the robot. If the heights differ by more than the drift, odometry is
+        right, as no wheel slips upwards.
 
         Args:
             match: the best of ``tries``.

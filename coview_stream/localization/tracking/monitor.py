@@ -1,11 +1,10 @@
-"""Monitoring a place while tracking: how probable it is that the robot is elsewhere, and the consequences.
+"""Loss monitor: the probability while tracking that the robot is elsewhere, and its consequences.
 
-Two hypotheses are compared: the robot is where it is tracked, or it is not (odometry has jumped, it has been carried,
-the place was wrong from the beginning). Each registration weighs them by its log-likelihood ratio
-(:mod:`coview_stream.localization.tracking.place_evidence`), and driving on makes the second a little more probable.
-A pose is given while its probability is below the integrity risk; once it is more probable than not, the place is lost.
-A scan may show nothing of the right place, so that it takes two views for that.
-docs/integrity.md has the equations.
+Two hypotheses are compared: the robot is at the tracked place, or it is not (odometry has jumped, it has been carried,
+the place was wrong from the beginning). A registration weighs them by its log-likelihood ratio
+(:mod:`coview_stream.localization.tracking.place_evidence`); driving makes the second a little more probable. Poses are
+reported while its probability is below the integrity risk; above one half the place is lost, which takes two views, as
+a scan may show nothing of the right place. docs/integrity.md has the equations.
 """
 
 from __future__ import annotations
@@ -54,19 +53,19 @@ class RejectionReason(StrEnum):
 
 
 _AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT)
-"""Reasons for which no pose is given at once; none of them is evidence that the place is wrong."""
+"""Causes that stop the poses at once, though they are no evidence of a wrong place."""
 
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """The verdict on one registration.
+    """Verdict on one registration.
 
     Attributes:
         cause: of the decision.
         reason: one clause for people.
-        evidence: of the registered pose; None where nothing could be registered.
+        evidence: at the registered pose; None without a registration.
         innovation: squared Mahalanobis distance to the prediction; None likewise.
-        observation: likelihood of the scan at that pose, against chance; None likewise.
+        observation: likelihood of the scan at the pose, against chance; None likewise.
     """
 
     cause: RejectionReason
@@ -77,7 +76,7 @@ class MatchVerdict:
 
     @property
     def verified(self) -> bool:
-        """Whether the registration is believed, as far as it goes by itself."""
+        """Whether the registration by itself is believed."""
         return self.cause is RejectionReason.VERIFIED
 
     @property
@@ -87,12 +86,12 @@ class MatchVerdict:
 
     @property
     def ratio(self) -> float:
-        """Log-likelihood ratio of the place against all others; 0 where nothing could be observed."""
+        """Log-likelihood ratio of the place against all others; 0 without an observation."""
         return self.observation.against_elsewhere if self.observation else 0.0
 
 
 class EvidenceBaseline:
-    """The usual shares of the last metres, for reasons in words and for the width of the protection level.
+    """Usual evidence of the last metres, for reasons in words and for the width of the protection level.
 
     Attributes:
         usual: running average; None before the first registration.
@@ -102,7 +101,7 @@ class EvidenceBaseline:
         self.usual: Evidence | None = None
 
     def clear(self) -> None:
-        """Forget it: the place is another."""
+        """Forget the usual evidence, as the place is another."""
         self.usual = None
 
     def learn(self, evidence: Evidence) -> None:
@@ -114,7 +113,7 @@ class EvidenceBaseline:
         self.usual = Evidence(**{n: before[n] + _NEWEST_SHARE * (now[n] - before[n]) for n in now})
 
     def fallen(self, evidence: Evidence) -> float:
-        """Return how many times better the usual shares are than ``evidence``: 1 at least."""
+        """Return the ratio of the usual score to that of ``evidence``, 1 or more."""
         if self.usual is None:
             return 1.0
         return max(1.0, self.usual.score / evidence.score) if evidence.score > 0 else math.inf
@@ -158,25 +157,25 @@ class Ruling(NamedTuple):
 class LossMonitor:
     """Odds that the place is wrong, from registration to registration.
 
-    Evidence against the place adds up, a view at a time: registrations within ``TrackingConfig.distance`` of each
-    other are one view, of which the newest counts. Evidence for it does not: a place that fits by chance goes on to
-    fit, so that one view has to make up for all that was said against the place.
+    Evidence against the place adds up by views: of registrations within ``TrackingConfig.distance`` the newest counts.
+    Evidence for the place does not add up, as a place that fits by chance goes on to fit: one view has to outweigh all
+    evidence against it.
     """
 
     def __init__(self, rule: AcceptanceConfig, tracking: TrackingConfig) -> None:
-        """Decide by ``rule``; ``tracking`` says how far apart registrations tell something new."""
+        """Decide by ``rule``, with views as long as ``tracking`` says."""
         self._rule = rule
         self._tracking = tracking
         self.begin(0.0)
 
     def begin(self, error: float) -> None:
         """Begin at a place that is wrong with a probability of ``error``."""
-        self._odds = self._before = error / (1.0 - error)  # now, and before the view that is looked at
-        self._viewed_at = -math.inf  # metres driven where that view began
+        self._odds = self._before = error / (1.0 - error)  # now, and before the present view
+        self._viewed_at = -math.inf  # metres driven where the view began
         self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
-        self._since: float | None = None  # stamp of the first registration that was not believed
-        self._seen_since = 0.0  # and of the first of those that was not blind
-        self._required = False  # whether there is to be no pose before a registration is believed
+        self._since: float | None = None  # stamp of the first doubted registration
+        self._seen_since = 0.0  # stamp of the first doubted one that was not blind
+        self._required = False  # whether a registration has to be believed before the next pose
 
     def require_verification(self) -> None:
         """Begin a doubt: the robot may have been carried unseen."""
@@ -200,7 +199,7 @@ class LossMonitor:
         return self._doubt(verdict, stamp, wrong)
 
     def _doubt(self, verdict: MatchVerdict, stamp: float, wrong: float) -> Ruling:
-        """Give no pose, and after a while give the place up."""
+        """Stop the poses; after a while give the place up."""
         if self._since is None:
             self._since = self._seen_since = stamp
         blind = verdict.cause is RejectionReason.BLIND
@@ -216,7 +215,7 @@ class LossMonitor:
         return Ruling(Event.MATCH_REJECTED, reason, wrong, False)
 
     def _weigh(self, verdict: MatchVerdict, stamp: float, travelled: float) -> None:
-        """Update the odds by the metres driven since the newest registration and by this one's evidence."""
+        """Update the odds by the metres driven since the last registration and by the evidence of this one."""
         waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
         self._newest = stamp, travelled
         prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)

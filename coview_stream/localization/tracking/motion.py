@@ -1,8 +1,8 @@
-"""Motion while tracking: how far odometry has driven, how it drifts, and the newest frames' points.
+"""Motion while tracking: distance and drift of odometry, and the newest frames' points.
 
-A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. With one sigma for all, the poses of the
-first would be reported far too uncertain and those of the second too certain. So the rates are measured while tracking:
-the motion between two registrations, less the motion that odometry tells, is its drift and the noise of both.
+A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. One sigma for both would be far too large
+for the first and too small for the second. So the rates are measured while tracking: the motion between two
+registrations less odometry's is its drift plus the noise of both registrations.
 """
 
 from __future__ import annotations
@@ -23,20 +23,19 @@ from coview_stream.localization.registration.register import swap_rotation_trans
 MAX_FRAMES = 40
 """Frames whose points are held."""
 _OWN_NOISE = 0.4
-"""Share of two neighbouring registrations' variances that is in their difference; the rest they have in common.
+"""Share of two neighbouring registrations' variances that is independent and so remains in their difference.
 
-Seen once on the simulated drives of ``python -m bench tracking --seeds 5100``; no command prints it.
+Measured once on the simulated drives of ``python -m bench tracking --seeds 5100``; no command prints it.
 """
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
 
-# set by hand
 _MIN_FACTOR = 0.3  # of the configured rates
 _MAX_FACTOR = 20.0  # likewise: a scale error is no random walk, and looks like a high rate
 _OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
-_MIN_STEP = 0.2  # metres; over less, drift cannot be told from the registrations' noise
+_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
-_MIN_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
+_MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Drift:
         return cls(config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift)
 
     def variances(self, driven: float, turned: float) -> Floats:
-        """Variances (6,) over (rx, ry, rz, x, y, z) that gather in metres driven and radians turned."""
+        """Variances (6,) over (rx, ry, rz, x, y, z) after metres driven and radians turned."""
         rates = np.array([self.tilt, self.tilt, self.yaw, self.position, self.position, self.height])
         gathered: Floats = rates**2 * max(driven, _MIN_DRIVEN)
         gathered[2] += (self.turn * turned) ** 2
@@ -79,7 +78,7 @@ class Drift:
 
 
 class DriftEstimator:
-    """Rates of the drift: the configured ones at first, then measured, and forgotten by the metre."""
+    """Estimator of the drift's rates: a prior at the configured ones, and measurements that fade by the metre."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
@@ -89,7 +88,7 @@ class DriftEstimator:
 
     @property
     def drift(self) -> Drift:
-        """The rates as they seem to be now."""
+        """The present estimate of the rates."""
         factors = np.sqrt(np.clip(self._sums / self._metres, _MIN_FACTOR**2, _MAX_FACTOR**2))
         tilt, yaw, position, height = factors.tolist()
         base = self._nominal
@@ -101,22 +100,22 @@ class DriftEstimator:
         """Add the motion between two registrations, where it is :func:`worth_learning`.
 
         Args:
-            gap: (6,) over (rx, ry, rz, x, y, z): the later one, less where odometry leads from the earlier one.
+            gap: (6,) over (rx, ry, rz, x, y, z): the later pose less odometry's prediction from the earlier one.
             noise: (6,) variances that the two registrations alone account for.
             driven: metres between them.
             turned: radians between them.
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
-        # one by one less than nothing at times; only so is their mean right
+        # single ones may be negative; only so is their mean unbiased
         squares = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
             if driven < _MIN_STEP and rows != [2]:
-                continue  # turning on the spot tells of the heading alone
-            # for the heading, a turn on the spot is worth metres of driving
+                continue  # turning on the spot informs the heading alone
+            # for the heading, a turn on the spot counts as metres of driving
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
-            # by how much it can tell: a registration that hardly knows a direction says nothing of its drift
+            # a registration with a large variance in a direction hardly informs its drift
             weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
             fade = exp(-weight / self._config.drift_memory)
             ratio = float((squares[rows] / nominal[rows]).mean())
@@ -125,7 +124,7 @@ class DriftEstimator:
 
 
 def worth_learning(driven: float, turned: float) -> bool:
-    """Tell whether a motion of so many metres and radians tells drift from the registrations' noise."""
+    """Return whether a motion of so many metres and radians is long enough to measure drift."""
     return driven >= _MIN_STEP or turned >= _MIN_TURN
 
 
@@ -143,9 +142,9 @@ class _Registered:
     """A verified registration.
 
     Attributes:
-        T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
-        covariance: (6, 6) of that.
-        mark: where odometry was.
+        T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
+        covariance: (6, 6) of the pose.
+        mark: odometry at the registration.
     """
 
     T_map_cloud: Pose
@@ -205,19 +204,19 @@ class OdometryTracker:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
         Args:
-            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's own axes, without the prediction's share.
-            covariance: (6, 6) of that.
+            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
+            covariance: (6, 6) of the pose.
         """
         self._confirm()
         self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
 
     def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
-        """Do the same once another registration has followed: odometry contradicts this one. Args as there."""
+        """Learn from a registration that contradicts odometry once the next one follows; args as :meth:`learn`."""
         self._confirm()
         self._unconfirmed = _Registered(T_map_cloud, covariance, self._keyframe)
 
     def forget_registration(self) -> None:
-        """Compare the next registration with none before it; the rates stay."""
+        """Forget the last registration; the rates stay."""
         self._registered = self._unconfirmed = None
 
     def _confirm(self) -> None:
@@ -243,7 +242,7 @@ class OdometryTracker:
 
 
 class ScanBuffer:
-    """Scans of at most 40 frames, newest last, levelled by the calibration when they are read."""
+    """Buffer of the newest 40 scans, levelled by the calibration when they are read."""
 
     def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
         self._config = config
@@ -269,7 +268,7 @@ class ScanBuffer:
         return self._frames[-1][1].levelled(self._calibration.calibration.R_body_cloud) if self._frames else None
 
     def window(self) -> Points:
-        """Points (N, 3) of the newest frames, as :class:`coview_stream.config.TrackingConfig` has it; perhaps none."""
+        """Points (N, 3) of the newest frames, as many as :class:`coview_stream.config.TrackingConfig` allows."""
         parts: list[Points] = []
         count, R_body_cloud = 0, self._calibration.calibration.R_body_cloud
         for travelled, scan in reversed(self._frames):

@@ -1,11 +1,9 @@
-"""Evidence of a tracked place: the search's log-likelihood ratio, with nuisances that are known from before.
+"""Evidence of a tracked place: the search's log-likelihood ratio, with nuisances learned along the path.
 
-In a search nothing is known of how much of the site is as the map has it, of what the survey shows of it, and of how
-foliage lets rays through: these are summed over, and so they are here at first, evenly. A robot that has been here for
-some metres knows them, for they change slowly along its way: those learned at one registration, spread a little, are
-presumed at the next. So the usual shares are part of the likelihood (docs/integrity.md, eq. 6): explaining half of
-the scan speaks for a place in a street where half of everything has changed, and against it where nearly all was
-explained a metre before.
+A search sums over the nuisances: unchanged share of the site, kind of survey, leaks through foliage. Tracking begins
+with an even prior over them and learns them, as they change slowly along the path: their posterior at one registration,
+spread a little, is the prior of the next (docs/integrity.md, eq. 6). So explaining half of the scan speaks for a place
+in a street where half has changed, and against it where nearly all was explained a metre before.
 """
 
 from __future__ import annotations
@@ -25,10 +23,10 @@ from coview_stream.localization.evidence.likelihood import KEPT, NUISANCES, log_
 from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
-_SPREAD = 0.05  # standard deviation of the share q that is as the map has it, from one registration to the next
-_ANOTHER = 0.01  # probability that the kind of survey and the leaks become others meanwhile
-_CHANGED = 1e-4  # probability that the site becomes another one from one registration to the next
-_BESIDE = 0.5  # of a place that is wrong: that the right one lies metres beside it, as odometry has slipped
+_SPREAD = 0.05  # standard deviation of the change of the unchanged share q between two registrations
+_ANOTHER = 0.01  # probability that the kind of survey and the leaks change between two registrations
+_CHANGED = 1e-4  # probability that the whole site changes between two registrations
+_BESIDE = 0.5  # probability that the right place lies metres beside a wrong one, by a slip of odometry
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,8 @@ class Observation:
 
     Attributes:
         ratio: log-likelihood ratio of "the robot is here" against chance.
-        likelihoods: (Q, D, L) the same for each value of the nuisances.
-        rival: log-likelihood ratio of the most probable pose metres beside it; chance's where none is known.
+        likelihoods: (Q, D, L) log-likelihood ratios by the values of the nuisances.
+        rival: log-likelihood ratio of the most probable pose metres beside it; chance's without any.
     """
 
     ratio: float
@@ -82,12 +80,12 @@ class PlaceEvidence:
         return self._ratios(self._likelihoods(scan, T_map_odom))
 
     def look_around(self, scan: ObservedScan, T_map_odom: Pose, poses: Floats) -> tuple[Floats, Floats]:
-        """Move poses (H, 4) to the best near each: where to, and log-likelihood ratios (H,) as around (4, 4)."""
+        """Move poses (H, 4) to the best ones nearby; return them and their log-likelihood ratios (H,)."""
         observed = scan.few.look_up(self._base_map.field, poses, Move.NEAR)
         return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
 
     def learn(self, observation: Observation) -> None:
-        """Learn the nuisances from a registration that is believed; not from others, or a wrong place became usual."""
+        """Learn the nuisances from a believed registration; others would make a wrong place usual."""
         likelihoods = observation.likelihoods
         posterior = self._presumed() * np.exp(likelihoods - likelihoods.max())
         self._known = posterior / posterior.sum()
@@ -107,13 +105,13 @@ class PlaceEvidence:
         return around.background
 
     def _ratios(self, likelihoods: Floats) -> Floats:
-        """Return the log-likelihood ratios (P,) with the nuisances that are presumed."""
+        """Return the log-likelihood ratios (P,) under the prior of the nuisances."""
         top = likelihoods.max(axis=(1, 2, 3))
         weighted = self._presumed() * np.exp(likelihoods - top[:, None, None, None])
         return np.asarray(top + np.log(weighted.sum(axis=(1, 2, 3))))
 
     def _presumed(self) -> Floats:
-        """Return the probabilities (Q, D, L) of the nuisances at the next registration."""
+        """Return the prior (Q, D, L) of the nuisances at the next registration."""
         spread = np.einsum("qr,qdl->rdl", _STEPS, self._known)
         spread = (1.0 - _ANOTHER) * spread + _ANOTHER * spread.mean(axis=(1, 2), keepdims=True)
         return np.asarray((1.0 - _CHANGED) * spread + _CHANGED / np.prod(NUISANCES))

@@ -1,20 +1,19 @@
-"""The pose graph: a chain of keyframes, from odometry between them and registrations to the map, on gtsam's iSAM2.
+"""Pose graph: a chain of keyframes with odometry between them and registrations to the map, on gtsam's iSAM2.
 
-Unknown are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of two poses in
-the tangent of the body, it holds the most probable ones given
+The unknowns are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of two
+poses in the tangent of the body, the estimate is the most probable one given
 
 * a prior on the first: e(T_prior, X_0) ~ N(0, P)
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
 * registrations: e(Y_k, X_k) ~ N(0, R_k), under Huber's kernel on the whitened residual
 
-Only the newest pose is asked for, where filtering and smoothing are the same; smoothing the ones before is what lets a
-registration be weighed again in the light of later ones.
+Only the newest pose is used, where filtering and smoothing agree; smoothing the earlier ones reweighs a registration
+by later ones.
 
-The memory is bounded: a graph that has grown to ``restart`` keyframes is begun anew with the newest ``window`` of them.
-The past is replaced by the *filtering* belief of the first of them: the belief when it was the newest, from all before
-it. For a chain this is exact up to linearisation, as past and future meet in that one pose. The smoothed belief would
-be wrong, for it holds the later measurements that stay in the graph: they would count twice. (gtsam's own
-fixed-lag smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
+The memory is bounded: at ``restart`` keyframes the graph restarts with the newest ``window`` of them. The first one's
+*filtering* belief, from the measurements up to it, replaces the past. For a chain this is exact up to linearisation, as
+past and future meet in one pose. Its smoothed belief would count the later measurements twice. (gtsam's fixed-lag
+smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, adjoint, along_body, along_map, boxminus, inverse, orthonormal
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
-# set by hand
-_RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are weighed again
+_RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are linearised again
 _MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
 
 
@@ -71,10 +69,10 @@ class _Keyframe:
     """One pose of the chain.
 
     Attributes:
-        T: (4, 4) ``T_map_body``, where it is linearised or first was.
-        between: this body in the frame of the one before; None for the first.
+        T: (4, 4) ``T_map_body``, initial or linearised.
+        between: this body in the frame of the previous one; None for the first.
         corrections: measured poses in the map.
-        filtered: belief when it was the newest; None while it is.
+        filtered: belief at the time when it was the newest; None for the newest.
     """
 
     T: Pose
@@ -118,9 +116,7 @@ class PoseGraph:
         self._values: Any = None
 
     def start(self, T_map_body: Pose, covariance: Floats) -> None:
-        """Begin a new chain: all that is known is that the body is here.
-
-        After a (re-)localization, too: nothing of an older chain is carried over.
+        """Begin a new chain with a prior on the first pose; the old chain is dropped.
 
         Args:
             T_map_body: (4, 4) of the first keyframe.
@@ -133,7 +129,7 @@ class PoseGraph:
         self._build(prior)
 
     def move(self, T_between: Pose, covariance: Floats) -> None:
-        """Add a keyframe where odometry leads from the newest.
+        """Add a keyframe by odometry from the newest.
 
         Args:
             T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
@@ -147,7 +143,7 @@ class PoseGraph:
         moved = _Gaussian(step, along_body(spread, T))
         self._keyframes[-1].filtered = before
         self._keyframes.append(_Keyframe(T, moved))
-        # odometry alone teaches nothing about the past, so there is nothing to solve
+        # odometry alone does not change earlier poses, so there is nothing to solve
         Ad = adjoint(inverse(step))
         self._newest_belief = _Gaussian(T, Ad @ before.covariance @ Ad.T + moved.covariance)
         self._add_motion(len(self) - 1)
@@ -158,9 +154,9 @@ class PoseGraph:
         """Add a registration of the newest keyframe, under Huber's kernel.
 
         Args:
-            T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
-                twice (see :func:`coview_stream.localization.registration.register.remove_prior`).
-            covariance: of that measurement alone (see
+            T_map_body: (4, 4) with the prior removed, which would count twice (see
+                :func:`coview_stream.localization.registration.register.remove_prior`).
+            covariance: of the measurement alone (see
                 :func:`coview_stream.localization.registration.register.registration_covariance`).
         """
         T = check_rigid(T_map_body, "T_map_body")
@@ -192,7 +188,7 @@ class PoseGraph:
         return self._newest_belief
 
     def _restart(self) -> None:
-        """Go on with the newest keyframes alone, from the filtering belief of the first of them."""
+        """Restart with the newest keyframes, from the filtering belief of the first one."""
         self._update()
         values = self._isam.calculateEstimate()
         for key, item in enumerate(self._keyframes):
@@ -203,7 +199,7 @@ class PoseGraph:
         self._build(first)
 
     def _build(self, prior: _Gaussian) -> None:
-        """Make iSAM2 of the keyframes held; ``prior`` is all that is known of the first, its corrections included."""
+        """Build iSAM2 from the keyframes; ``prior`` includes the corrections of the first one."""
         gtsam = self._gtsam
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(_RELINEARIZE)
@@ -219,7 +215,7 @@ class PoseGraph:
         self._update()
 
     def _update(self) -> None:
-        """Give iSAM2 the new factors and values, and linearise again the poses that they move."""
+        """Give iSAM2 the new factors and values, and relinearise the poses that they move."""
         self._isam.update(self._factors, self._values)
         self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
         for _ in range(_MAX_UPDATES):

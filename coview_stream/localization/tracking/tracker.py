@@ -43,7 +43,7 @@ class Tracker:
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
-        ground: by how much the robot's ground lies above the survey's, metres.
+        ground: offset of the site's ground against the survey's.
         odometry: metres driven, and drift.
     """
 
@@ -85,7 +85,7 @@ class Tracker:
         self._scans.clear()
 
     def prefetch_map(self, T_odom_body: Pose) -> None:
-        """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
+        """Crop the map on a frame without a registration, as a new crop takes as long as one."""
         if (target := self._target(T_odom_body)) is not None:
             target.prepare(self.config.registration.method)
 
@@ -104,7 +104,7 @@ class Tracker:
         return bool(variances[2] > yaw**2 or variances[3] > position**2)
 
     def looks_displaced(self, T_odom_body: Pose) -> bool:
-        """Whether the newest frame lies on the map so much less than the ones before that it should be registered."""
+        """Whether the newest frame fits the map so much less than usual that it should be registered."""
         target, points = self._target(T_odom_body), self._scans.newest
         if target is None or points is None:
             return False
@@ -115,10 +115,10 @@ class Tracker:
     def start(
         self, registration: Registration, T_odom_body: Pose, travelled: float, T_odom_found: Pose | None = None
     ) -> None:
-        """Begin with an accepted place; it may not have converged yet: its own covariance is not believed.
+        """Begin with an accepted place, with a wide covariance, as its registration may not have converged.
 
         Args:
-            registration: of the keyframe that it was found with.
+            registration: of the accepted keyframe.
             T_odom_body: (4, 4) odometry of the newest frame.
             travelled: metres that odometry had driven at that keyframe.
             T_odom_found: (4, 4) odometry of that keyframe; None if it is the newest frame.
@@ -145,11 +145,11 @@ class Tracker:
         """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
         Args:
-            cloud: (N, 3) the newest frame, which has been added, in the sensor's own axes.
+            cloud: (N, 3) the newest frame, already added, in the sensor's axes.
             T_odom_body: (4, 4) its odometry.
-            standing_still: by its odometry the robot stands still: use only frames since the last registration, and
-                believe the odometry a little less; standing and looking again and again must not add up to certainty.
-            newest_only: use the newest frame alone: something is wrong with it, or with earlier ones.
+            standing_still: by odometry; use only frames since the last registration, and trust odometry a little less:
+                repeated views of a standing robot must not add up to certainty.
+            newest_only: use the newest frame alone, as it or earlier ones are in doubt.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
@@ -161,7 +161,7 @@ class Tracker:
         points = prepare_scan(self._scans.window(), T_odom_body[:3, 3], self.config.registration)
         points = self.ground.lower(points)
         newest = self._scans.newest
-        # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
+        # older frames complete a sparse newest one, but cannot replace a blind one
         count = 0 if newest is None else min(len(points.points), len(newest))
         if count < _MIN_POINTS:
             verdict = MatchVerdict(RejectionReason.BLIND, f"only {count} points to register")
@@ -181,12 +181,12 @@ class Tracker:
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
-        """Correct the belief by a registration at the newest frame; one that is not believed leaves it as it is."""
+        """Correct the belief by a registration at the newest frame, if it is believed."""
         verdict = match.verdict
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
-            # odometry has slipped, or drifts as it has done before; go on where the lidar says
+            # odometry has slipped, or drifts as usual: go on at the lidar's pose
             self.odometry.learn_once_confirmed(self._of_cloud(match.T_map_body), match.covariance)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
@@ -213,7 +213,7 @@ class Tracker:
         return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
 
     def protection_level(self) -> ProtectionLevel:
-        """Metres and degrees that the error exceeds at most once in a thousand, wider as less is seen than usual."""
+        """Metres and degrees that the error exceeds once in a thousand, wider if the evidence is below the usual."""
         return protection_level(self.reported_covariance(), self._doubt)
 
     # ---- inside
@@ -222,14 +222,14 @@ class Tracker:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
-        """Begin a new graph: nothing that was believed before counts."""
+        """Begin a new graph without the old one's information."""
         self._matcher.dispute.clear()
         self._graph.start(self._of_cloud(T_map_body), covariance)
         self.odometry.set_keyframe(T_odom_body)
         self._set_belief(T_odom_body)
 
     def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
-        """Add a keyframe where odometry leads; return its pose and covariance."""
+        """Add a keyframe by odometry; return its pose and covariance."""
         driven, turned = self.odometry.since_keyframe()
         spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self.odometry.motion(T_odom_body)
@@ -240,13 +240,13 @@ class Tracker:
         return self._belief()
 
     def _belief(self) -> Estimate:
-        """Return the newest keyframe's pose, of the body by the present calibration; its covariance is the cloud's."""
+        """Return the newest keyframe's body pose by the present calibration, with the cloud's covariance."""
         of_cloud = self._graph.estimate
         level = inverse(self._calibration.calibration.T_body_cloud)
         return Estimate(of_cloud.T_map_body @ level, of_cloud.covariance)
 
     def _of_cloud(self, T_map_body: Pose) -> Pose:
-        """Return the pose (4, 4) of the cloud in the sensor's own axes."""
+        """Return the pose (4, 4) of the cloud in the sensor's axes."""
         return T_map_body @ self._calibration.calibration.T_body_cloud
 
     def _set_belief(self, T_odom_body: Pose) -> None:
@@ -260,7 +260,7 @@ class Tracker:
             raise ValueError("nothing can be learned from a match without a registration")
         self._doubt = self._matcher.baseline.fallen(evidence)
         self._matcher.baseline.learn(evidence)
-        if self.odometry.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
+        if self.odometry.travelled - self._learned_at >= self.config.tracking.distance:  # once per view
             self._learned_at = self.odometry.travelled
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
