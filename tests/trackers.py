@@ -8,17 +8,24 @@ import numpy as np
 import small_world
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import Registration
 from coview_stream.localization.tracking.tracker import Tracker
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])
 OFF = pose_from(np.eye(3), [0.2, -0.15, 0.0])
 """How far from the truth a tracker begins."""
+
+
+def follow(localizer, drive, frames=None, start=0.0):
+    """Fixes of a drive's frames, two a second: the first ``frames`` of them, these, or all."""
+    numbers = range(len(drive.clouds))[:frames] if frames is None or isinstance(frames, int) else frames
+    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], start + 0.5 * k) for k in numbers]
 
 
 def registration(T_map_odom):
@@ -28,6 +35,14 @@ def registration(T_map_odom):
 def garbage(seed=1, count=6000):
     """A frame that is like no place."""
     return np.random.default_rng(seed).uniform([-20, -20, -1.5], [20, 20, 6], (count, 3)).astype(np.float32)
+
+
+def observed(cloud, T_odom_body, voxels=True):
+    """A frame, body frame, as evidence and registration take it; ``voxels``: one point per voxel, as in tracking."""
+    config = LocalizerConfig()
+    points = transform(T_odom_body, cloud).astype(np.float32)
+    points = voxelized(cloud, T_odom_body, config.keyframe) if voxels else points
+    return ObservedScan.of(prepare_scan(points, T_odom_body[:3, 3], config.registration), cloud, T_odom_body)
 
 
 def tracker_of(world_map, config=None):

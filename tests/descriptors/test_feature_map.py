@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.descriptors import feature_map
 from coview_stream.descriptors.feature_map import (
     TILE,
     FeatureMap,
@@ -79,25 +80,30 @@ def differing(one, other, name):
     return (np.abs(one[name].astype(np.float64) - other[name]) > 1).mean()
 
 
+@pytest.fixture
+def encoder(monkeypatch, request):
+    """The network, or its stand-in."""
+    encode = network("aerial") if request.param == "aerial" else far_sighted
+    monkeypatch.setattr(feature_map, "network", lambda *_: encode)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("encoder", ["aerial", "far-sighted"])
-def test_feature_windows_leave_no_seams(points, monkeypatch, encoder):
+@pytest.mark.parametrize("encoder", ["aerial", "far-sighted"], indirect=True)
+def test_feature_windows_leave_no_seams(points, encoder):
     """Many windows make of a map what one does: drawing and network see enough around each."""
-    encode = network("aerial") if encoder == "aerial" else far_sighted
-    monkeypatch.setattr("coview_stream.descriptors.feature_map.network", lambda *_: encode)
     one, many = (by_place(feature_arrays(points, window=window)[0]) for window in (256, 64))
     for name in one:  # a rare point lies so near a layer's bound that rounding puts it to either side
         assert differing(one, many, name) < 1e-3, name
 
 
 @pytest.mark.slow
-def test_window_margin_is_needed(points, monkeypatch):
+@pytest.mark.parametrize("encoder", ["far-sighted"], indirect=True)
+@pytest.mark.parametrize(("margin", "name"), [(24, "learned.local"), (48, "learned.place")])
+def test_window_margin_is_needed(points, encoder, monkeypatch, margin, name):
     """Or the test above could not fail."""
-    monkeypatch.setattr("coview_stream.descriptors.feature_map.network", lambda *_: far_sighted)
     whole = by_place(feature_arrays(points)[0])
-    for margin, name in ((24, "learned.local"), (48, "learned.place")):
-        monkeypatch.setattr("coview_stream.descriptors.feature_map._NET_MARGIN", margin)
-        assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
+    monkeypatch.setattr(feature_map, "_NET_MARGIN", margin)
+    assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
 
 
 def test_feature_tiles_lie_on_fixed_grid_where_map_has_points(points, built):
@@ -129,12 +135,7 @@ def test_patch_holds_unit_vectors_or_zeros(points, features):
     high = points[:, :2].max(axis=0)
     assert known[(x < high[0]) & (y < high[1])].all()
     assert not known[(x > high[0] + 5.0) | (y > high[1] + 5.0)].any()
-
-
-def test_patch_outside_the_map_is_empty(features):
-    patch = features.patch(np.array([5e3, 5e3]), 10.0)
-    assert patch.local.shape == (features.dimensions, 20, 20)
-    assert not patch.local.any()
+    assert not features.patch(np.array([5e3, 5e3]), 10.0).local.any()
 
 
 @pytest.mark.parametrize("cell", [1, 2, 4])
@@ -174,11 +175,8 @@ def test_map_file_keeps_features(world_map, built, tmp_path):
     assert again.weights == built[1]["weights"] != ""
 
 
-def test_map_without_features_has_no_feature_map(world_map):
-    assert world_map.learned is None
-
-
 def test_maps_of_earlier_version_can_be_read(world_map):
+    assert world_map.learned is None
     before = {n: v for n, v in world_map.parameters.items() if n != "learned"}
     before["config"] = {n: v for n, v in before["config"].items() if n != "learned"}
     old = BaseMap(dict(world_map.arrays), before)

@@ -14,27 +14,18 @@ import numpy as np
 import pytest
 import small_world
 from small_world import pose_error
-from trackers import garbage
+from trackers import follow, garbage
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config import AcceptanceConfig, RegistrationConfig
 from coview_stream.errors import CloudError, ConfigError, InputError, MapError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
-
-
-def follow(localizer, drive, frames=None):
-    some = slice(0, frames)
-    return [
-        localizer.step(cloud, T, 0.5 * k)
-        for k, (cloud, T) in enumerate(zip(drive.clouds[some], drive.T_odom_body[some], strict=True))
-    ]
 
 
 def moved_map(base_map: BaseMap, origin) -> BaseMap:
@@ -52,13 +43,14 @@ def test_first_fix_and_later_poses_are_correct(world_fixes, world_drive):
         assert degrees < 0.3, k
 
 
-def test_no_pose_unless_tracking(world_fixes):
-    for fix in world_fixes:
+def test_no_pose_unless_tracking(world_map, world_fixes, elsewhere):
+    outside = follow(Localizer(world_map), elsewhere)
+    assert not any(fix.state is State.TRACKING for fix in outside)
+    for fix in (*world_fixes, *outside):
         known = fix.state is State.TRACKING
-        assert (fix.T_map_body is not None) == known
-        assert (fix.T_map_odom is not None) == known
-        assert (fix.covariance is not None) == known
+        assert (fix.T_map_body is not None) == (fix.T_map_odom is not None) == (fix.covariance is not None) == known
         assert known or fix.state in (State.SEARCHING, State.AMBIGUOUS)
+        assert known or fix.confidence == 0.0
         assert fix.evidence is not None
 
 
@@ -85,12 +77,11 @@ def test_covariance_is_symmetric_positive_and_translation_first(world_fixes):
     assert (sigma[3:] > shared.shared_yaw).all()
 
 
-def test_confidence_is_the_probability_that_the_search_found(world_fixes, world_map, elsewhere):
+def test_confidence_is_the_probability_that_the_search_found(world_fixes):
     posed = [fix for fix in world_fixes if fix.T_map_body is not None]
     assert posed[0].confidence == posed[0].evidence.confidence
     assert {fix.confidence for fix in posed} == {posed[0].confidence}  # tracking goes on from that place
     assert posed[0].confidence > 1.0 - AcceptanceConfig().risk
-    assert all(fix.confidence == 0.0 for fix in follow(Localizer(world_map), elsewhere, 2))
 
 
 @pytest.mark.slow
@@ -107,21 +98,6 @@ def test_utm_map_and_utm_odometry_keep_millimetres(world_map, world_drive, world
             np.testing.assert_allclose(there.T_map_body[:3, :3], here.T_map_body[:3, :3], atol=1e-4)
             np.testing.assert_allclose(there.T_map_odom @ T_odom_body, there.T_map_body, atol=1e-3)
     assert posed >= 2
-
-
-def test_state_is_lost_when_scans_no_longer_fit(world_map, world_drive):
-    localizer = Localizer(world_map)
-    assert follow(localizer, world_drive, 7)[-1].state is State.TRACKING
-    for k in range(7, 10):
-        fix = localizer.step(garbage(k), world_drive.T_odom_body[k], 0.5 * k)
-        assert fix.state is (State.DOUBTED if k == 7 else State.LOST)
-        assert fix.T_map_body is None
-
-
-def test_no_pose_outside_the_map(world_map, elsewhere):
-    for fix in follow(Localizer(world_map), elsewhere):
-        assert fix.state in (State.SEARCHING, State.AMBIGUOUS)
-        assert fix.T_map_body is None
 
 
 def test_invalid_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
@@ -172,16 +148,17 @@ def test_input_arrays_are_not_modified(world_map, world_drive):
 
 
 @pytest.mark.slow
-def test_reset_clears_all_but_the_map(world_map, world_drive, world_fixes):
+@pytest.mark.parametrize("how", [Localizer.reset, Localizer.relocalize])
+def test_reset_and_relocalize_search_again_and_find(world_map, world_drive, world_fixes, how):
     localizer = Localizer(world_map)
-    follow(localizer, world_drive, 2)
+    follow(localizer, world_drive, 6)
     assert localizer.search.last_query
-    localizer.reset()
+    how(localizer, 1)
     assert localizer.state is State.SEARCHING
     assert not localizer.search.last_query
-    # another odometry frame after the reset must not matter: the old one is forgotten
+    # another odometry frame must not matter: the old one is forgotten
     T_other = pose_from(rot_z(-0.4), [1e5, -2e5, 3.0])
-    again = follow(localizer, world_drive.seen_from(T_other), 6)
+    again = follow(localizer, world_drive.seen_from(T_other), 6, 100.0)
     assert [fix.state for fix in again] == [fix.state for fix in world_fixes[:6]]
     metres, degrees = pose_error(again[-1].T_map_body, world_drive.T_map_body[5])
     assert metres < 0.08
@@ -230,35 +207,21 @@ def test_fix_before_first_frame_raises(world_map):
         Localizer(world_map).fix()
 
 
-def test_search_result_of_old_epoch_is_ignored(world_map, world_drive, results):
+@pytest.mark.parametrize("since", ["reset", "loss", "acceptance"])
+def test_search_result_from_before_a_change_is_ignored(world_map, world_drive, results, since):
     localizer, result, k = searched(world_map, world_drive, results)
-    localizer.reset()
-    localizer.apply_search_result(result)  # before any frame
-    localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    localizer.apply_search_result(result)
-    assert localizer.state is State.SEARCHING
-    assert localizer.fix().T_map_body is None
-    assert localizer.fix().evidence is None
-
-
-def test_search_result_from_before_a_loss_is_ignored(world_map, world_drive, results):
-    localizer, result, k = searched(world_map, world_drive, results)
-    localizer.apply_search_result(result)
-    for n in range(1, 4):
+    if since == "reset":
+        localizer.reset()
+        localizer.apply_search_result(result)  # before any frame
+        localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    else:
+        localizer.apply_search_result(result)
+    for n in range(1, 4) if since == "loss" else ():
         localizer.add_frame(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
-    assert localizer.state is State.LOST
-    localizer.apply_search_result(result)
-    assert localizer.state is State.LOST
-    assert localizer.fix().T_map_body is None
-
-
-def test_search_result_while_tracking_is_ignored(world_map, world_drive, results):
-    localizer, result, _ = searched(world_map, world_drive, results)
-    localizer.apply_search_result(result)
     before = localizer.fix()
+    assert before.state is {"reset": State.SEARCHING, "loss": State.LOST, "acceptance": State.TRACKING}[since]
     localizer.apply_search_result(result)
-    np.testing.assert_array_equal(localizer.fix().T_map_body, before.T_map_body)
-    np.testing.assert_array_equal(localizer.fix().covariance, before.covariance)
+    assert localizer.fix().to_json() == before.to_json()
 
 
 def test_late_search_result_gives_the_current_pose(world_map, world_drive, results):
@@ -287,11 +250,15 @@ def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, wo
     assert localizer.fix().state is State.TRACKING
 
 
-def test_require_verification_withholds_pose_until_verified(world_map, world_drive, results):
+@pytest.mark.parametrize("before", [True, False], ids=["result first", "verification first"])
+def test_require_verification_withholds_pose_until_verified(world_map, world_drive, results, before):
     localizer, result, k = searched(world_map, world_drive, results)
-    localizer.apply_search_result(result)
-    assert localizer.fix().state is State.TRACKING
+    if before:
+        localizer.apply_search_result(result)
+        assert localizer.fix().state is State.TRACKING
     localizer.require_verification()
+    if not before:
+        localizer.apply_search_result(result)
     assert localizer.state is localizer.fix().state is State.DOUBTED
     assert localizer.fix().T_map_body is None
     # the robot stands still: nothing is due, and yet it is verified
@@ -301,47 +268,29 @@ def test_require_verification_withholds_pose_until_verified(world_map, world_dri
     assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
-def test_search_result_waits_for_required_verification(world_map, world_drive, results):
-    localizer, result, k = searched(world_map, world_drive, results)
-    localizer.require_verification()
-    localizer.apply_search_result(result)
-    assert localizer.fix().T_map_body is None
-    fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
-    assert fix.state is State.TRACKING
-
-
-def test_frame_is_voxelized_once_and_copied(world_map, world_drive, monkeypatch):
+def test_frame_is_voxelized_once_and_copied(world_map, world_drive, results, monkeypatch):
     """A driver may reuse its array for the next frame; a search result applied later still registers this one."""
     whole, calls = kernels.VoxelFilter.__call__, []
     monkeypatch.setattr(kernels.VoxelFilter, "__call__", lambda *given: calls.append(1) or whole(*given))
     localizer = Localizer(world_map)
-    array = world_drive.clouds[0].copy()
-    localizer.add_frame(array, world_drive.T_odom_body[0], 0.0)
-    array[:] = 0.0
-    np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
-    T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
-    made = voxelized(world_drive.clouds[0], T, localizer.config.keyframe)
-    np.testing.assert_allclose(localizer._tracker._scans.window(), made, atol=1e-6)
+    for k, result in enumerate(results):
+        array = world_drive.clouds[k].copy()
+        localizer.add_frame(array, world_drive.T_odom_body[k], 0.5 * k)
+        array[:] = 0.0
+        localizer.apply_search_result(result)
+    assert pose_error(localizer.fix().T_map_body, world_drive.T_map_body[k])[0] < 0.08
+    localizer.reset()
+    calls.clear()
+    localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 100.0)
     assert len(calls) == 2  # in the body's frame as well, to be compared with the keyframe before
-
-
-def standing(localizer, cloud, T_odom_body, seconds, start):
-    """Fixes at 10 Hz while odometry stands still."""
-    return [localizer.step(cloud, T_odom_body, start + 0.1 * k) for k in range(round(10 * seconds))]
-
-
-def tracking_localizer(world_map, world_drive, frames=6):
-    localizer = Localizer(world_map)
-    for k in range(frames):
-        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    assert fix.state is State.TRACKING
-    return localizer, 0.5 * frames
 
 
 @pytest.mark.slow
 def test_standing_robot_keeps_tracking_without_shrinking_covariance(world_map, world_drive):
-    localizer, now = tracking_localizer(world_map, world_drive)
-    fixes = standing(localizer, world_drive.clouds[5], world_drive.T_odom_body[5], 20.0, now)
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, 6)[-1].state is State.TRACKING
+    frame = world_drive.clouds[5], world_drive.T_odom_body[5]
+    fixes = [localizer.step(*frame, 3.0 + 0.1 * k) for k in range(200)]
     assert all(fix.state is State.TRACKING for fix in fixes)
     metres, degrees = small_world.pose_error(fixes[-1].T_map_body, world_drive.T_map_body[5])
     assert metres < 0.05
@@ -376,18 +325,6 @@ def test_intensities_do_not_change_a_fix(world_map, world_drive, world_fixes):
         assert fix.to_json() == known.to_json()
     with pytest.raises(CloudError, match=r"give cloud\[:, :3\]"):
         localizer.step(np.zeros((99, 6)), np.eye(4), 99.0)
-
-
-def test_relocalize_searches_again_and_finds(world_map, world_drive, world_fixes):
-    config = LocalizerConfig(reloc="coview")
-    localizer = Localizer(world_map, config)
-    frames = list(zip(world_drive.clouds, world_drive.T_odom_body, strict=True))
-    states = [localizer.step(*frame, 0.5 * k).state for k, frame in enumerate(frames)]
-    assert states[-1] is State.TRACKING
-    localizer.relocalize()
-    assert localizer.state is State.SEARCHING
-    again = [localizer.step(*frame, 100.0 + 0.5 * k).state for k, frame in enumerate(frames)]
-    assert State.TRACKING in again
 
 
 def test_localizer_says_its_state_and_map(world_map, world_drive):

@@ -12,7 +12,7 @@ import pytest
 import small_world
 from any_risk import NEVER
 from small_world import pose_error
-from trackers import garbage
+from trackers import follow, garbage
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
@@ -78,37 +78,26 @@ def test_docs_have_the_transition_table_and_every_state():
 # ---- a localizer
 
 
-class Watched(Localizer):
-    """A localizer whose events and states are recorded, each state with the events since the one before."""
-
-    def __init__(self, base_map):
-        self.moves = []
-        super().__init__(base_map)
-
-    @property
-    def state(self):
-        return self._state
-
-    @state.setter
-    def state(self, state):
-        self.moves.append((getattr(self, "_state", None), self.__dict__.pop("_event", None), state))
-        self._state = state
-
-    def _handle(self, event):
-        self._event = event
-        super()._handle(event)
-
-
 def test_localizer_moves_only_along_the_table(world_map, world_drive):
     """Searched for and found, asked to verify, covered, seeing garbage, lost and found again."""
-    localizer, states = Watched(world_map), []
+    localizer, states = Localizer(world_map), [State.SEARCHING]
+
+    def moved():
+        """Check that the reported events lead from the state before to the present one."""
+        after = states[-1]
+        for event in localizer.take_events():
+            assert next_state(after, event) is not after
+            after = next_state(after, event)
+        assert localizer.state is after
+        assert localizer.take_events() == ()
+        states.append(after)
 
     def step(k, cloud=None, stamp=None):
         cloud = world_drive.clouds[k] if cloud is None else cloud
         fix = localizer.step(cloud, world_drive.T_odom_body[k], 0.5 * k if stamp is None else stamp)
         assert fix.state is localizer.state
         assert (fix.T_map_body is not None) == (fix.state is State.TRACKING)
-        states.append(fix.state)
+        moved()
 
     usual = localizer.search.config
     localizer.search.config = replace(usual, acceptance=NEVER)
@@ -118,40 +107,29 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
     for k in range(2, 5):
         step(k)
     localizer.require_verification()
-    states.append(localizer.state)
+    moved()
     step(4, stamp=2.1)
     step(5, garbage(5, 60))
     step(6, garbage(6))
     step(7, garbage(7))  # one frame may be garbage, two lose the place
     for k in (8, 9):
         step(k)
-    moved = [(before, after) for before, after in pairwise(states) if after is not before]
-    assert list(dict.fromkeys(moved)) == [
+    moves = [(before, after) for before, after in pairwise(states) if after is not before]
+    assert list(dict.fromkeys(moves)) == [
+        (State.SEARCHING, State.AMBIGUOUS),
         (State.AMBIGUOUS, State.TRACKING),
         (State.TRACKING, State.DOUBTED),
         (State.DOUBTED, State.TRACKING),
         (State.DOUBTED, State.LOST),
         (State.LOST, State.TRACKING),
     ]
-    begun, *moves = localizer.moves
-    assert begun == (None, None, State.SEARCHING)
-    assert len(moves) > len(states)
-    for before, event, after in moves:
-        assert next_state(before, event) is after
-    changes = tuple(event for before, event, after in moves if after is not before)
-    assert localizer.take_events() == changes
-    assert localizer.take_events() == ()
     localizer.require_verification()
     localizer.reset()
-    assert localizer.moves[-1][1:] == (None, State.SEARCHING)
+    assert localizer.state is State.SEARCHING
     assert localizer.take_events() == ()
 
 
 RULE = AcceptanceConfig()
-
-
-def follow(localizer, drive, frames, start=0.0):
-    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], start + 0.5 * k) for k in frames]
 
 
 @pytest.fixture
@@ -185,72 +163,41 @@ def covered(seed):
     return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
 
 
-def test_rejected_registration_gives_doubted_state_without_pose(found, world_drive):
-    doubtful = found.step(dusty(world_drive, 5), world_drive.T_odom_body[5], 2.5)
+def test_rejected_registration_gives_doubted_state_without_pose(found, world_fixes, world_drive):
+    assert world_fixes[0].evidence.cause is world_fixes[0].evidence.innovation is None  # as the search's
+    (usual,) = follow(found, world_drive, [5])
+    assert (usual.evidence.cause, usual.evidence.reason) == (RejectionReason.VERIFIED, "verified")
+    assert 0.0 < usual.evidence.innovation < RULE.max_innovation
+    assert usual.evidence.stamp == 2.5
+    assert usual.drift is not None
+    assert usual.evidence.confidence > 1.0 - RULE.risk
+    doubtful = found.step(dusty(world_drive, 6), world_drive.T_odom_body[6], 3.0)
     assert doubtful.state is State.DOUBTED
-    assert doubtful.T_map_body is None
-    assert doubtful.T_map_odom is None
-    assert doubtful.covariance is None
-    assert doubtful.drift is None
+    assert doubtful.T_map_body is doubtful.T_map_odom is doubtful.covariance is doubtful.drift is None
     assert doubtful.confidence == 0.0
     assert doubtful.evidence.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     assert 0.5 < doubtful.evidence.confidence < 1.0 - RULE.risk
     assert "wrong 1 in " in doubtful.evidence.reason
-    known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
+    (known,) = follow(found, world_drive, [7])
     assert known.state is State.TRACKING
-    assert right(known, world_drive.T_map_body[6])
+    assert right(known, world_drive.T_map_body[7])
 
 
-def test_doubted_state_is_rechecked_while_standing(found, world_drive):
-    """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
-    fixes = [found.step(covered(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
+@pytest.mark.parametrize("driving", [False, True])
+def test_covered_sensor_is_doubted_and_checked_at_each_frame(found, world_drive, driving):
+    """Uncovered, the pose is back at once, and nothing was lost: the frames before are no evidence of the place."""
+    at = [5 + driving * (k // 3) for k in range(6)]
+    fixes = [found.step(covered(k), world_drive.T_odom_body[n], 3.0 + k) for k, n in enumerate(at)]
     assert [fix.state for fix in fixes] == [State.DOUBTED] * 6
     assert [fix.T_map_body for fix in fixes] == [None] * 6
+    assert fixes[0].evidence.cause is RejectionReason.BLIND
     assert fixes[-1].evidence.stamp == 8.0
-    again = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 9.0)
+    (again,) = follow(found, world_drive, [at[-1]], 9.0)
     assert again.state is State.TRACKING
-    assert right(again, world_drive.T_map_body[5])
-
-
-def test_evidence_reports_cause_reason_and_innovation(found, world_drive):
-    fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
-    assert fix.evidence.cause is RejectionReason.VERIFIED
-    assert fix.evidence.reason == "verified"
-    assert 0.0 < fix.evidence.innovation < RULE.max_innovation
-    assert fix.evidence.stamp == 2.5
-    assert fix.drift is not None
-    assert fix.evidence.confidence > 1.0 - RULE.risk
-    doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
-    assert doubtful.evidence.cause is not RejectionReason.VERIFIED
-    assert doubtful.evidence.reason != "verified"
-
-
-def test_search_evidence_has_no_cause_or_innovation(world_fixes):
-    assert world_fixes[0].evidence.cause is None
-    assert world_fixes[0].evidence.innovation is None
+    assert right(again, world_drive.T_map_body[at[-1]])
 
 
 # ---- carried to another place
-
-
-@pytest.mark.slow
-def test_search_after_loss_starts_from_scratch(found, world_drive):
-    """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
-    anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
-    lost = follow(found, anew, range(2), 2.5)
-    assert [fix.T_map_body for fix in lost] == [None] * 2
-    assert [fix.state for fix in lost] == [State.DOUBTED, State.LOST]  # one frame may be garbage
-    frames = range(2, 5)
-    again = follow(found, anew, frames, 2.5)
-    assert {fix.state for fix in again} <= {State.LOST, State.TRACKING}
-    assert again[-1].state is State.TRACKING
-    assert min(fix.evidence.score for fix in again) > 0.8
-    assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in zip(frames, again, strict=True))
-
-
-def found_frame(drive):
-    """odometry <- map of a drive."""
-    return drive.T_odom_body[0] @ inverse(drive.T_map_body[0])
 
 
 @pytest.mark.slow
@@ -364,16 +311,6 @@ def test_after_a_cover_the_pose_returns_with_the_first_frame_that_is_certain(wor
         assert len(posed) == len(after) or dust
 
 
-def test_driving_with_covered_sensor_is_doubted(found, world_drive):
-    """What was seen before is no evidence of where the robot is now."""
-    first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
-    assert first.state is State.DOUBTED
-    assert first.evidence.cause is RejectionReason.BLIND
-    assert found.step(covered(1), world_drive.T_odom_body[6], 3.0).T_map_body is None
-    known = found.step(world_drive.clouds[7], world_drive.T_odom_body[7], 3.5)
-    assert right(known, world_drive.T_map_body[7])
-
-
 @pytest.mark.slow
 def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene):
     """Straight over the edge and back again; no pose is wrong, and none is given 10 m after the map was last seen."""
@@ -394,36 +331,22 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
 
 
 @pytest.mark.slow
-def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
-    """What came before the pause is no doubt that has lasted: one good frame is enough."""
-    frames = (world_drive.clouds[5], State.TRACKING), (dusty(world_drive, 5), State.DOUBTED), (garbage(), State.DOUBTED)
-    for cloud, expected in frames:
-        localizer = Localizer(world_map)
-        for k in range(5):
-            fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-        assert fix.state is State.TRACKING
-        localizer.require_verification()
-        fix = localizer.step(cloud, world_drive.T_odom_body[5], 60.0)
-        assert fix.state is expected
-        assert fix.evidence.state is expected
-        assert fix.evidence.cause is not None
+@pytest.mark.parametrize("seen", ["the place", "dust", "garbage"])
+def test_first_frame_after_pause_decides_the_state(found, world_drive, seen):
+    """Frames from before the pause are no doubt that has lasted: one good frame is enough."""
+    cloud = {"the place": world_drive.clouds[5], "dust": dusty(world_drive, 5), "garbage": garbage()}[seen]
+    found.require_verification()
+    fix = found.step(cloud, world_drive.T_odom_body[5], 60.0)
+    assert fix.state is fix.evidence.state is (State.TRACKING if seen == "the place" else State.DOUBTED)
+    assert fix.evidence.cause is not None
 
 
 @pytest.mark.slow
-def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(world_map, world_drive):
+def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(found, world_drive):
     """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
-    localizer = Localizer(world_map)
-    for k in range(6):
-        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    assert fix.state is State.TRACKING
-    localizer.require_verification()
-    fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[5], 2.6)]
-    ahead = world_drive.T_odom_body[5]
-    for k in range(1, 4):
-        ahead = ahead @ pose_from(np.eye(3), [2.1, 0.0, 0.0])
-        fixes.append(localizer.step(world_drive.clouds[k], ahead, 2.6 + 0.5 * k))
+    follow(found, world_drive, [5])
+    found.require_verification()
+    moved = carried(world_drive, 5, 0)
+    fixes = follow(found, moved, range(4), 2.6)
     assert fixes[0].T_map_body is None
-    off = [
-        pose_error(f.T_map_body, world_drive.T_map_body[k])[0] for k, f in enumerate(fixes) if f.T_map_body is not None
-    ]
-    assert all(metres < 0.08 for metres in off), f"poses wrong by {off} m"
+    assert all(fix.T_map_body is None or right(fix, moved.T_map_body[k]) for k, fix in enumerate(fixes))

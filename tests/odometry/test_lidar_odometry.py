@@ -79,25 +79,27 @@ def test_sweep_is_deskewed_by_previous_motion(cloud):
     assert np.abs(odometry.points - cloud).max() < 0.1
 
 
-@pytest.mark.parametrize("times", [0.0, 7.0, np.nan, np.inf, 1.6e9])
-def test_constant_point_times_deskew_nothing(cloud, times):
+def three_steps(cloud, times):
+    """What registration got of the third frame of a robot that drives a metre a frame."""
     told = Told(np.eye(4), moved(1.0))
     odometry = LidarOdometry(LEVEL, told)
     for k in range(3):
-        odometry.step(cloud, np.full(len(cloud), times), 0.1 * k)
-    assert (told.frames[2] == cloud).all()
+        odometry.step(cloud, times, 0.1 * k)
+    return told.frames[2]
+
+
+@pytest.mark.parametrize("times", [0.0, 7.0, np.nan, np.inf, 1.6e9])
+def test_constant_point_times_deskew_nothing(cloud, times):
+    assert (three_steps(cloud, np.full(len(cloud), times)) == cloud).all()
 
 
 def test_point_with_bad_time_is_not_moved(cloud):
-    told = Told(np.eye(4), moved(1.0))
-    odometry = LidarOdometry(LEVEL, told)
     times = np.linspace(-0.1, 0.0, len(cloud))
     times[7] = np.nan
-    for k in range(3):
-        odometry.step(cloud, times, 0.1 * k)
-    assert np.allclose(told.frames[2][7], cloud[7], atol=0.01)
-    assert np.isfinite(told.frames[2]).all()
-    assert np.abs(told.frames[2][0] - cloud[0]).max() > 0.5
+    frame = three_steps(cloud, times)
+    assert np.allclose(frame[7], cloud[7], atol=0.01)
+    assert np.isfinite(frame).all()
+    assert np.abs(frame[0] - cloud[0]).max() > 0.5
 
 
 def covered(cloud):

@@ -12,62 +12,62 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import exp_so3, pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, mixed
+from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 
+LEAN = np.radians(3.0)
 
-def poses_of(localizer, clouds, odometry, truth):
-    """Return frame, metres and degrees of error of each pose, and the last fix."""
+
+def leaning(drive, roll=0.0, pitch=LEAN):
+    """Clouds of the drive from a sensor that leans, by default down by three degrees."""
+    R = exp_so3(np.array([roll, pitch, 0.0]))
+    return [(cloud @ R.T).astype(np.float32) for cloud in drive.clouds]
+
+
+def follow(localizer, clouds, odometry, truth):
+    """Return metres and degrees of error of each pose, and the last fix."""
     errors, fix = [], None
     for k, (cloud, T) in enumerate(zip(clouds, odometry, strict=True)):
         fix = localizer.step(cloud, T, 0.5 * k)
         if fix.T_map_body is not None:
-            np.testing.assert_allclose(fix.T_map_odom @ T, fix.T_map_body, atol=1e-6)
-            errors.append((k, *pose_error(fix.T_map_body, truth[k])))
-    return errors, fix
+            np.testing.assert_allclose(fix.T_map_odom @ T, fix.T_map_body, atol=1e-5)
+            errors.append(pose_error(fix.T_map_body, truth[k]))
+    return np.array(errors), fix
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lean", [(0.0, 3.0), (-2.0, -2.0)])
-def test_leaning_sensor_is_levelled(world_map, world_drive, world_fixes, lean):
-    R = exp_so3(np.radians([*lean, 0.0]))
-    clouds = [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
-    errors, fix = poses_of(Localizer(world_map), clouds, world_drive.T_odom_body, world_drive.T_map_body)
-    straight = sum(each.T_map_body is not None for each in world_fixes)
-    assert len(errors) >= 0.85 * straight
-    assert max(metres for _, metres, _ in errors) < 0.1
-    assert max(degrees for _, _, degrees in errors) < 0.6
-    assert np.degrees(fix.calibration.roll) == pytest.approx(-lean[0], abs=0.3)
-    assert np.degrees(fix.calibration.pitch) == pytest.approx(-lean[1], abs=0.3)
+@pytest.mark.parametrize("known", [0.0, -3.0])
+def test_leaning_sensor_is_levelled(world_map, world_drive, world_fixes, lean, known):
+    """With any lean that was known before."""
+    localizer, clouds = Localizer(world_map), leaning(world_drive, *np.radians(lean))
+    if known:
+        localizer.hint_calibration(Calibration(pitch=np.radians(known), sigma_tilt=np.radians(0.1)))
+    errors, fix = follow(localizer, clouds, world_drive.T_odom_body, world_drive.T_map_body)
+    assert len(errors) >= 0.85 * sum(each.T_map_body is not None for each in world_fixes)
+    assert (errors.max(axis=0) < (0.1, 0.6)).all()
+    found = np.degrees([fix.calibration.roll, fix.calibration.pitch])
+    np.testing.assert_allclose(found, -np.array(lean), atol=0.4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.93, 1.07])
 def test_scale_of_odometry_is_learnt(world_map, world_drive, world_fixes, scale):
     odometry = [pose_from(T[:3, :3], scale * T[:3, 3]) for T in world_drive.T_odom_body]
-    errors, fix = poses_of(Localizer(world_map), world_drive.clouds, odometry, world_drive.T_map_body)
+    errors, fix = follow(Localizer(world_map), world_drive.clouds, odometry, world_drive.T_map_body)
     assert len(errors) >= 0.85 * sum(each.T_map_body is not None for each in world_fixes)
-    assert max(metres for _, metres, _ in errors) < 0.1
+    assert errors[:, 0].max() < 0.1
     assert (1.0 + fix.calibration.scale) * scale == pytest.approx(1.0, abs=0.02)
 
 
-LEAN = np.radians(3.0)
-
-
-@pytest.fixture(scope="module")
-def leaning(world_drive):
-    """Clouds of the drive from a sensor that looks down by three degrees."""
-    R = exp_so3(np.array([0.0, LEAN, 0.0]))
-    return [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
-
-
 @pytest.mark.slow
-def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, world_drive, leaning):
-    """The keyframe's clouds were levelled by what was known then."""
-    localizer, waiting, errors = Localizer(world_map), [], []
-    for k, cloud in enumerate(leaning):
+def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, world_drive):
+    """The keyframe's clouds were levelled by the calibration of then."""
+    localizer, waiting, errors, clouds = Localizer(world_map), [], [], leaning(world_drive)
+    for k, cloud in enumerate(clouds):
         if len(waiting) == 2:
             localizer.apply_search_result(localizer.search.update(waiting.pop(0)))
         request = localizer.add_frame(cloud, world_drive.T_odom_body[k], 0.5 * k)
@@ -76,26 +76,24 @@ def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, worl
         fix = localizer.fix()
         if fix.T_map_body is not None:
             errors.append(pose_error(fix.T_map_body, world_drive.T_map_body[k]))
-    assert len(errors) > 0.5 * len(leaning)
-    assert max(metres for metres, _ in errors) < 0.1
-    assert max(degrees for _, degrees in errors) < 0.6
+    assert len(errors) > 0.5 * len(clouds)
+    assert (np.max(errors, axis=0) < (0.1, 0.6)).all()
     assert fix.calibration.pitch == pytest.approx(-LEAN, abs=np.radians(0.3))
 
 
 @pytest.mark.slow
-def test_calibration_outlives_the_odometry_frame_but_no_reset(world_map, world_drive, leaning):
-    localizer = Localizer(world_map)
-    for k, cloud in enumerate(leaning):
-        fix = localizer.step(cloud, world_drive.T_odom_body[k], 0.5 * k)
+def test_calibration_outlives_the_odometry_frame_but_no_reset(world_map, world_drive):
+    localizer, clouds = Localizer(world_map), leaning(world_drive)
+    _, fix = follow(localizer, clouds, world_drive.T_odom_body, world_drive.T_map_body)
     assert fix.state is State.TRACKING
     localizer.relocalize(1)
     T_other = pose_from(exp_so3(np.array([0.0, 0.0, 1.0])), [40.0, -3.0, 1.0])
-    localizer.add_frame(leaning[0], T_other @ world_drive.T_odom_body[0], 60.0)
+    localizer.add_frame(clouds[0], T_other @ world_drive.T_odom_body[0], 60.0)
     begun = localizer.fix()
     assert begun.T_map_body is None
     assert begun.calibration.pitch == pytest.approx(-LEAN, abs=np.radians(0.3))
     localizer.reset(2)
-    localizer.add_frame(leaning[0], world_drive.T_odom_body[0], 90.0)
+    localizer.add_frame(clouds[0], world_drive.T_odom_body[0], 90.0)
     assert localizer.fix().calibration.pitch == 0.0
 
 
@@ -110,52 +108,25 @@ def test_odometry_in_utm_that_turns_is_corrected(world_map, world_drive, world_f
         turned += np.radians(0.1) * float(np.linalg.norm(step))
         turn = exp_so3(np.array([0.0, 0.0, turned]))
         odometry.append(pose_from(turn @ T[:3, :3], odometry[-1][:3, 3] + scale * (turn @ step)))
-    localizer, errors = Localizer(world_map), []
-    for k, (cloud, T) in enumerate(zip(world_drive.clouds, odometry, strict=True)):
-        fix = localizer.step(cloud, T, 0.5 * k)
-        if fix.T_map_body is not None:
-            np.testing.assert_allclose(fix.T_map_odom @ T, fix.T_map_body, atol=1e-5)
-            errors.append(pose_error(fix.T_map_body, world_drive.T_map_body[k]))
+    errors, fix = follow(Localizer(world_map), world_drive.clouds, odometry, world_drive.T_map_body)
     assert len(errors) >= 0.8 * sum(each.T_map_body is not None for each in world_fixes)
-    assert max(metres for metres, _ in errors) < 0.15
+    assert errors[:, 0].max() < 0.15
     assert (1.0 + fix.calibration.scale) * scale == pytest.approx(1.0, abs=0.02)
-
-
-def last_fix(world_map, clouds, odometry, known):
-    localizer = Localizer(world_map)
-    localizer.hint_calibration(known)
-    for k, (cloud, T) in enumerate(zip(clouds, odometry, strict=True)):
-        fix = localizer.step(cloud, T, 0.5 * k)
-    return fix
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lean", [0.0, 3.0])
-def test_known_lean_is_measured_again(world_map, world_drive, lean):
-    """Once it is right, and once the sensor has been set straight meanwhile."""
-    known = Calibration(pitch=np.radians(-3.0), sigma_tilt=np.radians(0.1))
-    R = exp_so3(np.radians([0.0, lean, 0.0]))
-    clouds = [(cloud @ R.T).astype(np.float32) for cloud in world_drive.clouds]
-    fix = last_fix(world_map, clouds, world_drive.T_odom_body, known)
-    assert fix.T_map_body is not None
-    assert np.degrees(fix.calibration.pitch) == pytest.approx(-lean, abs=0.4)
 
 
 def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, world_drive):
     localizer = Localizer(world_map)
-    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
-        fix = localizer.step(cloud, T, 0.5 * k)
+    _, fix = follow(localizer, world_drive.clouds, world_drive.T_odom_body, world_drive.T_map_body)
     localizer.hint_calibration(Calibration(pitch=0.1))
     assert localizer.fix().calibration == fix.calibration
 
 
-def test_ground_offset_of_the_site_is_restored(world_map):
+def test_ground_offset_of_the_site_is_restored_and_outlives_the_place(world_map):
     localizer = Localizer(world_map)
     localizer.hint_calibration(Calibration(ground=0.35))
-    offset = localizer._tracker.ground
-    assert offset.metres > 0.15
-    offset.clear()  # as at each place that is found
-    assert offset.metres > 0.15
+    assert localizer.calibration.ground > 0.15
+    localizer.relocalize()
+    assert localizer.calibration.ground > 0.15
 
 
 def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
@@ -166,24 +137,12 @@ def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
     assert localizer.calibration.pitch == 0.0
 
 
-def test_what_is_known_better_here_stays_group_by_group(world_map):
-    localizer = Localizer(world_map)
-    estimator = localizer._frames.estimator
+def test_what_is_known_better_here_stays_group_by_group():
+    estimator = CalibrationEstimator()
     estimator.restore(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
-    localizer.hint_calibration(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001))
-    assert localizer.calibration.pitch == pytest.approx(0.03, abs=0.002)
-    assert 0.008 < localizer.calibration.scale < 0.03
-
-
-def test_ground_that_was_learned_here_is_not_given_up_for_a_hint(world_map):
-    localizer = Localizer(world_map)
-    offset = localizer._tracker.ground
-    offset._views, offset.metres = 3, 0.1
-    localizer.hint_calibration(Calibration(ground=0.35))
-    assert offset.metres == 0.1
-    offset.restore(0.3)
-    offset.restore(0.0)
-    assert offset.metres == 0.0
+    estimator.learn(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001).doubted())
+    assert estimator.calibration.pitch == pytest.approx(0.03, abs=0.002)
+    assert 0.008 < estimator.calibration.scale < 0.03
 
 
 def test_what_a_leader_supposed_ends_with_it():
@@ -205,14 +164,13 @@ def test_mixture_has_the_sigma_of_each_axis():
 
 def test_leaders_that_alternate_do_not_begin_the_search_anew_at_every_frame(world_map, world_drive):
     """A robot that stands still sees nothing new: what it has seen is levelled once, and evidence adds up."""
-    localizer = Localizer(world_map)
-    localizer.search.update = lambda request: SearchResult(None, KeyframeEvidence(request.stamp, State.SEARCHING, ""))
-    straight, leaning = np.eye(4), np.eye(4)
-    leaning[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
-    epochs = set()
+    localizer, epochs, shares = Localizer(world_map), [], Evidence(1.0, 1.0, 1.0, 1.0, 1.0)
     for k in range(20):
-        localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.1 * k)
-        epochs.add(localizer._requests.epoch)
-        T = leaning if k % 2 else straight
-        localizer._frames.estimator.suppose_attitude(T, np.eye(4), 1e-5, 0.9)
-    assert len(epochs) <= 2
+        request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.1 * k)
+        if request is not None:
+            epochs.append(request.epoch)
+        lean = pose_from(exp_so3(np.radians([0.0, 4.0 * (k % 2), 0.0])), np.zeros(3))
+        said = KeyframeEvidence(0.1 * k, State.SEARCHING, "", evidence=shares, confidence=0.9)
+        localizer.apply_search_result(SearchResult(None, said, epoch=epochs[-1], leader=lean))
+    assert abs(localizer.calibration.pitch) > np.radians(1.0)
+    assert len(set(epochs)) == 2

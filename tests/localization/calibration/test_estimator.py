@@ -71,8 +71,9 @@ def test_tilt_of_the_sensor_is_found(tilt):
 
 
 @pytest.mark.parametrize("scale", [0.9, 0.95, 1.05, 1.1])
-def test_scale_of_odometry_is_found(scale):
-    found = drive(scale=scale)
+def test_scale_and_turn_of_odometry_are_found(scale):
+    found = drive(scale=scale, turn=0.1)
+    assert np.degrees(found.turn) == pytest.approx(-0.1, abs=0.03)
     assert (1.0 + found.scale) * scale == pytest.approx(1.0, abs=0.005)
     assert any("too short" in c if scale < 1 else "too long" in c for c in found.describe())
 
@@ -90,6 +91,10 @@ def test_what_was_known_before_is_a_prior_and_no_more():
     estimator = CalibrationEstimator()
     estimator.restore(before.doubted())
     assert np.degrees(estimator.calibration.pitch) == pytest.approx(3.0, abs=0.7)
+    known = Calibration(0.0, np.radians(4.0), 0.05, 0.0, np.radians(0.2), 0.002, np.radians(0.005))
+    estimator.restore(known)
+    assert estimator.calibration.pitch == pytest.approx(known.pitch, rel=0.02)
+    assert estimator.calibration.scale == pytest.approx(known.scale, rel=0.02)
 
 
 def test_sensor_that_cannot_lean_does_not():
@@ -102,11 +107,6 @@ def test_sensor_that_cannot_lean_does_not():
     assert (estimator.calibration.roll, estimator.calibration.pitch) == (0.0, 0.0)
     assert estimator.calibration.sigma_tilt < np.radians(0.01)
     assert estimator.calibration.scale > 0.02  # the rest is learnt all the same
-
-
-def test_turn_of_odometry_is_found():
-    found = drive(turn=0.1)
-    assert np.degrees(found.turn) == pytest.approx(-0.1, abs=0.03)
 
 
 def test_one_slip_does_not_become_a_scale():
@@ -128,24 +128,10 @@ def test_small_lean_is_odometrys_gravity_rather_than_the_sensor():
     assert abs(np.degrees(estimator.calibration.roll)) < 0.05
 
 
-def test_what_was_known_before_is_gone_on_from():
-    estimator = CalibrationEstimator()
-    known = Calibration(0.0, np.radians(4.0), 0.05, 0.0, np.radians(0.2), 0.002, np.radians(0.005))
-    estimator.restore(known)
-    assert estimator.calibration.pitch == pytest.approx(known.pitch, rel=0.02)
-    assert estimator.calibration.scale == pytest.approx(known.scale, rel=0.02)
-
-
 def test_nothing_known_is_as_uncertain_as_the_prior_and_corrects_nothing():
     found = CalibrationEstimator().calibration
     assert (found.roll, found.pitch, found.scale, found.turn) == (0.0, 0.0, 0.0, 0.0)
     assert 2.0 < np.degrees(found.sigma_tilt) < 4.0
-
-
-def test_odometry_that_is_right_stays_as_it_is():
-    correction, rng = OdometryCorrection(), np.random.default_rng(1)
-    for T in truth_of(10, 3.0, rng):
-        np.testing.assert_allclose(correction.correct(T, Calibration()), T, atol=1e-12)
 
 
 def test_corrected_odometry_keeps_its_gravity():
@@ -153,6 +139,7 @@ def test_corrected_odometry_keeps_its_gravity():
     for T in truth_of(10, 3.0, rng):
         corrected = correction.correct(T, Calibration(scale=0.05, turn=0.02))
         np.testing.assert_allclose(corrected[2, :3], T[2, :3], atol=1e-12)
+        np.testing.assert_allclose(OdometryCorrection().correct(T, Calibration()), T, atol=1e-12)
 
 
 def test_ground_above_the_surveys_is_told():

@@ -106,6 +106,7 @@ def test_offset_that_was_known_before_holds_until_another_is_told():
 @pytest.mark.parametrize("metres", [0.0, 0.03, -0.02])
 def test_next_to_nothing_restores_nothing(metres):
     offset = GroundOffset()
+    offset.restore(0.3)  # another site
     offset.restore(metres)
     assert offset.metres == pytest.approx(0.0, abs=1e-9)
     assert offset.probability == pytest.approx(0.02, abs=0.01)

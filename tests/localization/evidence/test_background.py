@@ -1,12 +1,23 @@
-"""Background: what chance explains, and how many independent observations a scan is, from chance places."""
+"""Background: the share that chance explains, and how many independent observations a scan is, from chance places."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation, places_of_their_own, what_was_seen_before
+from trackers import observed
 
-from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, outcomes, scatter
+from coview_kernels import Move
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.background import (
+    Most,
+    estimate_background,
+    left_in_mean,
+    observe_with_background,
+    outcomes,
+    scatter,
+)
+from coview_stream.localization.evidence.background import chance_places as places_around
 from coview_stream.localization.evidence.observation import Share
 
 NOTHING = np.empty((0, len(Share)), dtype=np.float32)
@@ -147,3 +158,38 @@ def test_places_that_go_on_to_fit_leave_most_of_the_scatter(rng, draw):
 @pytest.mark.parametrize(("count", "keyframes"), [(300, 1), (5, 4), (0, 3)])
 def test_one_keyframe_or_few_places_tell_nothing_of_it(rng, count, keyframes):
     np.testing.assert_array_equal(left_in_mean(chance_places(rng, count, keyframes=keyframes)), 1.0)
+
+
+T_MAP_ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])
+
+
+@pytest.fixture(scope="module")
+def seen(world_drive):
+    return observed(world_drive.clouds[4], inverse(T_MAP_ODOM) @ world_drive.T_map_body[4])
+
+
+def test_chance_places_lie_around_at_all_sides():
+    around = places_around(np.array([5.0, -3.0, 1.0, 0.2]))
+    gap = around[:, :2] - [5.0, -3.0]
+    assert len(around) == 32
+    assert np.linalg.norm(gap, axis=1).min() == pytest.approx(3.0)
+    np.testing.assert_allclose(gap.mean(axis=0), 0.0, atol=1e-9)
+    assert (around[:, 2] == 1.0).all()
+    assert np.abs(around[:, 3] - 0.2).min() > 0.0
+
+
+def test_background_is_what_the_places_around_the_first_pose_explain(world_map, seen):
+    away = T_MAP_ODOM.copy()
+    away[:2, 3] += [0.9, -0.7]
+    both = np.stack([T_MAP_ODOM, away])
+    observed, background = observe_with_background(world_map.field, seen, both)
+    chance = seen.few.look_up(world_map.field, places_around(seen.poses(both)[0]), Move.NONE).shares
+    expected = estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
+    np.testing.assert_allclose(background.structure, expected.structure)
+    assert background.passed == pytest.approx(expected.passed)
+    assert background.ground == pytest.approx(expected.ground)
+    assert background.number == pytest.approx(expected.number)
+    np.testing.assert_array_equal(observed, seen.few.look_up(world_map.field, seen.poses(both), Move.NONE).shares)
+    assert observed[0, Share.NEAR] > observed[1, Share.NEAR] > chance[:, Share.NEAR].mean()
+    other, _ = observe_with_background(world_map.field, seen, both[::-1])
+    np.testing.assert_array_equal(other, observed[::-1])

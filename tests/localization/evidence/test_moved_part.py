@@ -6,22 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from trackers import observed
 
 import coview_kernels as kernels
-from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.prepare_scan import prepare_scan
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 RISK = 1e-4
 
 
 def scan_of(drive, frame: int) -> ObservedScan:
-    T, cloud = inverse(ODOM) @ drive.T_map_body[frame], drive.clouds[frame]
-    points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return ObservedScan.of(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T)
+    return observed(drive.clouds[frame], inverse(ODOM) @ drive.T_map_body[frame], voxels=False)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import small_world
+from trackers import observed
 
 from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
@@ -21,10 +22,7 @@ CONFIG = LocalizerConfig().registration
 @pytest.fixture(scope="module")
 def scan(world_drive):
     """A frame of the small world, with odometry in a frame of its own."""
-    T = inverse(ODOM) @ world_drive.T_map_body[0]
-    cloud = world_drive.clouds[0]
-    points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    return ObservedScan.of(prepare_scan(points, T[:3, 3], CONFIG), cloud, T)
+    return observed(world_drive.clouds[0], inverse(ODOM) @ world_drive.T_map_body[0], voxels=False)
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +211,6 @@ def test_rays_pass_through_the_space_before_their_returns_and_no_other():
     assert 1.0 < ranges.min() < 6.0
     assert 16.0 < ranges.max() < 20.0
     assert points[:, 2].min() > -1.5 + 0.8  # well above the ground
-
-
-def test_frame_without_returns_passes_through_nothing():
     assert len(RangeImage.of(np.empty((0, 3), np.float32)).passed_points()) == 0
 
 

@@ -12,6 +12,7 @@ import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
 from small_world import pose_error
+from trackers import follow
 
 from coview_kernels import Belief
 from coview_stream.config import LocalizerConfig, RegistrationConfig
@@ -43,11 +44,6 @@ def library(request, monkeypatch):
     elif find_spec("small_gicp") is None:
         pytest.skip("small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
     return request.param
-
-
-@pytest.fixture
-def stand_in(monkeypatch):
-    monkeypatch.setitem(sys.modules, "small_gicp", fake_small_gicp)
 
 
 @pytest.fixture
@@ -129,13 +125,6 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
         np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
 
 
-def test_step_without_prior_is_that_of_the_pairs():
-    A = np.diag([4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    step, information = gicp.fused_step(A, np.ones(6), TILTED, PIVOT, None)
-    np.testing.assert_allclose(step, -1.0 / np.diag(A), rtol=1e-6)
-    np.testing.assert_array_equal(information, A)
-
-
 # ---- registrations
 
 
@@ -156,32 +145,22 @@ def test_gicp_and_trimmed_icp_agree_from_one_metre_and_five_degrees(target, cent
     assert np.linalg.eigvalsh(found.information).min() > 1
 
 
-def test_points_without_map_counterpart_are_trimmed(target):
-    """A quarter of the scan stands in the air, half of that within reach of the walls."""
+def test_points_without_map_counterpart_are_trimmed_and_non_finite_ones_dropped(target):
+    """A quarter of the scan stands in the air, half of that within reach of the walls; seven points are nowhere."""
     scan, rng = scan_of(target), np.random.default_rng(5)
     air = rng.uniform([-12, -12, 0.6], [12, 12, 5], (500, 3)).astype(np.float32)
     near = scan.points[scan.above][:500] + np.float32([0.25, 0.25, 0.0])
-    stray = np.concatenate([air, near])
+    stray = np.concatenate([air, near, np.full((7, 3), np.nan, np.float32)])
     crowd = RegistrationCloud(
         np.concatenate([scan.points, stray]),
         np.concatenate([scan.above, np.ones(len(stray), bool)]),
         np.concatenate([scan.height, np.full(len(stray), 2.0, np.float32)]),
     )
     start = TRUTH @ exp_se3(np.array([0.0, 0.0, 0.03, 0.3, -0.2, 0.1]))
-    found = register(crowd, start, target, CONFIG, CONFIG.search)
+    found = register(crowd, start, target, CONFIG, CONFIG.search, centre=np.zeros(3))
     assert pose_error(found.T_map_source, TRUTH)[0] < 0.03
-
-
-def test_non_finite_rows_change_nothing(target):
-    scan = scan_of(target)
-    hole = np.full((7, 3), np.nan, np.float32)
-    holed = RegistrationCloud(
-        np.concatenate([hole, scan.points]),
-        np.concatenate([np.ones(7, bool), scan.above]),
-        np.concatenate([hole[:, 0], scan.height]),
-    )
-    a, b = (register(s, TRUTH, target, CONFIG, CONFIG.track, centre=np.zeros(3)) for s in (scan, holed))
-    assert pose_error(a.T_map_source, b.T_map_source)[0] < 1e-4
+    with pytest.raises(ValueError, match="finite"):
+        register(scan, np.full((4, 4), np.nan), target, CONFIG, CONFIG.track)
 
 
 @pytest.mark.parametrize("count", [0, 1, 19, 45])
@@ -192,11 +171,6 @@ def test_too_few_points_are_refused(target, count):
     assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, CONFIG.track) is None
     tiny = LocalMap(target.points[:count], target.normals[:count])
     assert register(scan, TRUTH, tiny, CONFIG, CONFIG.track) is None
-
-
-def test_invalid_initial_pose_is_refused(target):
-    with pytest.raises(ValueError, match="finite"):
-        register(scan_of(target), np.full((4, 4), np.nan), target, CONFIG, CONFIG.track)
 
 
 # ---- the prior
@@ -213,26 +187,23 @@ def corridor(library):
     )
 
 
-def inside(corridor):
-    """The middle of a corridor with ends out of sight, without noise."""
-    middle = corridor.points[np.abs(corridor.points[:, 0]) < 20][::5]
-    return source_of(middle, np.eye(4))
+def along(corridor, config, scales, off, start):
+    """Registration of the middle of a corridor with ends out of sight, without noise; its prior is ``off``."""
+    middle = source_of(corridor.points[np.abs(corridor.points[:, 0]) < 20][::5], np.eye(4))
+    prior = Prior(boxplus(np.eye(4), off), np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
+    return register(middle, boxplus(np.eye(4), start), corridor, config, scales, prior, np.zeros(3)), prior
 
 
 def test_along_a_corridor_the_prior_decides(corridor):
     """It is off to the side, too, and there the walls do."""
-    mean = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.5, 0.1, 0.05]))
-    start = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.2, 0.1, 0.05]))
-    prior = Prior(mean, np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
-    found = register(inside(corridor), start, corridor, DISTRUSTING, DISTRUSTING.track, prior, np.zeros(3))
-    gap = boxminus(found.T_map_source, np.eye(4))
+    off, start = np.array([0.0, 0.0, 0.01, 0.5, 0.1, 0.05]), np.array([0.0, 0.0, 0.01, 0.2, 0.1, 0.05])
+    gap = boxminus(along(corridor, DISTRUSTING, DISTRUSTING.track, off, start)[0].T_map_source, np.eye(4))
     assert gap[3] == pytest.approx(0.5, abs=0.03)
     assert np.abs(gap[[0, 1, 2, 4, 5]]).max() < 0.01
 
 
 def test_corridor_direction_has_no_information(corridor):
-    prior = Prior(np.eye(4), np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
-    fused = register(inside(corridor), np.eye(4), corridor, CONFIG, (0.4,), prior, np.zeros(3))
+    fused, prior = along(corridor, CONFIG, (0.4,), np.zeros(6), np.zeros(6))
     found = remove_prior(fused.T_map_source, fused.information, np.eye(4), prior.information, CONFIG)
     sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
     assert sigma[3] > 10 * sigma[4]
@@ -272,14 +243,6 @@ def test_missing_small_gicp_is_named(monkeypatch, world_file):
         open_engine("track", world_file, "0" * 64, LocalizerConfig(registration=CONFIG))
 
 
-def test_local_map_is_prepared_for_the_requested_method(stand_in):
-    target = local_map(*courtyard())
-    target.prepare()
-    assert "surfaces" not in vars(target)
-    target.prepare("gicp")
-    assert vars(target)["surfaces"] is target.surfaces
-
-
 def test_global_search_uses_trimmed_icp(world_map):
     config = LocalizerConfig(registration=replace(CONFIG, keep=0.8))
     search = GlobalSearch(world_map, config, LocalMaps(world_map, 50.0))
@@ -287,22 +250,14 @@ def test_global_search_uses_trimmed_icp(world_map):
     assert replace(search.config, registration=config.registration) == config
 
 
-def test_drive_is_tracked_with_gicp(world_map, world_drive, monkeypatch):
+def test_drive_is_tracked_with_gicp(world_map, world_drive):
     pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
-    inner, calls = gicp.register_surfaces, []
-    monkeypatch.setattr(gicp, "register_surfaces", lambda *a, **k: calls.append(1) or inner(*a, **k))
-    localizer = Localizer(world_map, replace(LocalizerConfig(), registration=CONFIG))
-    pairs = zip(world_drive.clouds, world_drive.T_odom_body, strict=True)
-    fixes = [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+    maps = LocalMaps(world_map, CONFIG.source_range)
+    fixes = follow(Localizer(world_map, LocalizerConfig(registration=CONFIG), maps), world_drive)
     tracking = [k for k, fix in enumerate(fixes) if fix.state is State.TRACKING]
     assert len(tracking) >= 4
-    assert len(calls) >= len(tracking)
     for k in tracking:
         metres, degrees = pose_error(fixes[k].T_map_body, world_drive.T_map_body[k])
         assert metres < 0.08
         assert degrees < 0.4
-    # on a frame that registers nothing the crop is prepared, for the method that will ask for it
-    asked = []
-    monkeypatch.setattr(LocalMap, "prepare", lambda self, *method: asked.append(method))
-    localizer.step(world_drive.clouds[-1], world_drive.T_odom_body[-1], 0.5 * (len(fixes) - 1) + 0.1)
-    assert asked == [("gicp",)]
+        assert "surfaces" in vars(maps.around(world_drive.T_map_body[k][:3, 3]))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
 
 import coview_kernels as kernels
-from coview_stream.config import MapConfig, RegistrationConfig
+from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z, rotation_angle, transform
 from coview_stream.geometry.validation import check_covariance
@@ -75,18 +77,13 @@ def test_known_six_dof_offset_is_found(target, scan, offset):
     assert 0 < found.iterations <= CONFIG.iterations * len(CONFIG.search)
 
 
-def test_registration_with_forty_percent_outliers(target, scan):
+@pytest.mark.parametrize("centre", [None, np.zeros(3), np.array([8.0, -5.0, 1.0])], ids=["no pivot", "zero", "pivot"])
+def test_registration_with_forty_percent_outliers(target, scan, centre):
     start = TRUTH @ exp_se3(np.array([0.01, 0.0, 0.06, 0.8, -0.7, 0.1]))
-    metres, degrees = errors(register(with_outliers(scan, 0.4), start, target, CONFIG, CONFIG.search).T_map_source)
+    crowd = with_outliers(scan, 0.4)
+    metres, degrees = errors(register(crowd, start, target, CONFIG, CONFIG.search, centre=centre).T_map_source)
     assert metres < 0.03
     assert degrees < 0.15
-
-
-def test_pivot_does_not_change_the_result(target, scan):
-    start = TRUTH @ exp_se3(np.array([0.0, 0.0, 0.05, 0.5, -0.5, 0.1]))
-    for centre in (None, np.zeros(3), np.array([8.0, -5.0, 1.0])):
-        found = register(scan, start, target, CONFIG, CONFIG.search, centre=centre)
-        assert errors(found.T_map_source)[0] < 0.01
 
 
 def test_information_is_symmetric_and_reflects_observability(target, scan):
@@ -101,6 +98,8 @@ def test_information_is_symmetric_and_reflects_observability(target, scan):
 
 def test_empty_local_map_gives_no_registration(target, scan):
     assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, (1.0,)) is None
+    thin = scan.every(3)
+    assert thin.above.mean() == pytest.approx(scan.above.mean(), abs=0.01)
     few = RegistrationCloud(scan.points[:20], scan.above[:20], scan.height[:20])
     assert register(few, TRUTH, target, CONFIG, (1.0,)) is None
 
@@ -128,58 +127,28 @@ def test_weak_prior_does_not_outweigh_the_map(target, scan):
     assert errors(found.T_map_source)[0] < 0.02
 
 
-def test_thinning_keeps_ground_and_structure_points(scan):
-    thin = scan.every(3)
-    assert len(thin.points) == -(-len(scan.points) // 3)
-    assert thin.above.mean() == pytest.approx(scan.above.mean(), abs=0.01)
-    np.testing.assert_array_equal(thin.above, thin.height > 0.5)
-
-
-class FakeMap:
-    """A map of one cloud that counts the crops asked for."""
-
-    config = MapConfig()
-
-    def __init__(self, points, normals):
-        self.arrays = self
-        self.cloud, self.asked = (points, np.rint(127 * normals).astype(np.int8)), []
-
-
-@pytest.fixture(autouse=True)
-def cut_from_the_whole_cloud(monkeypatch):
-    def cut_points(fake, tile, cut):
-        fake.asked.append(cut)
-        return kernels.crop_points(*fake.cloud, [[0, len(fake.cloud[0])]], cut)
-
-    monkeypatch.setattr("coview_stream.localization.registration.local_map.cut_points", cut_points)
-
-
-def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
-    fake = FakeMap(target.points, target.normals)
-    maps = LocalMaps(fake, radius=6.0)
+def test_local_maps_hold_all_points_within_radius_and_are_cached(world_map):
+    maps, crops = LocalMaps(world_map, radius=6.0), {}
     for position in np.random.default_rng(3).uniform(-12, 12, (30, 3)):
         found = maps.around(position)
-        wanted = np.hypot(*(target.points[:, :2] - position[:2]).T) < 6.0
+        wanted = np.hypot(*(world_map.points[:, :2] - position[:2]).T) < 6.0
         inside = np.hypot(*(found.points[:, :2] - position[:2]).T) < 6.0
         assert inside.sum() == wanted.sum()
         assert len(found.points) == len(found.normals)
-    assert len(fake.asked) == len(set(fake.asked)) <= 9
+        crops[id(found)] = found
+    assert 1 < len(crops) <= 9
 
 
-def test_local_map_cache_drops_the_oldest(target):
-    fake = FakeMap(target.points, target.normals)
-    maps = LocalMaps(fake, radius=6.0)
-    for x in range(0, 16 * 40, 16):
-        maps.around(np.array([x, 0.0, 0.0]))
-    assert len(maps._crops) < 40
-    maps.around(np.array([0.0, 0.0, 0.0]))
-    assert len(fake.asked) == 41
+def test_local_map_cache_drops_the_oldest(world_map):
+    maps = LocalMaps(world_map, radius=6.0, crops=2)
+    refs = [weakref.ref(maps.around(np.array([x, 0.0, 0.0]))) for x in (-16.0, 0.0, 16.0)]
+    assert [ref() is not None for ref in refs] == [False, True, True]
 
 
-def test_local_map_without_points_is_none(target):
-    maps = LocalMaps(FakeMap(target.points, target.normals), radius=6.0)
-    assert maps.around(np.array([900.0, 0.0, 0.0])) is None
-    assert maps.around(np.array([901.0, 0.0, 0.0])) is None
+def test_local_map_without_points_is_none(world_map):
+    maps = LocalMaps(world_map, radius=6.0)
+    for x in (900.0, 901.0):
+        assert maps.around(np.array([x, 0.0, 0.0])) is None
 
 
 def test_T_map_source_maps_scan_points_into_map(target, scan):
@@ -188,6 +157,7 @@ def test_T_map_source_maps_scan_points_into_map(target, scan):
     assert distance.max() < 1e-3
 
 
+SHARED = ["shared_position", "shared_height", "shared_tilt", "shared_yaw"]
 FLOOR = np.array([CONFIG.sigma_floor_angle] * 3 + [CONFIG.sigma_floor] * 3)
 
 
@@ -295,7 +265,7 @@ def test_invalid_information_matrix_is_refused(bad):
         registration_covariance(bad, CONFIG)
 
 
-@pytest.mark.parametrize("name", ["weak_lever", "weak_from", "weak_sigma"])
+@pytest.mark.parametrize("name", ["weak_lever", "weak_from", "weak_sigma", "shared", *SHARED])
 def test_covariance_settings_must_be_positive(name):
     with pytest.raises(ConfigError, match=name):
         RegistrationConfig(**{name: 0.0})

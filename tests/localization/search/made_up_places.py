@@ -1,4 +1,4 @@
-"""Places that a search might have scored, with probabilities of our choice."""
+"""Places that a search might have scored, with probabilities of our choice, and votes that name chosen places."""
 
 from __future__ import annotations
 
@@ -12,6 +12,33 @@ from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.scoring import Rivals, Scored
+
+
+class Votes:
+    """Consensus of keyframes whose places a test replaces: ``name`` gets those of the real one."""
+
+    def __init__(self, consensus, name):
+        self.consensus, self.name, self.centre = consensus, name, None
+
+    def __len__(self):
+        return len(self.consensus)
+
+    def vote(self, centre, query, area=None):
+        self.centre = centre
+        self.consensus.vote(centre, query, area)
+
+    def hypotheses(self):
+        return self.name(self.consensus.hypotheses())
+
+    def clear(self):
+        self.consensus.clear()
+
+
+def name_instead(search, name=lambda _: []):
+    """Have the co-view votes of a search name other places, by default none; the votes."""
+    search.coview.consensus = votes = Votes(search.coview.consensus, name)
+    return votes
+
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_world
+from made_up_places import name_instead
+from trackers import follow
 
 from bench.accuracy.paper import TableVote
 from coview_stream.config import LearnedConfig, LocalizerConfig
@@ -15,6 +17,8 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_queue import SearchJob
 from coview_stream.stream.node.engines import SearchEngine
@@ -25,28 +29,36 @@ def search_of(base_map, reloc="auto", **settings):
     return GlobalSearch(base_map, config, LocalMaps(base_map, 50.0))
 
 
-@pytest.fixture
-def knowing(monkeypatch, world_drive):
-    """Learned features that know the truth of the drive (see :func:`follow`): their votes, not their networks."""
-    first = world_drive.T_odom_body[0]
-    local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
-    T_map_local = world_drive.T_map_body[0] @ inverse(local)
+class Told(FeatureMatcher):
+    """Learned features whose votes are told: ``distances`` of a keyframe's centre (3,) and the matcher."""
 
-    def vote(self, view, near, area):
-        rng = np.random.default_rng(0)
-        found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
-        there = transform(T_map_local, view.centre[None])[0, :2]
-        station = np.hypot(*(self.stations[:, :2] - there).T).argmin()
-        shift = round(-yaw_of(T_map_local) / (2 * np.pi / self.config.yaws)) % self.config.yaws
-        found[station, shift] = -1.0
-        return TableVote.of_distances(view.centre, [found])
+    def __init__(self, base_map, distances):
+        super().__init__(base_map.learned, base_map.stations, LearnedConfig(), block=base_map.config.block)
+        self.distances = distances
 
-    monkeypatch.setattr(FeatureMatcher, "vote", vote)
+    def vote(self, view, near=(), area=None):
+        return TableVote.of_distances(view.centre, [self.distances(self, view.centre).astype(np.float32)])
 
 
-def follow(localizer, drive):
-    pairs = zip(drive.clouds, drive.T_odom_body, strict=True)
-    return [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+def knowing(drive):
+    """Distances that know the truth of the drive."""
+    first = pose_from(drive.T_odom_body[0][:3, :3], np.zeros(3))  # about the localizer's anchor
+    T_map_odom = drive.T_map_body[0] @ inverse(first)
+
+    def distances(matcher, centre):
+        found = np.random.default_rng(0).normal(1.0, 0.1, (len(matcher.stations), matcher.config.yaws))
+        there = transform(T_map_odom, centre[None])[0, :2]
+        station = np.hypot(*(matcher.stations[:, :2] - there).T).argmin()
+        found[station, round(-yaw_of(T_map_odom) / (2 * np.pi / matcher.config.yaws)) % matcher.config.yaws] = -1.0
+        return found
+
+    return distances
+
+
+def localizer_of(base_map, distances, reloc="auto"):
+    """A localizer whose learned features are told."""
+    index = SearchIndex(None if reloc == "learned" else Retrieval(base_map), Told(base_map, distances))
+    return Localizer(base_map, LocalizerConfig(reloc=reloc), index=index)
 
 
 def right(fixes, drive):
@@ -90,8 +102,8 @@ def test_each_recognizer_has_its_own_limit_of_hypotheses(learned_map):
 # ---- what they name
 
 
-def test_learned_recognizer_alone_localizes(learned_map, world_drive, knowing):
-    localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
+def test_learned_recognizer_alone_localizes(learned_map, world_drive):
+    localizer = localizer_of(learned_map, knowing(world_drive), "learned")
     fixes = follow(localizer, world_drive)
     assert right(fixes, world_drive)
     first = next(f for f in fixes if f.state is State.TRACKING)
@@ -102,27 +114,27 @@ def test_learned_recognizer_alone_localizes(learned_map, world_drive, knowing):
 
 
 @pytest.mark.slow
-def test_learned_recognizer_finds_what_coview_misses(learned_map, world_drive, knowing, monkeypatch):
-    localizer = Localizer(learned_map)
-    monkeypatch.setattr(localizer.search.coview.consensus, "hypotheses", list)
+def test_learned_recognizer_finds_what_coview_misses(learned_map, world_drive):
+    localizer = localizer_of(learned_map, knowing(world_drive))
+    name_instead(localizer.search)
     assert right(follow(localizer, world_drive), world_drive)
 
 
 @pytest.mark.slow
-def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, world_fixes, monkeypatch):
+def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, world_fixes):
     """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
     named = []
 
-    def vote(self, view, near, area):
-        found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
-        away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
+    def distances(matcher, centre):
+        xy = matcher.stations[:, :2]
+        found = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), matcher.config.yaws))
+        away = np.hypot(*(xy - xy.mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
         found[wrong, np.arange(5) * 7] = -1.0
         named.append(wrong)
-        return TableVote.of_distances(view.centre, [found.astype(np.float32)])
+        return found
 
-    monkeypatch.setattr(FeatureMatcher, "vote", vote)
-    fixes = follow(Localizer(learned_map), world_drive)
+    fixes = follow(localizer_of(learned_map, distances), world_drive)
     assert right(fixes, world_drive)
     assert named
     states = [f.state for f in fixes]

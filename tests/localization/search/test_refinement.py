@@ -9,14 +9,13 @@ import pytest
 import small_world
 from made_up_places import candidate, place
 from small_world import Box
+from trackers import observed
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
-from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.search import refinement
 from coview_stream.localization.search.refinement import Modes, find_modes
 from coview_stream.localization.search.request import SearchRequest
@@ -47,10 +46,7 @@ def look(row_map, points, x, reach, start):
     near = points[np.linalg.norm(points[:, :2] - truth[:2, 3], axis=1) < reach]
     cloud = transform(inverse(truth), near).astype(np.float32)
     T_odom_body = inverse(T_MAP_ODOM) @ truth
-    scan = ObservedScan.of(
-        prepare_scan(voxelized(cloud, T_odom_body, CONFIG.keyframe), T_odom_body[:3, 3], CONFIG.registration),
-        cloud, T_odom_body,
-    )  # fmt: skip
+    scan = observed(cloud, T_odom_body)
     request = SearchRequest(0.0, T_odom_body, NOTHING, NOTHING, NOTHING, 0.0, (0, 0))
     named = place(1.0, pose_from(np.eye(3), [start, 0.0, 0.0]) @ T_MAP_ODOM)
     return find_modes(named, candidate(named), scan, request, row_map, CONFIG, LocalMaps(row_map, 50.0))

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
+from trackers import follow
 
 from bench.accuracy.paper import TableVote
 from coview_stream.basemap.station_index import StationIndex
@@ -20,6 +21,7 @@ from coview_stream.localization.search import retrieval
 from coview_stream.localization.search.consensus import yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, PoseHints
+from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.retrieval import CoViewVote, Retrieval, SearchStations, exact_distances
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_queue import FrameJob
@@ -91,11 +93,11 @@ def test_exhaustive_retrieval_equals_brute_force(stations, query):
         np.testing.assert_allclose(volume[7], 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("block", [1, 7, M])
-def test_distances_are_the_same_in_blocks(stations, query, monkeypatch, block):
+def test_distances_are_the_same_in_blocks(stations, query):
+    """Of 8192 stations each."""
+    many = np.resize(stations.full["coview"], (8200, R, S))
     expected = exact_distances(stations.full["coview"], query["coview"])
-    monkeypatch.setattr(retrieval, "_BLOCK", block)
-    np.testing.assert_allclose(exact_distances(stations.full["coview"], query["coview"]), expected, atol=1e-5)
+    np.testing.assert_allclose(exact_distances(many, query["coview"]), np.resize(expected, (8200, S)), atol=1e-5)
 
 
 def test_vote_is_that_of_the_exact_distances(stations, query):
@@ -143,13 +145,16 @@ def test_robot_turned_left_is_found_at_its_heading(turn):
 
 @pytest.fixture
 def few_are_many(monkeypatch):
-    monkeypatch.setattr(retrieval, "_ORDINARY", 50)
+    monkeypatch.setattr(retrieval, "_ORDINARY", 20)
 
 
-def test_ordinary_maps_are_compared_whole(world_map):
+def test_ordinary_maps_and_blocks_of_a_square_s_size_are_compared_whole(world_map, request):
     compared = SearchStations.of(world_map.station_index, world_map.station_grid)
     assert compared.index is world_map.station_index
     assert compared.grid is world_map.station_grid
+    request.getfixturevalue("few_are_many")
+    grid = StationGrid(world_map.stations, 6.0)
+    assert SearchStations.of(world_map.station_index, grid).squares is None
 
 
 def test_every_station_is_in_one_square_and_its_middle_stands_for_it(few_are_many, world_map):
@@ -170,26 +175,21 @@ def test_storeys_have_squares_of_their_own(few_are_many, world_map):
     above = ground + np.array([0, 0, 6], dtype=np.float32)
     for lower, upper in ((ground, above[::2]), (ground[::2], above), (ground[::3], above[1::2])):
         grid = StationGrid(np.concatenate([lower, upper]), world_map.config.block)
-        members = retrieval._members(grid, np.arange(len(grid)), 3)
+        compared = SearchStations.of(world_map.station_index.subset(np.arange(len(grid)) % 80), grid)
+        members = compared.squares.members
         heights = np.where(members < 0, np.nan, grid.stations[members, 2])
         assert np.nanmax(np.nanmax(heights, axis=1) - np.nanmin(heights, axis=1)) < 3.0
         np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(grid)))
         # each of them is found at its height by the one that stands for it
-        coarse = StationGrid(grid.stations[members[:, 0]], 3 * grid.block)
-        found = coarse.at(grid.stations)
+        found = compared.grid.at(grid.stations)
         assert (found >= 0).all()
-        assert (np.abs(coarse.stations[found, 2] - grid.stations[:, 2]) < 3.0).all()
-
-
-def test_blocks_of_a_square_s_size_stand_for_themselves(few_are_many, world_map):
-    grid = StationGrid(world_map.stations, 6.0)
-    assert SearchStations.of(world_map.station_index, grid).squares is None
+        assert (np.abs(compared.grid.stations[found, 2] - grid.stations[:, 2]) < 3.0).all()
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_circle_has_the_scores_of_the_map(world_map, monkeypatch, many):
+def test_circle_has_the_scores_of_the_map(world_map, request, many):
     if many:
-        monkeypatch.setattr(retrieval, "_ORDINARY", 20)
+        request.getfixturevalue("few_are_many")
     index, grid = world_map.station_index, world_map.station_grid
     chosen = np.flatnonzero(Circle(*world_map.stations[40, :2].tolist(), 12.0).holds(world_map.stations))
     compared = SearchStations.of(index, grid, chosen)
@@ -204,11 +204,10 @@ def test_circle_has_the_scores_of_the_map(world_map, monkeypatch, many):
         np.testing.assert_allclose(single, index.at(whole, compared.numbers, np.zeros(len(every))), atol=1e-4)
 
 
-def driven(localizer, world_drive, guess=None, frames=6):
+def driven(localizer, world_drive, guess=None):
     if guess is not None:
         localizer.guess_place(guess)
-    steps = zip(world_drive.clouds, world_drive.T_odom_body, range(frames), strict=False)
-    return [localizer.step(cloud, T, 0.5 * k) for cloud, T, k in steps]
+    return follow(localizer, world_drive, 6)
 
 
 @pytest.mark.slow
@@ -234,10 +233,9 @@ def test_robot_is_found_within_a_circle_and_not_beside_it(world_map, world_drive
     assert all(fix.T_map_body is None for fix in there)
 
 
-def test_localizer_that_does_not_search_chooses_no_stations(world_map, world_drive, monkeypatch):
+def test_localizer_that_does_not_search_chooses_no_stations(world_map, world_drive):
     """As the tracking engine's: the search is in another process."""
-    monkeypatch.setattr(SearchStations, "of", None)
-    localizer = Localizer(world_map)
+    localizer = Localizer(world_map, index=SearchIndex(object(), None))
     assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0) is not None
 
 

@@ -83,12 +83,15 @@ def test_what_speaks_for_the_place_does_not_add_up(monitor):
     )
 
 
-def test_standing_and_looking_again_and_again_is_no_certainty(monitor):
-    """A robot that is carried, while its odometry stands still, is noticed as soon as any other."""
+@pytest.mark.parametrize("metres", [0.2, 1.5, 20.0])
+def test_one_frame_of_garbage_costs_its_pose_and_two_views_of_it_the_place(monitor, metres):
+    """However often the place has fitted: a robot that is carried while it stands is noticed as soon as any other."""
     for k in range(50):
-        assert monitor.verify(said(15.0), float(k), 7.0).believed
-    assert monitor.verify(said(-6.0), 50.0, 7.0).event is Event.MATCH_REJECTED
-    assert monitor.verify(said(-14.0), 51.0, 8.0).event is Event.PLACE_GIVEN_UP
+        assert monitor.verify(said(15.0), float(k), 4.0).believed
+    assert monitor.verify(said(-100.0), 50.0, 4.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(said(15.0), 50.1, 4.0 + metres).believed
+    told = drive(monitor, [-100.0, -100.0], 60.0)
+    assert [ruling.event for ruling in told] == [Event.MATCH_REJECTED, Event.PLACE_GIVEN_UP]
 
 
 def test_one_view_has_to_make_up_for_all_that_was_said_before(monitor):
@@ -111,28 +114,10 @@ def test_place_is_given_up_once_it_is_more_probable_than_not_that_it_is_wrong(mo
     assert found[given_up.index(True)].reason == "more probably elsewhere: why"
 
 
-@pytest.mark.parametrize("metres", [0.2, 1.5, 20.0])
-def test_single_frame_of_garbage_costs_its_pose_alone(monitor, metres):
-    drive(monitor, [15.0, 15.0])
-    assert monitor.verify(said(-100.0), 3.0, 4.0).event is Event.MATCH_REJECTED
-    assert monitor.verify(said(15.0), 3.1, 4.0 + metres).believed
-
-
-def test_two_views_of_nothing_lose_the_place(monitor):
-    told = drive(monitor, [15.0, -100.0, -100.0])
-    assert [ruling.event for ruling in told[1:]] == [Event.MATCH_REJECTED, Event.PLACE_GIVEN_UP]
-
-
-def test_verification_that_is_required_again_changes_nothing(monitor):
-    drive(monitor, [15.0])
-    for _ in range(10_000):
-        monitor.require_verification()
-    assert monitor.verify(said(4.0), 2.0, 1.0).believed
-
-
 def test_verification_that_is_required_begins_a_doubt_with_a_timeout(monitor):
     drive(monitor, [15.0])
-    monitor.require_verification()
+    for _ in range(10_000):  # asked again, it changes nothing
+        monitor.require_verification()
     told = [monitor.verify(said(-0.1), 1.0 + seconds, 1.0).event for seconds in (0.0, 0.9 * RULE.max_doubt_s)]
     assert told == [Event.MATCH_REJECTED] * 2
     assert monitor.verify(said(-0.1), 1.0 + RULE.max_doubt_s, 1.0).event is Event.PLACE_GIVEN_UP
@@ -328,12 +313,6 @@ def test_evidence_has_fallen_by_as_much_as_the_usual_is_better(used):
     assert used.fallen(GOOD) == 1.0
     assert used.fallen(replace(GOOD, ground=1.0)) == 1.0  # better than usual
     assert EvidenceBaseline().fallen(half) == 1.0
-
-
-def test_explaining_does_not_change_the_baseline(used):
-    before = used.usual
-    used.explain(replace(GOOD, near=0.1))
-    assert used.usual == before
 
 
 @pytest.mark.parametrize("cause", list(RejectionReason))

@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from small_world import pose_error
+from trackers import observed
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import Prior, register
 from coview_stream.localization.tracking import map_matching
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, _beside, find_rivals, rings
@@ -29,15 +28,9 @@ LOOSE = np.diag([0.01, 0.01, 0.03, 0.5, 0.5, 0.3]) ** 2
 TIGHT = np.diag([0.003, 0.003, 0.004, 0.05, 0.05, 0.05]) ** 2
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scan(world_drive):
-    return scan_of(world_drive.clouds[4], world_drive.T_map_body[4])
-
-
-def scan_of(cloud, truth) -> ObservedScan:
-    T_odom_body = inverse(T_MAP_ODOM) @ truth
-    points = voxelized(cloud, T_odom_body, CONFIG.keyframe)
-    return ObservedScan.of(prepare_scan(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
+    return observed(world_drive.clouds[4], inverse(T_MAP_ODOM) @ world_drive.T_map_body[4])
 
 
 def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
@@ -159,6 +152,7 @@ def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_ma
         assert best.verdict.verified
         assert best is not tries[0]
         assert not tries[0].verdict.verified
+        assert tries[0].verdict.reason == "what is seen fits as well metres beside"
         assert tries[0].verdict.observation.rival == pytest.approx(best.verdict.observation.ratio, abs=3.0)
 
 
@@ -169,21 +163,9 @@ def test_right_place_stays_when_it_is_tried_again(world_map, world_drive, scan):
     assert all(off(each.T_map_body, truth) < 0.05 for each in tries if each.verdict.verified)
 
 
-def test_place_that_fits_as_well_as_its_rival_says_so(world_map, world_drive, scan):
-    truth = world_drive.T_map_body[4]
-    matcher = MapMatcher(world_map, CONFIG)
-    seen = matched(world_map, scan, Estimate(truth, TIGHT)).verdict
-    twin = replace(seen.observation, rival=seen.observation.ratio + 1.0)
-    cause, reason = matcher._judge(twin, seen.evidence)
-    assert (cause, reason) == (RejectionReason.FITNESS, "what is seen fits as well metres beside")
-
-
 @pytest.fixture(scope="module")
-def first_scan(world_drive):
-    truth = world_drive.T_map_body[4]
-    T = inverse(T_MAP_ODOM) @ truth
-    points = voxelized(world_drive.clouds[4], T, CONFIG.keyframe)
-    return ObservedScan.of(prepare_scan(points, T[:3, 3], CONFIG.registration), world_drive.clouds[4], T), truth
+def first_scan(scan, world_drive):
+    return scan, world_drive.T_map_body[4]
 
 
 def rivals(world_map, first_scan, off, count=1):
@@ -251,14 +233,6 @@ def test_rings_reach_as_far_as_odometry_slips():
             assert np.linalg.norm(straight[:, :2] - pose[:2] - slip, axis=1).min() < 0.75
 
 
-@pytest.mark.parametrize(
-    ("moved", "beside"), [((0.0, 0.0, 2.0), False), ((0.8, 0.0, 0.0), True), ((0.1, 0.1, -0.7), False)]
-)
-def test_pose_above_or_below_is_no_rival(moved, beside):
-    """Wheels slip along the ground."""
-    assert _beside(pose_from(np.eye(3), moved), np.eye(4)) == beside
-
-
 def judged(shift, degrees, sigma, innovation, disputed=False):
     """Whether the place moves, and how often the scans were asked, for a match off the belief at the origin."""
     asked = []
@@ -274,6 +248,14 @@ def judged(shift, degrees, sigma, innovation, disputed=False):
     led = near if innovation <= LocalizerConfig().acceptance.max_innovation and not disputed else belief
     found = MapMatcher.against_odometry(matcher, there, scan, [near, there], led.T_map_body, belief, 10.0)
     return found.moves_place, len(asked)
+
+
+@pytest.mark.parametrize(
+    ("moved", "beside"), [((0.0, 0.0, 2.0), False), ((0.8, 0.0, 0.0), True), ((0.1, 0.1, -0.7), False)]
+)
+def test_pose_above_or_below_is_no_rival(moved, beside):
+    """Wheels slip along the ground."""
+    assert _beside(pose_from(np.eye(3), moved), np.eye(4)) == beside
 
 
 @pytest.mark.parametrize("disputed", [False, True])

@@ -102,11 +102,3 @@ def test_scan_without_pairs_does_not_change_shared_error():
     before = shared.covariance
     shared.learn(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT)
     np.testing.assert_array_equal(shared.covariance, before)
-
-
-@pytest.mark.parametrize("name", ["shared", "shared_position", "shared_height", "shared_tilt", "shared_yaw"])
-def test_shared_error_settings_must_be_positive(name):
-    from coview_stream.errors import ConfigError
-
-    with pytest.raises(ConfigError, match=name):
-        RegistrationConfig(**{name: 0.0})

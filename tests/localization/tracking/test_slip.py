@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_world
+from any_risk import NEVER, with_risk
 from courtyard import courtyard, local_map
 from small_world import boxes
-from trackers import on_the_way, refused
+from trackers import observed, on_the_way, refused
 
+from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxplus, inverse, pose_from, rot_z, transform
-from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.tracking import slip as module
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
@@ -24,15 +24,9 @@ AWAY = pose_from(rot_z(np.radians(4.0)), [1.2, -0.5, 0.0])
 
 @pytest.fixture
 def scan(world_map, world_drive):
-    """A frame whose odometry frame is the body's, and where the body is."""
-    from coview_stream.config import LocalizerConfig
-    from coview_stream.localization.registration.prepare_scan import voxelized
-
-    config, cloud, truth = LocalizerConfig(), world_drive.clouds[4], world_drive.T_map_body[4].copy()
-    level = truth.copy()
-    level[:3, 3] = 0.0  # gravity aligned
-    points = voxelized(cloud, level, config.keyframe)
-    return ObservedScan.of(prepare_scan(points, level[:3, 3], config.registration), cloud, level), truth
+    """A frame whose odometry frame is the body's, gravity aligned, and where the body is."""
+    truth = world_drive.T_map_body[4].copy()
+    return observed(world_drive.clouds[4], pose_from(truth[:3, :3], np.zeros(3))), truth
 
 
 RISK = 1e-4
@@ -114,30 +108,30 @@ def test_places_within_half_of_the_alert_limit_need_no_decision():
     assert matters(0.0, 2.0)
 
 
-def test_registration_that_is_off_odometry_and_not_worth_it_moves_nothing(world_map, slow_drive, monkeypatch):
+SLIP = pose_from(np.eye(3), [0.9, -0.6, 0.1])
+
+
+def test_registration_that_is_off_odometry_and_not_worth_it_moves_nothing(world_map, slow_drive):
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
-    monkeypatch.setattr(Dispute, "settle", lambda *_: None)
-    ride = on_the_way(world_map, slow_drive)
-    ride.slips(pose_from(np.eye(3), [0.9, -0.6, 0.1]), truth[7])
+    ride = on_the_way(world_map, slow_drive, LocalizerConfig(acceptance=NEVER))
+    ride.slips(SLIP, truth[7])
     verdict = refused(ride, clouds[8], truth[8])
     assert verdict.cause is RejectionReason.ODOMETRY
     assert "may have been moved" in verdict.reason
-    off = ride.error(truth[8])[0]
-    assert off > 1.0
-    ride.slips(inverse(pose_from(np.eye(3), [0.9, -0.6, 0.1])), truth[8])  # so it had not slipped
+    assert ride.error(truth[8])[0] > 1.0
+    ride.slips(inverse(SLIP), truth[8])  # so it had not slipped
     assert ride.update(clouds[9], truth[9]).cause is RejectionReason.VERIFIED
     assert ride.error(truth[9])[0] < 0.05
 
 
 def test_doubt_that_makes_the_belief_wide_lets_no_such_registration_in(world_map, slow_drive, monkeypatch):
-    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
-    monkeypatch.setattr(Dispute, "settle", lambda *_: None)
-    ride = on_the_way(world_map, slow_drive)
-    ride.slips(pose_from(np.eye(3), [0.9, -0.6, 0.1]), truth[7])
+    clouds, truth, rule = slow_drive.clouds, slow_drive.T_map_body, with_risk(NEVER.risk)
+    ride = on_the_way(world_map, slow_drive, LocalizerConfig(acceptance=rule))
+    ride.slips(SLIP, truth[7])
     refused(ride, clouds[8], truth[8])
     monkeypatch.setattr(Estimate, "innovation", lambda *_: 1.0)
     assert refused(ride, clouds[9], truth[9], newest_only=True).cause is RejectionReason.ODOMETRY
-    monkeypatch.setattr(Dispute, "settle", lambda *_: truth[10])
+    object.__setattr__(rule, "risk", RISK)  # now the scans settle it
     assert ride.update(clouds[10], truth[10], newest_only=True).cause is RejectionReason.ODOMETRY
     assert ride.error(truth[10])[0] < 0.1
 
@@ -163,11 +157,8 @@ def shares(target, T, count=5):
     return [share_on_map(yard(seed), HERE, T, target) for seed in range(count)]
 
 
-def test_share_on_map_is_one_at_the_true_pose(target):
+def test_share_on_map_is_one_at_the_true_pose_and_falls_with_displacement(target):
     assert min(shares(target, T_MAP_ODOM)) > 0.98
-
-
-def test_share_on_map_falls_with_displacement(target):
     off = [np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0])))) for x in (0.0, 0.6, 5.3)]
     assert off[0] > 1.2 * off[1]
     assert off[1] > off[2]
@@ -216,9 +207,11 @@ def test_displaced_frame_is_detected_and_not_learned(target):
 
 
 def test_no_displacement_without_a_baseline(target):
-    check = DisplacementCheck()
-    assert not check.is_displaced(yard(), HERE, ELSEWHERE, target)
-    assert check.usual is None
+    cleared = used_to(target)
+    cleared.clear()
+    for check in (DisplacementCheck(), cleared):
+        assert not check.is_displaced(yard(), HERE, ELSEWHERE, target)
+        assert check.usual is None
 
 
 def cluttered(share, seed):
@@ -248,13 +241,6 @@ def test_one_badly_fitting_frame_does_not_become_the_baseline(target):
     check.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
     assert before - 0.3 < check.usual < before
     assert check.is_displaced(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
-
-
-def test_baseline_can_be_cleared(target):
-    check = used_to(target)
-    check.clear()
-    assert check.usual is None
-    assert not check.is_displaced(yard(), HERE, ELSEWHERE, target)
 
 
 def test_scan_of_another_world_is_detected_as_displaced(world_map, world_drive, scene):
