@@ -161,13 +161,13 @@ class PoseHints:
         self._circle_at = np.zeros(3)  # position by odometry then
 
     def clear(self) -> None:
-        """Forget them all: a place has been accepted."""
+        """Forget all hints, as a place has been accepted."""
         self._awaited, self._known = None, ()
         self.forget_leader()
         self._guess, self._guessed, self.circle = None, (), None
 
     def guess(self, guess: PlaceGuess) -> None:
-        """Have a guess of the place at the next frame tried, in place of an earlier one."""
+        """Try a guess of the place at the next frame, instead of an earlier one."""
         self._guess = guess
 
     def guessed(self, origin: Floats, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
@@ -219,7 +219,7 @@ class PoseHints:
         self._leader, self._led = None, ()
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
-        """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
+        """Return the hints as ``T_map_odom`` about ``anchor`` (3,), at a frame of pose ``T_odom_body`` about it."""
         if self._awaited is not None:
             T_map_body, self._awaited = self._awaited, None
             # level, for both frames are: the robot's lean has changed since

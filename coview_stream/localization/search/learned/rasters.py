@@ -120,7 +120,7 @@ class FeatureVote:
         return best
 
     def _products(self, cells: Ints, shifts: Ints) -> Floats32:
-        """Score cells (K, 2) of the raster."""
+        """Return the scores (K,) of raster cells (K, 2) at shifts (K,)."""
         sums = window_products(self._raster, self.images, cells - self._half, shifts)
         weight = sums[:, WEIGHT].astype(np.float32)
         enough = weight >= MIN_COVERAGE * self._total[shifts]
