@@ -141,6 +141,7 @@ class Node:
                 self.transport.answer(robot.session.keys.map_view, map_view)
             if not self._shared:
                 robot.begin_serving()
+            self.transport.announce(robot.session.keys.alive)
 
     def close(self, timeout: float = _CLOSE_TIMEOUT) -> bool:
         """Publish a last status, undeclare, end the engines; later calls only wait.

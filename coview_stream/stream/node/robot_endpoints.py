@@ -62,7 +62,7 @@ class RobotEndpoints:
         self._geo = geo
         self._publisher: Publisher | None = None
         self._locations: Publisher | None = None
-        self._endings: list[Callable[[], None]] = []  # of subscriptions
+        self._endings: list[Callable[[], None]] = []  # of subscriptions and answers
 
     @property
     def session(self) -> Session:
@@ -83,7 +83,7 @@ class RobotEndpoints:
     # ---- declarations
 
     def declare(self, node_id: str, number: int) -> None:
-        """Declare everything but the inputs; ``node_id`` is of our ROS node, ``number`` of this robot there, from 1."""
+        """Declare the outputs; ``node_id`` is of our ROS node, ``number`` of this robot there, from 1."""
         keys, transport = self.session.keys, self._transport
         self._publisher = transport.publisher(keys.pose, "realtime")
         if keys.rmw:
@@ -95,27 +95,28 @@ class RobotEndpoints:
         if self._geo is not None:
             self._locations = transport.publisher(keys.location, "data")
         self._reporter.declare(self.session)
-        transport.answer(keys.relocalize, self.relocalize)
-        transport.answer(keys.reset, self.reset)
-        transport.answer(keys.suggest, self.suggest)
-        transport.subscribe(keys.initial_pose, self.on_initial_pose, "all")
-        transport.announce(keys.alive)
 
     @property
     def serving(self) -> bool:
-        """Whether this node serves the robot: takes its clouds and odometry in, and publishes poses and statuses."""
+        """Whether this node serves the robot: reads its messages, answers its queries, publishes poses and statuses."""
         return bool(self._endings)
 
     def begin_serving(self) -> None:
-        """Take clouds and odometry in from now on."""
-        keys = self.session.keys
+        """Read the robot's messages and answer its queries from now on."""
+        keys, transport = self.session.keys, self._transport
         if self.session.inputs.odometry_source == "robot":
-            self._endings.append(self._transport.subscribe(keys.odometry, self.on_odometry, "all"))
-        self._endings.append(self._transport.subscribe(keys.cloud, self.on_cloud, "newest"))
+            self._endings.append(transport.subscribe(keys.odometry, self.on_odometry, "all"))
+        self._endings += [
+            transport.subscribe(keys.cloud, self.on_cloud, "newest"),
+            transport.subscribe(keys.initial_pose, self.on_initial_pose, "all"),
+            transport.answer(keys.relocalize, self.relocalize),
+            transport.answer(keys.reset, self.reset),
+            transport.answer(keys.suggest, self.suggest),
+        ]
         self._reporter.served.add(keys.robot)
 
     def end_serving(self) -> None:
-        """Take no clouds and no odometry in: nobody has to send them here."""
+        """Read no messages, answer no queries: another node does, and a client takes the first reply."""
         self._reporter.served.discard(self.session.keys.robot)
         endings, self._endings = self._endings, []
         for end in endings:

@@ -59,7 +59,7 @@ class MemoryTransport:
         self._connected = True
         self._tokens: list[str] = []
         self._subscriptions: list[tuple[str, Callable[[Sample], None], Policy]] = []
-        self._answers: dict[str, Callable[[dict[str, str]], dict[str, Any]]] = {}
+        self._answers: list[tuple[str, Callable[[dict[str, str]], dict[str, Any]]]] = []
         self._guard = RateLimitedErrors(_log)
 
     # for the node or client under test
@@ -81,9 +81,16 @@ class MemoryTransport:
         self.publishers.append(publisher)
         return publisher
 
-    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
-        """Answer :meth:`query`."""
-        self._answers[check_expression(key, "key")] = handler
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
+        """Answer :meth:`query`; of several answers to one key the first declared one replies."""
+        answer = (check_expression(key, "key"), handler)
+        self._answers.append(answer)
+
+        def end() -> None:
+            if answer in self._answers:
+                self._answers.remove(answer)
+
+        return end
 
     def announce(self, key: str) -> None:
         """Hold a token until :meth:`close`."""
@@ -97,7 +104,7 @@ class MemoryTransport:
         Raises:
             TransportError: if no answer is declared on ``key``, the network is away, or the handler raises.
         """
-        handler = next((handler for name, handler in self._answers.items() if matches(name, key)), None)
+        handler = next((handler for name, handler in self._answers if matches(name, key)), None)
         if handler is None or not self._connected:
             raise TransportError(f"{key}: no answer")
         try:

@@ -62,8 +62,11 @@ class Transport(Protocol):
         """Declare a publisher."""
         ...
 
-    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
-        """Answer queries on ``key`` with JSON; the handler takes the query's parameters. An error of it is replied."""
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
+        """Answer queries on ``key`` with JSON; the handler takes the query's parameters. An error of it is replied.
+
+        Returns a function that ends the answers; any thread may call it, more than once.
+        """
         ...
 
     def announce(self, key: str) -> None:

@@ -160,22 +160,23 @@ class Answers:
 
     def __init__(self, guard: RateLimitedErrors) -> None:
         self._guard = guard
-        self._queries: SimpleQueue[tuple[str, Any, Answer] | None] = SimpleQueue()
+        self._queries: SimpleQueue[tuple[str, Any, Answer, threading.Event] | None] = SimpleQueue()
 
-    def callback(self, key: str, handler: Answer) -> Callable[[Any], None]:
-        """Return the callback for queries on ``key``: it puts them into the queue."""
+    def callback(self, key: str, handler: Answer, ended: threading.Event) -> Callable[[Any], None]:
+        """Return the callback for queries on ``key``: it puts them into the queue. Once ``ended`` none is answered."""
 
         def enqueue(query: Any) -> None:
-            self._queries.put((key, query, handler))
+            self._queries.put((key, query, handler, ended))
 
         return enqueue
 
     def run(self) -> None:
         """Answer until :meth:`end`."""
         while (entry := self._queries.get()) is not None:
-            key, query, handler = entry
-            with self._guard.catch(key):
-                self._answer(key, query, handler)
+            key, query, handler, ended = entry
+            if not ended.is_set():
+                with self._guard.catch(key):
+                    self._answer(key, query, handler)
             del entry, query  # a query is finished for its sender once no reference is left
 
     def end(self) -> None:

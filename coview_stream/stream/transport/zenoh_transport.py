@@ -148,16 +148,7 @@ class ZenohTransport:
         def end() -> None:
             ended.set()
             inbox.close()
-            with self._lock:
-                if declare in self._declarations:
-                    self._declarations.remove(declare)
-                ending = [subscriber for subscriber in declared if subscriber in self._declared]
-                for subscriber in ending:
-                    self._declared.remove(subscriber)
-                declared.clear()
-            for subscriber in ending:
-                with self._guard.catch(key):
-                    subscriber.undeclare()
+            self._undeclare(key, declare, declared)
 
         self._declare(key, declare)
         return end
@@ -174,17 +165,32 @@ class ZenohTransport:
         self._declare(key, declare)
         return publisher
 
-    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
-        """Answer queries with JSON; all handlers of a transport share one thread. Errors as in :meth:`subscribe`."""
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
+        """Answer queries with JSON; all handlers of a transport share one thread. Errors as in :meth:`subscribe`.
+
+        Returns a function that ends the answers, also to queries that wait.
+        """
         import zenoh
 
+        declared: list[Any] = []
+        ended = threading.Event()
+
         def declare(session: Any) -> None:
-            callback = zenoh.handlers.Callback(self._answers.callback(key, handler), indirect=False)
-            self._declared.append(session.declare_queryable(key, callback))
+            if ended.is_set():
+                return
+            callback = zenoh.handlers.Callback(self._answers.callback(key, handler, ended), indirect=False)
+            queryable = session.declare_queryable(key, callback)
+            declared[:] = [queryable]
+            self._declared.append(queryable)
             if not any(thread.name == "coview answers" for thread in self._threads):
                 self._start("answers", self._answers.run)
 
+        def end() -> None:
+            ended.set()
+            self._undeclare(key, declare, declared)
+
         self._declare(key, declare)
+        return end
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
@@ -372,6 +378,19 @@ class ZenohTransport:
                 with zenoh_errors(f"key {key!r}"):
                     declare(self._session)
             self._declarations.append(declare)
+
+    def _undeclare(self, key: str, declare: Callable[[Any], None], declared: list[Any]) -> None:
+        """End a declaration, in this session and in one that opens later."""
+        with self._lock:
+            if declare in self._declarations:
+                self._declarations.remove(declare)
+            ending = [entity for entity in declared if entity in self._declared]
+            for entity in ending:
+                self._declared.remove(entity)
+            declared.clear()
+        for entity in ending:
+            with self._guard.catch(key):
+                entity.undeclare()
 
     # threads
 

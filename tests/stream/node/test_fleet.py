@@ -23,6 +23,8 @@ from sockets import until
 from zenoh_routers import Router
 
 from coview_stream.clouds.python_child import python_command, python_environment
+from coview_stream.errors import TransportError
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.fleet import Fleet, FleetMembers, owner
 from coview_stream.stream.node.last_place import LastPlace
@@ -155,6 +157,36 @@ def test_message_of_a_place_is_read_as_it_was_written():
     for broken in ({}, {"T_map_odom": [1], "map_sha256": SHA}, {"T_map_odom": twice, "map_sha256": SHA}):
         with pytest.raises((ValueError, KeyError)):
             LastPlace.from_message(broken)
+
+
+def test_only_the_node_that_serves_a_robot_acts_on_its_queries_and_guesses():
+    net, robots = MemoryTransport(), ROBOTS[:4]
+    nodes = {name: Member(net, name, robots) for name in ("a", "b")}
+    for _ in range(2):
+        for node in nodes.values():
+            node.fleet.look()
+    assert all(node.serves for node in nodes.values())
+
+    def guesses(robot):
+        return {name: guess.x for name, node in nodes.items() if (guess := node.sessions[robot].hints.guess)}
+
+    for robot in robots:
+        server = owner(robot, nodes)
+        assert net.query(f"coview/{robot}/rpc/suggest", {"x": "1", "y": "2"})["taken"]
+        assert guesses(robot) == {server: 1.0}
+        net.publish(Sample(f"coview/{robot}/in/initial_pose", b'{"x": 3.0, "y": 4.0}'))
+        assert guesses(robot) == {server: 3.0}
+        for name in ("relocalize", "reset"):
+            for node in nodes.values():
+                node.sessions[robot].guess_place(PlaceGuess(5.0, 6.0))
+            assert net.query(f"coview/{robot}/rpc/{name}")["ok"]
+            assert guesses(robot) == {name: 5.0 for name in nodes if name != server}
+            for node in nodes.values():
+                node.sessions[robot].reset()
+    for robot in nodes["a"].serves:
+        nodes["a"].node.endpoints[robot].end_serving()
+        with pytest.raises(TransportError, match="no answer"):
+            net.query(f"coview/{robot}/rpc/reset")
 
 
 class Other:

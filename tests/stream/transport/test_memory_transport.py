@@ -60,7 +60,7 @@ def test_queries_return_answers_or_raise_the_reason() -> None:
     def refuse(_: dict[str, str]) -> dict[str, object]:
         raise ValueError("not now")
 
-    net.answer("r1/rpc/reset", lambda parameters: {"ok": True, **parameters})
+    end = net.answer("r1/rpc/reset", lambda parameters: {"ok": True, **parameters})
     net.answer("r1/rpc/relocalize", refuse)
     assert net.query("r1/rpc/reset", {"why": "test"}) == {"ok": True, "why": "test"}
     with pytest.raises(TransportError, match="refused: not now"):
@@ -68,6 +68,10 @@ def test_queries_return_answers_or_raise_the_reason() -> None:
     assert [str(error) for error in net.raised] == ["not now"]
     with pytest.raises(TransportError, match="r2/rpc/reset"):
         net.query("r2/rpc/reset")
+    end()
+    end()
+    with pytest.raises(TransportError, match="r1/rpc/reset: no answer"):
+        net.query("r1/rpc/reset")
 
 
 def test_network_outage_and_return() -> None:

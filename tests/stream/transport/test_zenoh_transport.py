@@ -138,7 +138,7 @@ def test_queries_reply_json_and_errors(pair: tuple[ZenohTransport, ZenohTranspor
     def refuse(_: dict[str, str]) -> dict[str, Any]:
         raise ValueError("not now")
 
-    node.answer("r1/rpc/reset", lambda parameters: {"got": parameters})
+    end = node.answer("r1/rpc/reset", lambda parameters: {"got": parameters})
     node.answer("r1/rpc/relocalize", refuse)
     until(lambda: ask(robot, "r1/rpc/*"))
     (reply,) = ask(robot, "r1/rpc/reset?why=test;x=1")
@@ -147,6 +147,9 @@ def test_queries_reply_json_and_errors(pair: tuple[ZenohTransport, ZenohTranspor
     (reply,) = ask(robot, "r1/rpc/relocalize")
     assert json.loads(reply.err.payload.to_bytes()) == {"error": "not now"}
     assert len(ask(robot, "r1/rpc/*")) == 2  # each on its own key
+    end()
+    end()
+    until(lambda: not ask(robot, "r1/rpc/reset"))
 
 
 @pytest.mark.slow
