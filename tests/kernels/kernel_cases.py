@@ -5,11 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+
+from coview_kernels import runtime
 
 ROOT = Path(__file__).resolve().parents[2]
 BAD = (np.nan, np.inf, -np.inf, 3.0e38)
@@ -48,6 +53,14 @@ def poses(draw: st.DrawFn) -> np.ndarray:
         T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         T[:3, 3] = rng.integers(-5, 5, 3)
     return T
+
+
+@contextmanager
+def parallel_parts(count: int) -> Iterator[None]:
+    """Have the kernels split their work into so many parts, whatever the number of cores."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runtime, "workers", lambda: count)
+        yield
 
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 import coview_kernels as kernels
 from coview_kernels import field as field_module
-from coview_kernels import mapped, reference
+from coview_kernels import reference
 from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
 from coview_kernels.mapped import Windows
 from coview_kernels.reference.field import NO_GROUND, TILE, FieldLayers, Plan
@@ -179,14 +180,13 @@ def test_table_that_points_elsewhere_is_refused(scene: tuple[FieldMap, FieldScan
 
 
 def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path, windows: Callable[[int, int], None]
 ):
     field, scan, pose, others = scene
     np.save(tmp_path / "bits.npy", field.layers.bits)
     bits = np.load(tmp_path / "bits.npy", mmap_mode="r")
     stored = replace(field, stored=field.layers._replace(bits=bits))
-    monkeypatch.setattr(mapped, "LARGE", 1 << 14)
-    monkeypatch.setattr(mapped, "WINDOW", 2 * bits[0].nbytes)
+    windows(1 << 14, 2 * bits[0].nbytes)
     assert len(list(Windows(bits))) == 5
     starts = np.vstack([others, pose, np.add(pose, [500.0, -300.0, 0.0, 0.0])])  # some beside the map
     for poses in (starts, pose[None]):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernel_cases import parallel_parts
 from scipy.spatial.transform import Rotation
 
-import coview_kernels.icp
 from coview_kernels import Belief, PointGrid, Scale, align_planes, reference
 from coview_kernels.reference.icp import Plan
 
@@ -90,8 +90,7 @@ def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every, scat
     start[:3, 3] += truth[:3, :3] @ pivot - start[:3, :3] @ pivot + rng.uniform(-0.4, 0.4, 3)
     local[::97] = np.nan
     prior = Belief(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(coview_kernels.icp.runtime, "workers", lambda: threads)  # in how many parts it is done
+    with parallel_parts(threads):
         scales = tuple(scale._replace(every=n) for scale, n in zip(SCALES, every, strict=True))
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior, scales)
     assert_same(ours, plain, pivot)

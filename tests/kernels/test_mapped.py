@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coview_kernels import StationCodes, mapped
+from coview_kernels import StationCodes
 from coview_kernels.mapped import Windows, take_rows
 
 
 @pytest.fixture
-def windowed(monkeypatch):
-    monkeypatch.setattr(mapped, "LARGE", 1 << 15)
-    monkeypatch.setattr(mapped, "WINDOW", 1 << 14)
+def windowed(windows):
+    windows(1 << 15, 1 << 14)
 
 
 def stored(array, path):
@@ -48,9 +47,8 @@ def test_arrays_in_memory_small_ones_and_those_that_may_be_written_to_are_one_wi
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_what_a_window_brought_into_memory_is_released(tmp_path, monkeypatch):
-    monkeypatch.setattr(mapped, "LARGE", 1 << 20)
-    monkeypatch.setattr(mapped, "WINDOW", 1 << 20)
+def test_what_a_window_brought_into_memory_is_released(tmp_path, windows):
+    windows(1 << 20, 1 << 20)
     array = stored(np.ones((1 << 12, 1 << 13), dtype=np.uint8), tmp_path / "a.npy")  # 32 MB
     before = resident_bytes()
     total = sum(int(array[part, ::512].sum()) for part in Windows(array))
@@ -75,7 +73,7 @@ def test_rows_that_are_not_there_are_refused(windowed, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_single_codes_of_a_large_file_take_little_memory(tmp_path, monkeypatch):
+def test_single_codes_of_a_large_file_take_little_memory(tmp_path, monkeypatch, windows):
     rng = np.random.default_rng(8)
     codes = StationCodes.of([rng.random((300, 20, 60), dtype=np.float32)])
     rows = np.lib.format.open_memmap(tmp_path / "codes.npy", "w+", np.int16, (400_000, 16, 16))  # 205 MB
@@ -87,7 +85,7 @@ def test_single_codes_of_a_large_file_take_little_memory(tmp_path, monkeypatch):
     )
     assert Windows(file.codes).several
     query = codes.query(rng.random((20, 60), dtype=np.float32))
-    monkeypatch.setattr(mapped, "WINDOW", 1 << 23)
+    windows(1 << 26, 1 << 23)
     expected = codes.at(query, [0], [0])[0]  # the library is loaded
     before = most = resident_bytes()
     release = Windows._release
