@@ -19,7 +19,7 @@ from pathlib import Path
 import coview_stream
 from coview_stream import config
 from coview_stream.cli import PROGRAM, build_parser
-from coview_stream.cli.options import documented_fields
+from coview_stream.cli.options import documented_fields, role_free
 
 HERE = Path(__file__).resolve().parent
 _NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
@@ -33,11 +33,6 @@ def cell(text: str) -> str:
 def code(text: str) -> str:
     """Return a text as code in a cell of a table."""
     return f"`{text}`".replace("|", "\\|") if text else ""
-
-
-def role_free(text: str) -> str:
-    """Return a docstring's text with roles and double backticks as plain code."""
-    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
 
 
 def options_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str, str]]:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from coview_stream.cli.options import add_world
-from coview_stream.cli.view import add_view
+from coview_stream.cli.view import add_web
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, TransportError
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("coview-demo"), metavar="DIR", help="(coview-demo)")
     add_world(parser, 180.0, 40.0)
     parser.add_argument("--offline", action="store_true", help="frames straight from file to localizer, no zenoh")
-    add_view(parser)
+    add_web(parser)
     parser.epilog = (
         "Runs `serve`, `replay` and `watch` as processes of their own, which talk over zenoh on the loopback "
         "interface; at the robot's own pace. Exit code 0 if the robot was localised rightly, 1 if not."

@@ -6,7 +6,7 @@ import argparse
 import inspect
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -23,6 +23,11 @@ def documented_fields(kind: type[Any]) -> dict[str, str]:
     attributes = re.split(r"^\S", attributes, maxsplit=1, flags=re.MULTILINE)[0]
     field = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
     return {name: " ".join(text.split()) for name, text in field.findall(attributes)}
+
+
+def role_free(text: str) -> str:
+    """Return a docstring's text with roles and double backticks as plain code."""
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
 
 
 class HelpAll(argparse.Action):
@@ -49,7 +54,7 @@ def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mappin
         default = getattr(defaults, name)
         group.add_argument(
             f"--{_SHORT.get(name, name).replace('_', '-')}", dest=name, type=type(default), metavar=unit,
-            help=f"{texts[name].rstrip('.')} ({default:g})",
+            help=f"{role_free(texts[name]).rstrip('.')} ({f'{default:g}' if isinstance(default, float) else default})",
         )  # fmt: skip
 
 
@@ -68,18 +73,32 @@ def fill_from_file(
     from coview_stream.config.settings_file import read_settings, unknown_key
     from coview_stream.errors import ConfigError
 
-    settings = read_settings(path)
-    actions = {action.dest: action for action in parser._actions if action.dest not in ("help", "help_all", "config")}
-    for key, value in settings.items():
+    actions: dict[str, argparse.Action] = {}
+    for action in parser._actions:
+        names = [option[2:] for option in action.option_strings if option.startswith("--")] or [action.dest]
+        if action.dest not in ("help", "help_all", "config"):
+            actions |= {name.replace("-", "_"): action for name in names}
+    given = {action for action in actions.values() if not _absent(getattr(args, action.dest))}
+    for group in parser._mutually_exclusive_groups:  # one of them on the command line: the file's others are replaced
+        if given.intersection(group._group_actions):
+            given.update(group._group_actions)
+    found: dict[str, dict[str, Any]] = {}
+    for key, value in read_settings(path).items():
         name = key.replace("-", "_")
-        if name in tables:
+        if name in tables and (isinstance(value, dict) or name not in actions):
             if not isinstance(value, dict):
                 raise ConfigError(f"{path}: {key} is {value!r}; write a table [{key}]")
+            found[name] = value
         elif name not in actions:
             raise ConfigError(f"{path}: {unknown_key(key, [*tables, *actions])}")
-        elif getattr(args, name) in (None, False, []):
-            setattr(args, name, _value_of(actions[name], value, f"{path}: {key}"))
-    return {name: settings[name] for name in tables if name in settings}
+        elif actions[name] not in given:
+            setattr(args, actions[name].dest, _value_of(actions[name], value, f"{path}: {key}"))
+    return found
+
+
+def _absent(value: Any) -> bool:
+    """Whether an option was not given: None, False or an empty list, but not 0."""
+    return value is None or value is False or value == []
 
 
 def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
@@ -104,6 +123,17 @@ def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
         if action.choices is not None and out[-1] not in action.choices:
             raise ConfigError(f"{where} is {item!r}; choose one of {', '.join(map(str, action.choices))}")
     return out if several else out[0]
+
+
+def host_port(option: str, example: str) -> Callable[[str], str]:
+    """Return the type of an option whose value is ``HOST:PORT``."""
+
+    def check(text: str) -> str:
+        if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
+            raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write {option}={example}")
+        return text
+
+    return check
 
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"

@@ -30,6 +30,7 @@ from coview_stream.cli.options import (
     check_codec,
     fill_from_file,
     hide_rare,
+    host_port,
     initial_guesses,
     lidar_config,
     mount_of,
@@ -135,7 +136,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--metrics",
         nargs="?",
         const=METRICS_ADDRESS,
-        type=_host_port,
+        type=host_port("--metrics", METRICS_ADDRESS),
         metavar="HOST:PORT",
         help=f"serve GET /metrics and /health ({METRICS_ADDRESS} if no address is named)",
     )
@@ -146,12 +147,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "%(prog)s SITE --robot NAME [options]"
     parser.set_defaults(**dict.fromkeys(_DEFAULTS))  # None: not given, --config decides
     hide_rare(parser, *_RARE)
-
-
-def _host_port(text: str) -> str:
-    if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
-        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --metrics={METRICS_ADDRESS}")
-    return text
 
 
 def run(args: argparse.Namespace) -> int:
@@ -195,6 +190,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
 
     from coview_stream.basemap.signature import read_verify_key
     from coview_stream.config import LocalizerConfig
+    from coview_stream.config.odometry import LidarOdometryConfig
     from coview_stream.config.settings_file import with_table
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import CodecOptions, NetworkOptions, ServeOptions
@@ -205,13 +201,18 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
     verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
+    for name, key, remedy in (("localizer", "sensor_leans", "odometry decides it"), ("node", "mount", "set it above")):
+        if key in tables[name]:
+            raise ConfigError(f"{args.config}: [{name}]: {key} cannot be set here: {remedy}")
     localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
     localizer = replace(
         localizer,
         registration=localizer.registration
         if args.registration is None
         else replace(localizer.registration, method=args.registration),
-        acceptance=localizer.acceptance if args.risk is None else acceptance_config(args.risk),
+        acceptance=localizer.acceptance
+        if args.risk is None
+        else replace(localizer.acceptance, risk=acceptance_config(args.risk).risk),
         reloc=args.reloc or localizer.reloc,
     )
     node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")
@@ -221,11 +222,14 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         deskew=node.deskew and not args.no_deskew,
         mount=node.mount if args.mount is None else mount_of(args),
     )
-    # a pause that keeps the pose up keeps its frames as well
-    node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
+    if "max_gap" not in tables["node"]:  # a pause that keeps the pose up keeps its frames as well
+        node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
+    table = {"max_speed": node.max_speed} | tables["lidar_odometry"]
+    odometry = with_table(LidarOdometryConfig(), table, f"{args.config}: [lidar_odometry]")
     lidar = lidar_config(args.odometry, args.gravity, node.max_speed)
     if lidar is not None:
-        lidar = with_table(lidar, tables["lidar_odometry"], f"{args.config}: [lidar_odometry]")
+        gravity = odometry.gravity if args.gravity is None else lidar.gravity
+        lidar = replace(odometry, gravity=gravity, max_speed=args.max_speed or odometry.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)

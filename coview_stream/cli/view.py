@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.options import host_port
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,34 +24,26 @@ _WEB = "127.0.0.1:8642"
 _FOXGLOVE = "127.0.0.1:8765"
 
 
-def add_view(parser: argparse._ActionsContainer) -> None:
-    """Declare the options of what to show, which ``serve`` and ``watch`` share."""
+def add_web(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--web``."""
     parser.add_argument(
-        "--web",
-        nargs="?",
-        const=_WEB,
-        type=_host_port,
-        metavar="HOST:PORT",
+        "--web", nargs="?", const=_WEB, type=host_port("--web", _WEB), metavar="HOST:PORT",
         help=f"show map and robots on a web page ({_WEB} if no address is named)",
-    )
+    )  # fmt: skip
+
+
+def add_view(parser: argparse._ActionsContainer) -> None:
+    """Declare the views that ``serve`` and ``watch`` share."""
+    add_web(parser)
     parser.add_argument(
-        "--foxglove",
-        nargs="?",
-        const=_FOXGLOVE,
-        type=_host_port,
-        metavar="HOST:PORT",
+        "--foxglove", nargs="?", const=_FOXGLOVE, type=host_port("--foxglove", _FOXGLOVE), metavar="HOST:PORT",
         help=f"serve the same to Foxglove ({_FOXGLOVE}; extra foxglove)",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--record", type=Path, metavar="FILE", help="record the same: F.mcap (extra foxglove), F.rrd (viz)"
-    )
+        "--record", action="append", default=[], type=Path, metavar="FILE",
+        help="record the same: F.mcap (extra foxglove), F.rrd (extra viz); repeat for both",
+    )  # fmt: skip
     parser.add_argument("--rerun", action="store_true", help="show the same in rerun (extra viz)")
-
-
-def _host_port(text: str) -> str:
-    if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
-        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --web={_WEB}")
-    return text
 
 
 def open_sinks(args: argparse.Namespace) -> list[Sink]:
@@ -61,19 +54,20 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
         DependencyError: a library is missing.
     """
     sinks: list[Sink] = []
-    mcap, rrd = (args.record if args.record and args.record.suffix == suffix else None for suffix in (".mcap", ".rrd"))
-    if args.record is not None and not (mcap or rrd):
-        raise ConfigError(f"--record {args.record}: name a file .mcap (Foxglove) or .rrd (rerun)")
-    if args.rerun or rrd is not None:
+    mcap, rrd = ([path for path in args.record if path.suffix == suffix] for suffix in (".mcap", ".rrd"))
+    for path in args.record:
+        if path not in mcap + rrd:
+            raise ConfigError(f"--record {path}: name a file .mcap (Foxglove) or .rrd (rerun)")
+    if args.rerun or rrd:
         from coview_stream.viewers.rerun_sink import RerunSink
 
-        sinks.append(RerunSink(rrd))
-    if args.foxglove is not None or mcap is not None:
+        sinks += [RerunSink(path) for path in [*([None] if args.rerun else []), *rrd]]
+    if args.foxglove is not None or mcap:
         from coview_stream.viewers.foxglove_sink import FoxgloveSink
 
         foxglove = FoxgloveSink()
-        if mcap is not None:
-            foxglove.record(mcap)
+        for path in mcap:
+            foxglove.record(path)
         if args.foxglove is not None:
             host, _, port = args.foxglove.rpartition(":")
             host = host.strip("[]") or "127.0.0.1"

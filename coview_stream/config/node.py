@@ -19,8 +19,7 @@ class NodeConfig:
         pose_rate: of the poses, while TRACKING.
         status_rate: of the statuses, besides one at every change of state.
         odometry_timeout: without odometry for this long (local time) there is no pose: LOST.
-        dead_reckoning_timeout: without a usable frame for this long poses go on by odometry alone, then LOST
-            (``serve --coast``).
+        dead_reckoning_timeout: without a usable frame for this long poses go on by odometry alone, then LOST.
         pairing_wait: a frame waits this long (local time) for the odometry around its stamp.
         odometry_history: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.

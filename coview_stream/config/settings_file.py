@@ -18,8 +18,10 @@ def read_settings(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises:
-        ConfigError: the file cannot be read or is no TOML; the message names file and line.
+        ConfigError: the file cannot be read or is not valid TOML; the message names file and line.
     """
+    if path.suffix in (".json5", ".json", ".yaml", ".yml"):
+        raise ConfigError(f"{path}: --config takes a TOML file; zenoh's configuration goes to --zenoh-config")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -27,7 +29,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text; name a TOML file") from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is no TOML: {error}") from error
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
 
 
 def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
@@ -49,8 +51,8 @@ def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
         current = getattr(config, key)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
-                raise ConfigError(f"{where}: {key} is {value!r}; write a table [{key}] with its fields")
-            values[key] = with_table(current, value, f"{where}.{key}")
+                raise ConfigError(f"{where}: {key} is {value!r}; write a table of its fields")
+            values[key] = with_table(current, value, f"{where.removesuffix(']')}.{key}{']' * where.endswith(']')}")
         elif isinstance(value, list):
             values[key] = tuple(value)
         else:

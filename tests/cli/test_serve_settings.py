@@ -73,7 +73,7 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robot = "a"\npose_rate = "fast"\n', "pose_rate is 'fast'"),
         ('robot = "a"\nquiet = 1\n', "quiet is 1; write true or false"),
         ('robot = "a"\nregistration = "icp"\n', "registration is 'icp'; choose one of trimmed-icp, gicp"),
-        ('robot = "a"\nnode = 3\n', "node is 3; write a table [node]"),
+        ('robot = "a"\nlocalizer = 3\n', "localizer is 3; write a table [localizer]"),
         ('robot = "a"\n[node]\npose_rte = 3\n', "[node]: unknown key 'pose_rte'; did you mean 'pose_rate'?"),
         ('robot = "a"\n[localizer.keyframe]\ndistance = -1\n', "distance is -1"),
         ("[node]\n", "--robot is missing"),
@@ -98,3 +98,51 @@ def test_help_fits_a_screen_and_help_all_has_the_rest(capsys):
         assert option not in short
     for option in ("--robot", "--config", "--state", "--metrics"):
         assert option in short
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "read", "wanted"),
+    [
+        (
+            "[localizer.acceptance]\nmax_doubt_s = 9\n",
+            ["--risk", "1e-5"],
+            lambda o: o.localizer.acceptance.max_doubt_s,
+            9.0,
+        ),
+        ("domain = 7\npreset = 'rmw_zenoh'\n", ["--domain", "0"], lambda o: o.keys[0].cloud.partition("/")[0], "0"),
+        ("no_state = true\n", ["--state", "STATE"], lambda o: o.state is not None, True),
+        ("[node]\nmax_gap = 0.2\n", [], lambda o: o.node.max_gap, 0.2),
+        (
+            "coast = 3\nnode = 'n1'\n",
+            [],
+            lambda o: (o.node.dead_reckoning_timeout, o.node_keys.health.split("/")[2]),
+            (3.0, "n1"),
+        ),
+        (
+            "odometry = 'kiss-icp'\n[lidar_odometry]\ngravity = 'ground'\nmax_speed = 3\nvoxel = 2\n",
+            ["--gravity", "level", "--max-speed", "10"],
+            lambda o: (o.lidar.gravity, o.lidar.max_speed, o.lidar.voxel),
+            ("level", 10.0, 2.0),
+        ),
+    ],
+)
+def test_options_given_replace_the_file_and_leave_the_rest(world_file, tmp_path, text, given, read, wanted):
+    path = tmp_path / "node.toml"
+    path.write_text(text)
+    state = [str(tmp_path) if word == "STATE" else word for word in given]
+    assert read(options_of(world_file, "--robot", "r1", "--config", path, *state)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[localizer]\nsensor_leans = false\n", "sensor_leans cannot be set here"),
+        ("[node.mount]\nroll = 3\n", "mount cannot be set here: set it above"),
+        ("[lidar_odometry]\nnonsense = 3\n", "unknown key 'nonsense'"),
+    ],
+)
+def test_settings_that_something_else_decides_are_refused(world_file, tmp_path, text, message):
+    path = tmp_path / "node.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        options_of(world_file, "--robot", "r1", "--no-state", "--config", path)
