@@ -77,6 +77,10 @@ def check_commands(folder: Path, map_path: Path, block: bool) -> None:
     assert "Traceback" not in done.stderr, done.stderr
     parts = "client, watch, info, doctor (more: pip install 'coview-stream[node,build,plot]')"
     assert parts in done.stdout, done.stdout
+    alone = ["doctor", "--robot", "r1", "--listen", "tcp/127.0.0.1:0", "--seconds", "0.5"]
+    done = run(folder, map_path, alone, block)
+    assert done.returncode == 1, (done.returncode, done.stdout, done.stderr)
+    assert "nothing has connected" in done.stdout, done.stdout
     for extra, arguments in LACKING:
         done = run(folder, map_path, arguments, block)
         assert done.returncode == 2, (arguments, done.returncode, done.stdout, done.stderr)

@@ -131,9 +131,9 @@ def _rpc() -> Target:
     from coview_stream.errors import CoViewError
     from coview_stream.messages.json_messages import read_object
     from coview_stream.stream.client.fleet_table import FleetTable
-    from coview_stream.stream.node.status import NodeIdentity
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors
+    from coview_stream.stream.transport.keys import NodeIdentity
     from coview_stream.stream.transport.transport import MAX_REPLY
 
     log = logging.getLogger("coview_stream")

@@ -19,8 +19,7 @@ from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
-from coview_stream.stream.node.status import NodeIdentity
-from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.keys import NodeIdentity, RobotKeys
 from coview_stream.stream.transport.transport import Transport
 
 Wait = Callable[[float], object]

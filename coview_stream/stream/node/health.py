@@ -93,8 +93,6 @@ class NodeHealth:
                 session.keys.robot: {
                     "state": session.state()[0].reported,
                     "reason": session.state()[1],
-                    "served_by": node.identity.node,
-                    "serves": True,
                     "pose_rate_hz": node.reporter.rates[session.keys.robot].rate(now),
                     "latency_ms": session.queue.latency.to_json(),
                     "counters": session.counters.to_json(),
@@ -161,8 +159,6 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
     names = sorted({state.reported for state in State})
     states = [(labels | {"state": name}, int(robot["state"] == name)) for labels, robot in of_robots for name in names]
     yield from _metric("robot_state", "gauge", "1 for the state that a robot is in", states)
-    serving = [(labels, int(robot["serves"])) for labels, robot in of_robots]
-    yield from _metric("robot_served", "gauge", "Whether this node serves a robot, or stands by for another", serving)
     rates = [(labels, robot["pose_rate_hz"]) for labels, robot in of_robots]
     yield from _metric("pose_rate_hertz", "gauge", "Poses per second", rates)
     latencies = [

@@ -22,8 +22,9 @@ from coview_stream.stream.node.engine_feed import EngineFeed
 from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineRunner
 from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
-from coview_stream.stream.node.status import NodeIdentity, Reporter
+from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")

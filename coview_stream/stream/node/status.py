@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-import socket
 import threading
 import time
-import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,6 +17,7 @@ from coview_stream.messages.types import Encoded, HypothesesMessage
 from coview_stream.stream.node.counters import PoseRate, Rate
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Connection, Publisher, Transport
 from coview_stream.version import __version__
 
@@ -31,53 +29,6 @@ MAX_STATUS = 3500
 _JSON = "application/json"
 _MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
 _TEXT, _SHORT_TEXT = 300, 100  # characters
-_MAX_READ = 65_536  # bytes of a status that is read
-_MAX_NAME = 64  # characters of a node's name or host
-_MAX_PERIOD = 60.0  # seconds between two statuses
-
-
-@dataclass(frozen=True)
-class NodeIdentity:
-    """Identity of a node in its statuses.
-
-    Attributes:
-        node: unlike that of any other node.
-        host: name of its machine, for people.
-        period: seconds between its statuses.
-        ending: it serves no longer.
-    """
-
-    node: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
-    host: str = field(default_factory=lambda: socket.gethostname()[:_MAX_NAME])
-    period: float = 1.0
-    ending: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.node} on {self.host}" if self.host else self.node
-
-    def to_json(self, ending: bool = False) -> dict[str, Any]:
-        """Return it as it stands in a status."""
-        return {"id": self.node, "term": 0, "period_s": self.period, "ending": ending, "host": self.host}
-
-    @classmethod
-    def read(cls, status: bytes) -> NodeIdentity | None:
-        """Return the identity in a status, from anyone; None where none can be read."""
-        if len(status) > _MAX_READ:
-            return None
-        try:
-            node = json.loads(status)["node"]
-            name, period, ending, host = node["id"], node["period_s"], node["ending"], node.get("host", "")
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            return None
-        numeric = isinstance(period, int | float) and type(period) is not bool and 0.0 < period <= _MAX_PERIOD
-        if not (numeric and isinstance(ending, bool) and _is_name(name) and name and _is_name(host)):
-            return None
-        return cls(name, host, float(period), ending)
-
-
-def _is_name(text: object) -> bool:
-    """Whether it can be logged."""
-    return isinstance(text, str) and len(text) <= _MAX_NAME and text.isprintable()
 
 
 class Reporter:

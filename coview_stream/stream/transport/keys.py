@@ -1,4 +1,4 @@
-"""Keys of a robot's traffic: presets for the conventions in use, in one table.
+"""Keys of a robot's traffic, by presets for the conventions in use, and the identity of a node.
 
 ``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and ``keelson``
 RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no other convention has them. No robot
@@ -7,10 +7,14 @@ may read another's messages, and no pose may come back as input.
 
 from __future__ import annotations
 
+import json
 import re
+import socket
+import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations, pairwise
+from typing import Any
 
 from coview_stream.errors import ConfigError
 from coview_stream.stream.transport.rmw import dds_type, type_hash
@@ -326,3 +330,52 @@ def _check_inputs(one: RobotKeys, other: RobotKeys) -> None:
                     f"{first} {a!r} of robot {one.robot} and {second} {b!r} of {other.robot} have messages in common: "
                     f"use {{robot}} in {both}"
                 )
+
+
+_MAX_STATUS = 65_536  # bytes of a status that is read
+_MAX_NAME = 64  # characters of a node's name or host
+_MAX_PERIOD = 60.0  # seconds between two statuses
+
+
+@dataclass(frozen=True)
+class NodeIdentity:
+    """Identity of a node in its statuses.
+
+    Attributes:
+        node: unlike that of any other node.
+        host: name of its machine, for people.
+        period: seconds between its statuses.
+        ending: it serves no longer.
+    """
+
+    node: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
+    host: str = field(default_factory=lambda: socket.gethostname()[:_MAX_NAME])
+    period: float = 1.0
+    ending: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.node} on {self.host}" if self.host else self.node
+
+    def to_json(self, ending: bool = False) -> dict[str, Any]:
+        """Return it as it stands in a status."""
+        return {"id": self.node, "period_s": self.period, "ending": ending, "host": self.host}
+
+    @classmethod
+    def read(cls, status: bytes) -> NodeIdentity | None:
+        """Return the identity in a status, from anyone; None where none can be read."""
+        if len(status) > _MAX_STATUS:
+            return None
+        try:
+            node = json.loads(status)["node"]
+            name, period, ending, host = node["id"], node["period_s"], node["ending"], node.get("host", "")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return None
+        numeric = isinstance(period, int | float) and type(period) is not bool and 0.0 < period <= _MAX_PERIOD
+        if not (numeric and isinstance(ending, bool) and _is_name(name) and name and _is_name(host)):
+            return None
+        return cls(name, host, float(period), ending)
+
+
+def _is_name(text: object) -> bool:
+    """Whether it can be logged."""
+    return isinstance(text, str) and len(text) <= _MAX_NAME and text.isprintable()

@@ -265,5 +265,5 @@ def only_server(service, *nodes):
 
 def serving_now(*nodes):
     """Which of the nodes has the robot, None unless it is one."""
-    has = [k for k, node in enumerate(nodes) if (told := node.robot()) is not None and told["serves"]]
+    has = [k for k, node in enumerate(nodes) if node.robot() is not None]
     return has[0] if len(has) == 1 else None

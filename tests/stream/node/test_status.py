@@ -20,14 +20,8 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import Considered
 from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.stream.node.robot_endpoints import MapViewAnswer
-from coview_stream.stream.node.status import (
-    MAX_STATUS,
-    ConnectionMonitor,
-    NodeIdentity,
-    encode_status,
-    hypotheses,
-    status,
-)
+from coview_stream.stream.node.status import MAX_STATUS, ConnectionMonitor, encode_status, hypotheses, status
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Connection
 
 LONG = "the place that fits best is 1 in 3 to be wrong, and another one fits as well; " * 8
@@ -92,7 +86,7 @@ def test_long_name_of_a_robot_stays_whole(length):
     [
         b"", b"{", b"[]", b"7", b"null", b'{"node": 3}', b"[" * 100_000, b" " * 70_000,
         *(
-            json.dumps({"node": {"id": "a", "term": 1, "period_s": 1.0, "ending": False} | wrong}).encode()
+            json.dumps({"node": {"id": "a", "period_s": 1.0, "ending": False} | wrong}).encode()
             for wrong in (
                 {"id": ""}, {"id": 4}, {"id": "x" * 65}, {"period_s": 0}, {"period_s": -1.0}, {"period_s": 1e9},
                 {"period_s": float("nan")}, {"period_s": None}, {"period_s": True}, {"ending": 1}, {"id": "a\nb"},
