@@ -94,17 +94,11 @@ _LEFT_OUT = {
 
 @dataclass(frozen=True)
 class Submap:
-    """One submap.
-
-    Attributes:
-        file: its cloud.
-        xy: (2,) where it is, metres.
-        pose: (4, 4) site <- submap; None where only the place is known.
-    """
+    """One submap."""
 
     file: Path
-    xy: Floats
-    pose: Pose | None = None
+    xy: Floats  # (2,) metres
+    pose: Pose | None = None  # (4, 4) site <- submap; None where only the position is known
 
     def cloud(self, metres: float) -> Points:
         """Return its points (N, 3) upright, but at an unknown heading, metres from its middle.
@@ -136,21 +130,13 @@ class Submap:
 
 @dataclass(frozen=True)
 class Traverse:
-    """Submaps of one flight or walk.
+    """Submaps of one flight or walk."""
 
-    Attributes:
-        name: of its folder.
-        submaps: all of them.
-        queries: indices of those that are asked for.
-        searched: whether its submaps are a database.
-        right: of CS-Campus3D, by database and query: indices of the right submaps. Empty where distance decides.
-    """
-
-    name: str
+    name: str  # of its folder
     submaps: list[Submap]
-    queries: list[int]
-    searched: bool = True
-    right: dict[int, dict[int, list[int]]] = field(default_factory=dict)
+    queries: list[int]  # indices into the submaps
+    searched: bool = True  # its submaps are a database
+    right: dict[int, dict[int, list[int]]] = field(default_factory=dict)  # CS-Campus3D: database, query, right submaps
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import io
 import json
@@ -14,13 +13,12 @@ import tarfile
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
-from unittest.mock import patch
 
 import coview_kernels
 import coview_stream
@@ -113,24 +111,6 @@ class Clock:
             yield
         finally:
             self.seconds[name] += time.perf_counter() - begin
-
-    @contextmanager
-    def around(self, stages: Iterable[tuple[str, Any, str]]) -> Iterator[None]:
-        """Time functions until the block ends: label, module or class where it is looked up, attribute."""
-        with ExitStack() as stack:
-            for label, owner, name in stages:
-                timed: Any = self._timed(label, getattr(owner, name))
-                bound = isinstance(vars(owner)[name], classmethod)
-                stack.enter_context(patch.object(owner, name, staticmethod(timed) if bound else timed))
-            yield
-
-    def _timed(self, label: str, stage: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(stage)
-        def run(*arguments: Any, **options: Any) -> Any:
-            with self(label):
-                return stage(*arguments, **options)
-
-        return run
 
 
 class Code(NamedTuple):

@@ -28,7 +28,7 @@ from bench.integrity.run import Result, Task, everywhere, read
 from coview_stream.errors import InputError
 
 OUTCOMES = ("right", "false", "none")
-"""What counts as a run; what failed or had no way to drive does not."""
+"""Outcomes of a run that counts; a failed run, or one without a street, does not."""
 
 FIX = 1e-4
 """Stated error below which a first fix counts in the table of reliability; of larger ones see :data:`STATED`."""
@@ -38,31 +38,18 @@ _LONG = 58  # characters of a reason that are shown
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of some runs.
-
-    Attributes:
-        runs: how many count.
-        sites: on how many maps.
-        sites_false: on how many maps some first fix was false.
-        right: first fixes that are right.
-        false: first fixes that are not.
-        ambiguous: runs without a fix whose last state was AMBIGUOUS.
-        searching: those with any other last state.
-        reason: what was said most often at the end of those without a fix, numbers left out.
-        median_m: metres to the first fix if it is right.
-        most_m: 90 % of those are not longer.
-    """
+    """Counts of some runs."""
 
     runs: int
-    sites: int
-    sites_false: int
+    sites: int  # maps
+    sites_false: int  # maps with a false first fix
     right: int
     false: int
-    ambiguous: int
-    searching: int
-    reason: str
-    median_m: float
-    most_m: float
+    ambiguous: int  # runs without a fix whose last state is AMBIGUOUS
+    searching: int  # runs without a fix in any other state
+    reason: str  # the most frequent last reason of runs without a fix, without numbers
+    median_m: float  # metres to a right first fix
+    most_m: float  # its 90th percentile
 
     @classmethod
     def of(cls, results: Iterable[Result]) -> Tally:

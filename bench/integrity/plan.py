@@ -1,7 +1,7 @@
-"""What is run: sites, what is driven on the map of each, and which family of runs that belongs to.
+"""The plan: sites, the runs on each site's map, and the family of each run.
 
-A site is drawn and mapped once and serves several runs; no two of them share a drive as well. Sites of calibration
-kinds are for fitting and are never reported.
+A site is drawn and mapped once and serves several runs, each with its own drive. Calibration sites are for fitting and
+are never reported.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Class = Literal["ordinary", "outside", "near copies"]
 LIDARS = ("vlp16", "mid360", "os64")
 FIRST_SEED = {"calibration": 31_000, "reported": 215_000}
 STATED = (1e-1, 1e-2, 1e-3)
-"""Of a run is noted when its search first states an error below each of these, whether or not it gives the place."""
+"""Stated errors; a run records the first search below each, accepted or not."""
 
 _CHOICES = 230  # random stream
 
@@ -27,7 +27,7 @@ STREETS: dict[str, tuple[str, ...]] = {
     "calibration": ("town", "campus"),
     "reported": ("village", "industrial", "suburb", "harbour", "forest"),
 }
-"""Kinds of sites whose maps serve ordinary runs, runs outside and altered ones."""
+"""Kinds of sites for ordinary, outside and altered runs."""
 
 COPIES: dict[str, tuple[str, ...]] = {
     "calibration": ("terraces", "plantation"),
@@ -39,7 +39,7 @@ ALTERED: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibration": (("edge",),),
     "reported": (("mirrored", "shifted"), ("old", "scaled"), ("tilted", "edge")),
 }
-"""Families of near copies on the maps of streets, those of one site together."""
+"""Families of near copies on maps of streets, one tuple per site."""
 
 _ORDINARY: tuple[Class, str] = ("ordinary", "the site, 0-40 % changed")
 
@@ -62,50 +62,37 @@ FAMILIES: dict[str, tuple[Class, str]] = {
     "tilted": ("near copies", "the map tilted by 2-4 degrees: right where it fits"),
     "edge": ("near copies", "10-40 m from the map's border, inside or outside"),
 }  # fmt: skip
-"""Family of runs: class, and what it is."""
+"""Family of runs: class and description."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One first fix to wait for.
-
-    Attributes:
-        group: calibration or reported.
-        family: one of ``FAMILIES``.
-        kind: of the site that the map is of.
-        seed: of that site.
-        number: of the run among those on that map.
-        sensor: the robot's lidar.
-        changed: share of the trees, cars and poles that are others now; of made-up kinds see there.
-        rebuilt: share of the buildings that are.
-        driven: kind of the site that is driven through, if it is another site.
-        beyond: of a run at an edge: outside the border.
-    """
+    """A drive up to its first fix."""
 
     group: Group
-    family: str
-    kind: str
-    seed: int
-    number: int
+    family: str  # a key of FAMILIES
+    kind: str  # kind of the mapped site
+    seed: int  # seed of the mapped site
+    number: int  # of the run among the runs on this map
     sensor: str
-    changed: float = 0.0
-    rebuilt: float = 0.0
-    driven: str = ""
-    beyond: bool = False
+    changed: float = 0.0  # share of replaced trees, cars and poles; made-up kinds define their own
+    rebuilt: float = 0.0  # share of replaced buildings
+    driven: str = ""  # kind of the site of the drive, if it is another site
+    beyond: bool = False  # a run at an edge is outside the border
 
     @property
     def key(self) -> str:
-        """Name that no other run has."""
+        """Unique name."""
         return f"{self.group}/{self.kind}-{self.seed}/{self.number}-{self.family}"
 
     @property
     def of_class(self) -> Class:
-        """What it is counted under."""
+        """Class of its family."""
         return FAMILIES[self.family][0]
 
     @property
     def drive_seed(self) -> int:
-        """Seed of its drive, and of another site that it leads through."""
+        """Seed of the drive, and of its site if that is another one."""
         return 16 * self.seed + self.number
 
 
@@ -125,7 +112,7 @@ def plan(group: Group, runs: int) -> list[Site]:
 
 
 def sites(group: Group) -> Iterator[Site]:
-    """Yield sites without end, streets and near copies in turn: on two of them three runs of each class at least."""
+    """Yield sites without end, streets and near copies in turn; two sites have at least three runs of each class."""
     kinds, altered, copies = STREETS[group], ALTERED[group], COPIES[group]
     for k in count():
         seed = FIRST_SEED[group] + 2 * k

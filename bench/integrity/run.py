@@ -1,4 +1,4 @@
-"""A run: a localizer on a map, told frames and odometry and nothing else, until its first fix or the drive's end."""
+"""A run: a localizer gets frames and odometry until its first fix or the drive's end; runs in several processes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Result = dict[str, Any]
 
 SPEED = 4.0
 SPEEDS = {"storey": 1.5}
-"""Metres per second, set by hand: a frame every 0.4 m; those of kinds in which nothing goes that fast."""
+"""Metres per second: a frame every 0.4 m; slower inside a building."""
 
 HEIGHT = 1.5  # metres, of the sensor above the ground
 FIRST_STAMP = 1000.0  # seconds
@@ -49,24 +49,18 @@ _MIRROR_WORLD, _MIRROR_BODY = np.diag([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.
 
 
 class World(NamedTuple):
-    """How the robot's world follows from the scene that it is cast in, which the map is of.
+    """The robot's world, as a change of the mapped scene."""
 
-    Attributes:
-        poses: (N, 4, 4) scene <- body, to poses in the robot's world, where z is up and odometry measures.
-        cloud: (K, 3) body frame in the scene, to what the robot sees.
-        right: whether the pose in the scene is the right one on the map; else every pose is wrong.
-    """
-
-    poses: Callable[[Floats], Floats] = lambda poses: poses
-    cloud: Callable[[Points], Points] = lambda points: points
-    right: bool = True
+    poses: Callable[[Floats], Floats] = lambda poses: poses  # (N, 4, 4) scene <- body, to poses with z up for odometry
+    cloud: Callable[[Points], Points] = lambda points: points  # (K, 3) body frame, scene to world
+    right: bool = True  # the scene's pose is right on the map; False: every pose is wrong
 
 
 AS_MAPPED = World()
 
 
 def mirrored() -> World:
-    """Return the world in which left is right: no pose on the map is right."""
+    """Return the mirrored world: no pose on the map is right."""
 
     def poses(scene: Floats) -> Floats:
         out = scene.copy()
@@ -78,7 +72,7 @@ def mirrored() -> World:
 
 
 def scaled(factor: float) -> World:
-    """Return the world of which the map is ``factor`` times too large; right is the pose under the same scaling."""
+    """Return a world whose map is ``factor`` times too large; the scaled pose is right."""
 
     def poses(scene: Floats) -> Floats:
         out = scene.copy()
@@ -89,7 +83,7 @@ def scaled(factor: float) -> World:
 
 
 def tilted(angle: float, heading: float) -> World:
-    """Return the world of which the map is tilted by ``angle`` radians about a level axis; right is what fits."""
+    """Return a world whose map is tilted by ``angle`` radians about a level axis; the tilted pose is right."""
     axis = np.array([np.cos(heading), np.sin(heading), 0.0])
     K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     T = np.eye(4)
@@ -99,19 +93,12 @@ def tilted(angle: float, heading: float) -> World:
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive.
+    """Poses, odometry, truth and clouds of a drive."""
 
-    Attributes:
-        poses: (N, 4, 4) true poses of the body in the scene that it is cast in.
-        odometry: (N, 4, 4) odom <- body.
-        truth: (N, 4, 4) map <- body, the only right poses; None where every fix is a false one.
-        frame: number of a frame -> its cloud (K, 3), body frame, metres; in ascending order.
-    """
-
-    poses: Floats
-    odometry: Floats
-    truth: Floats | None
-    frame: Callable[[int], Points]
+    poses: Floats  # (N, 4, 4) scene <- body
+    odometry: Floats  # (N, 4, 4) odom <- body
+    truth: Floats | None  # (N, 4, 4) map <- body; None where every fix is false
+    frame: Callable[[int], Points]  # number -> cloud (K, 3), body frame, metres; call in ascending order
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -199,17 +186,11 @@ def _altered(run: Run, scene: Scene) -> tuple[Scene, World]:
 
 @dataclass(frozen=True)
 class Robot:
-    """A localizer, and the search that answers its requests: so that what each keyframe's search states is seen.
-
-    Attributes:
-        localizer: the localizer.
-        search: on the same map.
-        origin: (3,) of the map, metres.
-    """
+    """A localizer, and the search that answers its requests and shows each keyframe's leader."""
 
     localizer: Localizer
     search: GlobalSearch
-    origin: Floats
+    origin: Floats  # (3,) of the map, metres
 
     @classmethod
     def on(cls, base: BaseMap, risk: float | None) -> Robot:
@@ -223,7 +204,7 @@ class Robot:
         return cls(localizer, GlobalSearch(base, config, maps, index), base.origin)
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Fix, Leader | None]:
-        """Do as :meth:`Localizer.step` does; return what a search has stated as well, if there was one."""
+        """Do as :meth:`Localizer.step` does; return the search's leader as well, if there was a search."""
         request = self.localizer.add_frame(cloud, T_odom_body, stamp)
         leader = None
         if request is not None:
@@ -243,10 +224,10 @@ class Leader(NamedTuple):
 
 
 def first_fix(robot: Robot, drive: Drive) -> Result:
-    """Follow a drive to its first fix: the outcome, what was said last, and what was stated on the way.
+    """Follow a drive to its first fix; return outcome, last reason and stated errors.
 
-    ``stated`` has, for each of :data:`STATED` that some keyframe went below, the first one's error, the metres driven,
-    and whether its most probable place was right.
+    ``stated`` has for each limit of :data:`STATED` the first keyframe below it: its error, the metres driven, and
+    whether its most probable place was right.
     """
     robot.localizer.reset()
     said, way, stated = "", drive.driven, dict[str, Result]()
@@ -315,19 +296,12 @@ SITE_CODE = ("coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds
 
 @dataclass(frozen=True)
 class Task:
-    """How runs are made and where they are noted.
-
-    Attributes:
-        results: file of the results.
-        code: fingerprint that they are noted with.
-        risk: integrity risk; None for the product's own.
-        maps: folder in which maps are kept; None: they are deleted after use.
-    """
+    """Settings of the runs and the file of their results."""
 
     results: Path
-    code: str
-    risk: float | None = None
-    maps: Path | None = None
+    code: str  # fingerprint in every result
+    risk: float | None = None  # integrity risk; None: the product's own
+    maps: Path | None = None  # folder that keeps the maps; None: they are deleted
 
     def key(self, run: Run) -> str:
         """Name of a run's result."""
@@ -347,7 +321,7 @@ def everywhere(sites: Sequence[Site], task: Task, jobs: int) -> Iterator[Result]
 
 
 def on_site(site: Site, task: Task) -> list[Result]:
-    """Make all runs on one map; what cannot be made is noted as ``failed``, and tried again another time."""
+    """Make all runs on one map; a run that raises is recorded as ``failed`` and made again next time."""
     begin, out = time.process_time(), list[Result]()
     robot, reason = None, ""
     try:

@@ -42,10 +42,10 @@ _HEAVIEST, _LIGHTEST = 2.5, 200.0  # degrees of freedom of a tail: a finite vari
 
 
 class Sample(NamedTuple):
-    """Poses of which one counts per ten metres: (N, 2) each, of the position and of the rotation.
+    """One pose per ten metres: (N, 2) arrays for position and rotation.
 
-    Metres and degrees; trace and axes of the covariance are in m2 and rad2. ``doubt`` is the level that was told,
-    relative to the one that the covariance alone has: so other tails can be tried on the same drives.
+    Errors are in metres and degrees, trace and axes of the covariance in m2 and rad2. ``doubt`` is the reported level
+    over the level of the covariance alone, for trying other tails on the same drives.
     """
 
     error: Floats
