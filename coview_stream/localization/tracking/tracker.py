@@ -137,7 +137,7 @@ class Tracker:
         )
         drifted += self._calibration.motion_covariance(step)
         covariance = propagate(registered + _START, step) + drifted
-        self._restart(registration.T_map_source @ T_odom_body, covariance, T_odom_body)
+        self._restart(self._of_cloud(registration.T_map_source @ T_odom_body), covariance, T_odom_body)
 
     def match_to_map(
         self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False
@@ -182,16 +182,16 @@ class Tracker:
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
         """Correct the belief by a registration at the newest frame, if it is believed."""
-        verdict = match.verdict
+        verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as usual: go on at the lidar's pose
-            self.odometry.learn_once_confirmed(self._of_cloud(match.T_map_body), match.covariance)
-            self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
+            self.odometry.learn_once_confirmed(T_map_cloud, match.covariance)
+            self._restart(T_map_cloud, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
             self._matcher.dispute.clear()
-            self._graph.correct(self._of_cloud(match.T_map_body), match.covariance)
+            self._graph.correct(T_map_cloud, match.covariance)
             self._set_belief(T_odom_body)
             self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
@@ -221,10 +221,10 @@ class Tracker:
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
-    def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
+    def _restart(self, T_map_cloud: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph without the old one's information."""
         self._matcher.dispute.clear()
-        self._graph.start(self._of_cloud(T_map_body), covariance)
+        self._graph.start(T_map_cloud, covariance)
         self.odometry.set_keyframe(T_odom_body)
         self._set_belief(T_odom_body)
 

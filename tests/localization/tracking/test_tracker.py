@@ -10,14 +10,28 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 from small_world import pose_error, scan
-from trackers import OFF, Ride, add_frame, garbage, match_and_update, on_the_way, refused, registration, ride_of
+from trackers import (
+    OFF,
+    T_MAP_ODOM,
+    Ride,
+    add_frame,
+    garbage,
+    match_and_update,
+    on_the_way,
+    refused,
+    registration,
+    ride_of,
+)
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, RegistrationConfig, TrackingConfig
 from coview_stream.geometry.protection import protection_level
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.tracker import Tracker
 
 RULE = AcceptanceConfig()
 
@@ -229,6 +243,28 @@ def test_restart_carries_nothing_over(world_map, slow_drive, world_drive):
     verdict = ride.update(world_drive.clouds[8], world_drive.T_map_body[8])
     assert verdict.verified
     assert ride.error(world_drive.T_map_body[8])[0] < 0.03
+
+
+def test_place_that_moves_while_the_calibration_changes_is_the_registered_clouds(world_map, world_drive):
+    """A second slip confirms the first, from which the calibration learns: the second cloud stays where it lies."""
+    config, calibration = LocalizerConfig(), CalibrationEstimator()
+    local_maps = LocalMaps(world_map, config.registration.source_range)
+    ride = Ride(Tracker(world_map, config, local_maps, calibration), inverse(T_MAP_ODOM))
+    lean = pose_from(exp_so3(np.radians([2.0, 0.0, 0.0])), np.zeros(3))
+    for k in (4, 5):
+        cloud, T_odom_body = world_drive.clouds[k], ride.odometry(world_drive.T_map_body[k])
+        ride.see(cloud, world_drive.T_map_body[k])
+        if k == 4:
+            ride.tracker.start(registration(T_MAP_ODOM), T_odom_body, 0.0)
+        match = ride.tracker.match_to_map(cloud, T_odom_body)
+        before = calibration.calibration
+        T_map_body = match.T_map_body @ lean
+        ride.tracker.update(replace(match, T_map_body=T_map_body, moves_place=True), T_odom_body, believed=True)
+    after = calibration.calibration
+    assert abs(after.roll - before.roll) > np.radians(1.0)
+    np.testing.assert_allclose(
+        ride.tracker.T_map_odom @ T_odom_body @ after.T_body_cloud, T_map_body @ before.T_body_cloud, atol=1e-6
+    )
 
 
 SIDEWAYS = pose_from(np.eye(3), [0.0, 0.6, 0.0])
