@@ -69,7 +69,7 @@ BENCHMARKS = {
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
-    "forest": Benchmark("forest.forest", "learned re-localization beside descriptors and canopy heights"),
+    "forest": Benchmark("forest.forest", "learned re-localization beside descriptors"),
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),
     "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
     "recognition": Benchmark("forest.recognition", "place recognition on public sets: AR@1, AR@5, AR@1 %, MRR"),

@@ -118,7 +118,7 @@ def test_bad_paths_and_options_are_one_line(world_file, world_run, tmp_path, cap
         ([str(world_file), str(world_run), "-o", str(tmp_path / "file")], "is a file"),
         ([str(world_file), str(world_run), *out, "--odometry", str(tmp_path / "no.tum")], "no.tum"),
         ([str(world_file), str(world_run), *out, "--odometry", str(wheel)], "wheel.tum"),
-        ([str(world_file), str(world_run), *out, "--retrieval", "magic"], "--retrieval"),
+        ([str(world_file), str(world_run), *out, "--reloc", "magic"], "--reloc"),
         ([str(world_file), *out], "RUN"),
     ):
         assert main(["locate", *arguments]) == 2, text

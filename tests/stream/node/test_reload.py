@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from fake_node import STEP, Engine, Runner, Site
-from fake_robot import unknown
+from fake_robot import KEYS, T_MAP_ODOM, Robot, pose, tracking, unknown
 from sockets import until
 
 from coview_stream.errors import MapError
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.stream.node.engine_process import CancelledError, DiedError
 from coview_stream.stream.node.node import OpenedMap
 from coview_stream.stream.node.session import Session
@@ -183,3 +186,47 @@ def test_change_that_fails_before_the_hand_over_leaves_no_engines(changes):
     until(lambda: change.reloader.last["result"] == "failed", 10.0)
     assert all(runner.closed == 1 for runner in change.runners)
     assert len(change.site.node.feeds) == 1
+
+
+def on_other_map(old=None):
+    """A robot's session on another map, which begins with the place on the first one."""
+    robot = Robot()
+    robot.session = Session(KEYS, OTHER)
+    if old is not None:
+        robot.session.begin_beside(old.session)
+    return robot
+
+
+def test_calibration_goes_to_the_new_map_without_the_ground_of_the_old_survey():
+    calibration = Calibration(roll=0.02, scale=0.01, ground=0.4)
+
+    def calibrated(job):
+        result = tracking(job)
+        return replace(result, fix=replace(result.fix, calibration=calibration))
+
+    old = Robot().localized(0.0, answer=calibrated)
+    job = on_other_map(old).frame(0.1)
+    assert job.hint is not None
+    assert job.calibration == replace(calibration, ground=0.0)
+
+
+def test_guess_goes_to_the_new_map_without_its_circle():
+    old = Robot()
+    assert old.session.guess_place(PlaceGuess(1.0, 2.0, within=300.0))
+    assert on_other_map(old).frame(0.1).guess == PlaceGuess(1.0, 2.0)
+
+
+def test_no_pose_after_the_switch_is_older_than_the_last_or_a_second_one_of_its_stamp():
+    old, new = Robot().localized(0.0), on_other_map().localized(0.0, T_map_odom=pose(7.0) @ T_MAP_ODOM)
+    old.moved(0.1)
+    last = old.session.pose()
+    new.session.continue_from(old.session)
+    assert new.session.pose() is None
+    new.moved(0.1)
+    again = new.session.pose()
+    assert again.stamp_ns == last.stamp_ns
+    np.testing.assert_array_equal(again.T_map_body, last.T_map_body)
+    new.moved(0.2)
+    following = new.session.pose()
+    assert following.map_sha256 == OTHER
+    np.testing.assert_allclose(following.T_map_body, pose(7.0) @ T_MAP_ODOM @ pose(0.4), atol=1e-9)
