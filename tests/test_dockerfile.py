@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 
 from coview_stream.cli import build_parser
 from coview_stream.config.node import METRICS_ADDRESS
+from coview_stream.stream.node.health import metrics_server
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "examples" / "docker" / "Dockerfile"
@@ -43,6 +47,19 @@ def test_the_command_in_its_comment_parses_and_is_what_the_health_check_asks():
     args = build_parser("serve").parse_args(command[1].split())
     assert args.metrics in TEXT.partition("HEALTHCHECK")[2]
     assert args.metrics == METRICS_ADDRESS
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_the_health_check_asks_whether_the_node_lives_not_whether_it_is_ready(live):
+    server = metrics_server("127.0.0.1:0", lambda: {"live": {"ok": live}, "ready": {"ok": False}})
+    server.start()
+    try:
+        program = json.loads(re.search(r"^    CMD (\[.*\])$", TEXT, re.MULTILINE)[1])[2]
+        program = program.replace("127.0.0.1:9464", server.url.removeprefix("http://").rstrip("/"))
+        done = subprocess.run([sys.executable, "-c", program], timeout=20, check=False)
+        assert done.returncode == int(not live)
+    finally:
+        server.close()
 
 
 @pytest.mark.parametrize("word", ["HEALTHCHECK", "ENTRYPOINT", "AS build"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -354,4 +354,16 @@ def _load_again(kind: type[BaseMap], path: str, sha256: str, identity: FileIdent
         base_map = kind.load(path)
         if base_map.sha256 != sha256:
             raise MapError(f"{path}: is another map than the one that was pickled; pickle it again")
+    return base_map
+
+
+def load_served(files: Mapping[str, Path], sha256: str) -> BaseMap:
+    """Return the map of a hash from its file, which the node has compared with its hash when it opened the map.
+
+    Raises:
+        MapError: the file cannot be read, or is of another map than the one that is served.
+    """
+    base_map = BaseMap.load(files[sha256], check=False)
+    if base_map.sha256 != sha256:
+        raise MapError(f"{files[sha256]}: the file is of another map than the one that is served")
     return base_map

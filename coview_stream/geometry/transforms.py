@@ -238,12 +238,6 @@ def to_local(T_odom_body: Pose, anchor: Floats) -> Pose:
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 
-def to_map_origin(T_map_local: Pose, anchor: Floats, origin: Floats) -> Pose:
-    """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
-    shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
-    return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)
-
-
 def along_body(covariance: Floats, T_map_body: Pose) -> Floats:
     """Turn a covariance (6, 6) along the map's axes into one in the body's tangent."""
     return rotate_covariance(covariance, T_map_body[:3, :3].T)

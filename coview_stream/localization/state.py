@@ -41,8 +41,6 @@ class Event(StrEnum):
     VERIFICATION_REQUIRED = "the robot may have been moved unseen"
     PLACE_GIVEN_UP = "too much has spoken against the place, or for too long"
     SCANS_CONTRADICT = "scans do not fit together where odometry puts them"
-    SILENCE = "odometry or usable frames stay away"
-    ODOMETRY_RESTARTED = "odometry paused, jumped or began anew: older scans no longer belong to it"
 
 
 _S, _E = State, Event
@@ -53,23 +51,17 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (_S.AMBIGUOUS, _E.NO_PLACE): _S.SEARCHING,
     (_S.AMBIGUOUS, _E.PLACE_ACCEPTED): _S.TRACKING,
     (_S.AMBIGUOUS, _E.SCANS_CONTRADICT): _S.SEARCHING,
-    (_S.AMBIGUOUS, _E.ODOMETRY_RESTARTED): _S.SEARCHING,
     (_S.TRACKING, _E.MATCH_REJECTED): _S.DOUBTED,
     (_S.TRACKING, _E.VERIFICATION_REQUIRED): _S.DOUBTED,
     (_S.TRACKING, _E.PLACE_GIVEN_UP): _S.LOST,
-    (_S.TRACKING, _E.SILENCE): _S.LOST,
-    (_S.TRACKING, _E.ODOMETRY_RESTARTED): _S.LOST,
     (_S.DOUBTED, _E.MATCH_VERIFIED): _S.TRACKING,
     (_S.DOUBTED, _E.PLACE_GIVEN_UP): _S.LOST,
-    (_S.DOUBTED, _E.SILENCE): _S.LOST,
-    (_S.DOUBTED, _E.ODOMETRY_RESTARTED): _S.LOST,
     (_S.LOST, _E.PLACE_ACCEPTED): _S.TRACKING,
-    (_S.LOST, _E.MATCH_VERIFIED): _S.TRACKING,  # after silence
 }
-"""The state that follows on an event; where a pair is missing, the event changes nothing.
+"""State of the engine that follows on an event; where a pair is missing, the event changes nothing.
 
-LOST stays LOST while the map is searched again, and only an accepted place ends it; after SILENCE, which only a node
-knows of, the place is still there, and a registration that verifies it ends LOST too.
+LOST stays LOST while the map is searched again: only an accepted place ends it. A node loses a place for more reasons,
+by :func:`coview_stream.stream.node.robot_state.session_state`.
 """
 
 

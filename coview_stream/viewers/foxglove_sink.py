@@ -64,7 +64,7 @@ class FoxgloveSink(Sink):
         sink = self
 
         class Greeter(self._sdk.ServerListener):  # type: ignore[misc, name-defined]
-            """Hands the map to who comes late: nothing is kept by the server."""
+            """Sends the map to a client that connects later: the server keeps no messages."""
 
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 if channel.topic == "/map" and sink._map is not None:

@@ -45,17 +45,9 @@ def asked_of_node(transport: Transport, base: str) -> MapSource:
 
 def read_from_files(files: Mapping[str, Path], sha256: Callable[[], str]) -> MapSource:
     """Return a map source that reads a node's files, by the hash of the map that the node serves: ``sha256()``."""
-    from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.errors import MapError
+    from coview_stream.basemap.basemap import load_served
 
-    def load(robot: str) -> MapView:
-        served = sha256()
-        base_map = BaseMap.load(files[served], check=False)  # the node has compared it when it opened the map
-        if base_map.sha256 != served:
-            raise MapError(f"{files[served]}: the file is of another map than the one that is served")
-        return MapView.of(base_map)
-
-    return load
+    return lambda robot: MapView.of(load_served(files, sha256()))
 
 
 TopicKind = Literal["pose", "status", "hypotheses", "cloud"]

@@ -222,7 +222,7 @@ class WebSink(Sink):
         )
 
     def scan(self, scan: Scan) -> None:
-        """Tell a scan, in the map frame where the pose is known; nobody watches: not."""
+        """Send a scan, in the map frame where the pose is known; nothing while no page is open."""
         if not self._hub.pages:
             return
         points = scan.points[:: max(1, -(-len(scan.points) // _SCAN_POINTS))]

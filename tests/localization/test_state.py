@@ -44,15 +44,15 @@ def test_every_event_changes_some_state():
     assert {event for _, event in TRANSITIONS} == set(Event)
 
 
-def test_tracking_begins_by_an_accepted_place_or_a_verified_one():
+def test_tracking_begins_by_an_accepted_place_or_a_doubted_one_that_is_verified():
     begins = {pair for pair, after in TRANSITIONS.items() if after is State.TRACKING}
     searching = {(state, Event.PLACE_ACCEPTED) for state in State if not state.has_place}
-    assert begins == searching | {(state, Event.MATCH_VERIFIED) for state in (State.DOUBTED, State.LOST)}
+    assert begins == searching | {(State.DOUBTED, Event.MATCH_VERIFIED)}
 
 
-def test_only_an_accepted_or_verified_place_ends_lost():
+def test_only_an_accepted_place_ends_lost():
     ends = [event for event in Event if next_state(State.LOST, event) is not State.LOST]
-    assert ends == [Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED]
+    assert ends == [Event.PLACE_ACCEPTED]
 
 
 def test_only_a_known_place_is_doubted_or_lost():

@@ -95,10 +95,10 @@ def scatter(observed: Floats32) -> Floats:
 
 
 def left_in_mean(observed: Floats32) -> Floats:
-    """Return the shares (4,) of the variances of :func:`scatter` that remain in the mean over keyframes.
+    """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
 
-    Keyframes see much of the same surroundings, and a place that fits by chance goes on to fit. The share is measured
-    at wrong places, from the variance of all of them and of their tail; the larger counts. 1: all see the same.
+    They are measured at wrong places. Keyframes see much of the same surroundings, and a place that fits by chance goes
+    on to fit: at 1 all keyframes see the same.
 
     Args:
         observed: (N, W, 7) observations of W keyframes at the same chance places.

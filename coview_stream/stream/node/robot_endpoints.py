@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.basemap import BaseMap, load_served
 from coview_stream.basemap.map_parts import MapParts
 from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
 from coview_stream.clouds.reference_system import GeoReference
-from coview_stream.errors import CoViewError, InputError, MapError
+from coview_stream.errors import CoViewError, InputError
 from coview_stream.geometry.transforms import yaw_of
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages import encode_location, encode_pose
@@ -272,13 +272,9 @@ class MapViewAnswer:
         """Return the view; it is made once for each map.
 
         Raises:
-            MapError: the file cannot be read, or is of another map than the one that is served.
+            MapError: as of :func:`~coview_stream.basemap.basemap.load_served`.
         """
         served = self._sha256()
         if self._made is None or self._made[0] != served:
-            path = self._files[served]
-            base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
-            if base_map.sha256 != served:
-                raise MapError(f"{path}: the file is of another map than the one that is served")
-            self._made = served, MapView.of(base_map, POINTS_ON_WIRE).to_json()
+            self._made = served, MapView.of(load_served(self._files, served), POINTS_ON_WIRE).to_json()
         return self._made[1]

@@ -26,7 +26,10 @@ _MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them al
 
 
 def session_state(engine: State | None, lost: bool, unverified: bool) -> State:
-    """Return the state of a robot.
+    """Return the state of a robot: the engine's, but for a lost place and a pause of odometry.
+
+    A place is lost while odometry or usable frames stay away, and with every new odometry epoch. Only a fix in TRACKING
+    ends that: after silence the place is still there and a verified frame suffices, in a new epoch it is searched for.
 
     Args:
         engine: state of the tracking engine in this odometry epoch; None before its first frame.

@@ -97,8 +97,8 @@ def test_robots_keep_the_old_map_until_the_new_one_has_verified_their_place(chan
     stamps = [p.stamp_ns for p in poses]
     assert stamps == sorted(stamps)
     of = {}
-    for pose in poses:
-        of.setdefault(pose.stamp_ns, []).append(pose.map_sha256)
+    for message in poses:
+        of.setdefault(message.stamp_ns, []).append(message.map_sha256)
     assert all(len(set(shas)) == 1 for shas in of.values())
     assert [p.map_sha256 for p in poses] == sorted((p.map_sha256 for p in poses), reverse=old > OTHER)
 
