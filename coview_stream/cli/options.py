@@ -249,7 +249,7 @@ def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float |
     """Return the guesses of ``NAME=X,Y[,YAW]`` by robot.
 
     Raises:
-        ConfigError: a text is none, or names another robot.
+        ConfigError: a text is not a guess, or names an unknown robot.
     """
     from coview_stream.errors import ConfigError
 

@@ -1,7 +1,8 @@
 """HTTP server of a node's page, metrics and health: GET only, with limits on time, size and connections.
 
-Nothing in a request is acted upon. A server that is not ``open`` refuses requests whose Host is neither its own name nor an address,
-because a page of another site may have its name point here (DNS rebinding), and no other origin may read its replies.
+Nothing in a request is acted upon. A server that is not ``open_to_names`` refuses requests whose Host is neither its
+own name nor an address, because a page of another site may have its name point here (DNS rebinding), and no other
+origin may read its replies.
 """
 
 from __future__ import annotations
