@@ -129,7 +129,7 @@ class ZenohTransport:
         """
         import zenoh
 
-        self._require_key(key)
+        _require_key(key)
         inbox = self._inboxes.open(key, self._receiver(handler), 1 if policy == "newest" else _QUEUE)
         declared: list[Any] = []
         ended = threading.Event()
@@ -362,15 +362,8 @@ class ZenohTransport:
                 return
         session.close()
 
-    @staticmethod
-    def _require_key(key: str) -> None:
-        import zenoh
-
-        with zenoh_errors(f"key {key!r}"):
-            zenoh.KeyExpr(key)
-
     def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
-        self._require_key(key)
+        _require_key(key)
         with self._lock:
             if self._closing.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")
@@ -408,3 +401,10 @@ class ZenohTransport:
                 handler(plain(sample, self._max_payload))
 
         return handle
+
+
+def _require_key(key: str) -> None:
+    import zenoh
+
+    with zenoh_errors(f"key {key!r}"):
+        zenoh.KeyExpr(key)
