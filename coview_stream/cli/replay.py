@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Wait for a subscriber, send the run, print what was done; exit code 1 if there never was a subscriber."""
     from tqdm import tqdm
 
-    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.process import stop_on_signals
     from coview_stream.errors import ConfigError
     from coview_stream.recordings.lidar_runs import open_bare_run
     from coview_stream.recordings.open_run import open_run

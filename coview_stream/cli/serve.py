@@ -41,7 +41,7 @@ from coview_stream.config.node import METRICS_ADDRESS, NodeConfig
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
-    from coview_stream.cli.signals import Stop
+    from coview_stream.cli.process import Stop
     from coview_stream.stream.node.engine_process import EngineChild
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.serve import ServeOptions
@@ -260,8 +260,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
 def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:
     import logging
 
-    from coview_stream.cli.logs import start_logging
-    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.process import start_logging, stop_on_signals
     from coview_stream.cli.view import open_sinks
 
     start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
@@ -292,8 +291,8 @@ def _serve(
     """
     from coview_stream.cli.view import feed_of_node
     from coview_stream.stream.node.engine_process import CancelledError
+    from coview_stream.stream.node.health import Notifier
     from coview_stream.stream.node.serve import open_node
-    from coview_stream.stream.node.systemd import Notifier
 
     notifier = Notifier()
     opened: list[Node] = []

@@ -26,8 +26,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve until a signal comes; exit code 0 then."""
     import logging
 
-    from coview_stream.cli.logs import start_logging
-    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.process import start_logging, stop_on_signals
     from coview_stream.stream.maps.map_server import MapServer
     from coview_stream.stream.maps.zenoh_source import MapKeys
 

@@ -17,7 +17,7 @@ from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
 
 if TYPE_CHECKING:
-    from coview_stream.cli.signals import Stop
+    from coview_stream.cli.process import Stop
     from coview_stream.messages.types import Sample
     from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.client.latest_queue import LatestQueue
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
-    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.process import stop_on_signals
     from coview_stream.cli.view import feed_of_watch, map_of_watch, open_sinks
     from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.transport.zenoh_transport import open_client

@@ -64,3 +64,13 @@ def fraction(config: object, *names: str) -> None:
     """Refuse fields outside (0, 1]."""
     for name in names:
         require(0 < getattr(config, name) <= 1, config, name, "in (0, 1]")
+
+
+def within(config: object, **ranges: tuple[float, float]) -> None:
+    """Refuse fields outside their ranges, both ends included; NaN is outside.
+
+    Raises:
+        ConfigError: naming the field, its value and the range.
+    """
+    for name, (low, high) in ranges.items():
+        require(low <= getattr(config, name) <= high, config, name, f"within {low:g} and {high:g}")

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from coview_stream.clouds.filters import voxel_grid
+from coview_stream.config.checks import within
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Reals
-from coview_stream.sim.ranges import within
 from coview_stream.sim.sensors import MeshCaster
 
 ALTITUDE = 250.0

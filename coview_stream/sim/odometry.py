@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coview_stream.config.checks import within
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import rot_z
 from coview_stream.sim.layout import arc_lengths, directions
-from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 

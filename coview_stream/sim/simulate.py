@@ -24,6 +24,7 @@ import numpy as np
 
 from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
+from coview_stream.config.checks import within
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
@@ -34,7 +35,6 @@ from coview_stream.sim.dirt.scene import aged, drawn_parts
 from coview_stream.sim.dirt.survey import Thinning, spoilt_strips
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry, drive
-from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, MeshCaster
 

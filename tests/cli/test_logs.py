@@ -6,7 +6,7 @@ import json
 import logging
 import sys
 
-from coview_stream.cli.logs import JsonFormatter
+from coview_stream.cli.process import JsonFormatter
 
 
 def record(message, *args, error=None):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.cli.signals import Stop, stop_on_signals
+from coview_stream.cli.process import Stop, stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -75,7 +75,7 @@ def test_stop_clock_is_monotonic():
 
 WAITS = """
 import threading, time
-from coview_stream.cli.signals import stop_on_signals
+from coview_stream.cli.process import stop_on_signals
 threading.Thread(target=time.sleep, args=(90,), daemon=True).start()
 with stop_on_signals() as stop:
     print("waits", flush=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
+from coview_stream.config.checks import within
 from coview_stream.errors import ConfigError
 from coview_stream.sim.dirt.optics import Beams, Dust, Glass, Rain, Reflectors
 from coview_stream.sim.dirt.robot import Gravity, Miscalibration, Motion, Mounting, Slip
 from coview_stream.sim.dirt.scene import Grass, Seasons, Snow, Traffic, Years
 from coview_stream.sim.dirt.survey import Density, Strips
-from coview_stream.sim.ranges import within
 
 REAL = "real"
 """Name of the preset with all kinds on."""

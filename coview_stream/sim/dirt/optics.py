@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coview_stream.config.checks import within
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
-from coview_stream.sim.ranges import within
 
 
 @dataclass(frozen=True)

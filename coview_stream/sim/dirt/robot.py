@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coview_stream.config.checks import within
 from coview_stream.geometry.arrays import Floats, Indices
 from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, interpolate, inverse, pose_from, rot_z
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.sim.ranges import within
 from coview_stream.sim.sensors import FRAME_PERIOD
 
 

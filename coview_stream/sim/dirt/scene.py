@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coview_stream.config.checks import within
 from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.sim.furniture import vehicle
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.layout import Site, arc_lengths, directions
 from coview_stream.sim.mesh import EMPTY, Mesh, cylinder, ellipsoid, join, placed
-from coview_stream.sim.ranges import within
 from coview_stream.sim.scenes import Footprint, Parts, Scene
 
 _VERGE = 1.0  # metres beside the carriageway without grass

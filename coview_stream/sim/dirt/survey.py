@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_stream.config.checks import require
+from coview_stream.config.checks import require, within
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.sim.ranges import within
 
 _PATCH = 70.0  # metres: wavelength of the density
 _WAVES = 6  # summed

@@ -29,8 +29,8 @@ from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjo
 if TYPE_CHECKING:
     from coview_stream.basemap.site.fetch import Mirror
     from coview_stream.localization.search.hints import PlaceGuess
+    from coview_stream.stream.node.health import Notifier
     from coview_stream.stream.node.node import Node, OpenedMap, Service
-    from coview_stream.stream.node.systemd import Notifier
     from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
@@ -136,7 +136,7 @@ def open_node(
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.fleet import LEASE_MS
-        from coview_stream.stream.node.systemd import Notifier
+        from coview_stream.stream.node.health import Notifier
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
         notifier = notifier or Notifier()

@@ -404,6 +404,7 @@ class ZenohTransport:
 
 
 def _require_key(key: str) -> None:
+    """Raise TransportError unless ``key`` is a key expression."""
     import zenoh
 
     with zenoh_errors(f"key {key!r}"):

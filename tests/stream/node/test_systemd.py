@@ -10,7 +10,7 @@ import threading
 import pytest
 from sockets import until
 
-from coview_stream.stream.node.systemd import Notifier
+from coview_stream.stream.node.health import Notifier
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "AF_UNIX"), reason="no such sockets")
 

@@ -1,14 +1,17 @@
-"""A request to end, made by SIGINT and SIGTERM."""
+"""Process of a command that runs for long: its log, and the signals that ask it to end."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
 import os
 import select
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 
 _ASKED = b"."
 _ENDING = frozenset((signal.SIGINT, signal.SIGTERM, ord(_ASKED)))  # bytes of the pipe: a signal's number, or ours
@@ -94,3 +97,26 @@ def stop_on_signals(on_hangup: Callable[[], None] | None = None) -> Iterator[Sto
                 hangup = signal.signal(signal.SIGHUP, lambda _number, _frame: on_hangup())
                 stack.callback(signal.signal, signal.SIGHUP, hangup)
         yield stop
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a record: ``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message``, perhaps ``exception``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as one line."""
+        document = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            document["exception"] = self.formatException(record.exc_info)
+        return json.dumps(document)
+
+
+def start_logging(level: int, as_json: bool) -> None:
+    """Log to stderr from ``level`` on."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonFormatter() if as_json else logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
