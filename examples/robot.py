@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream import RobotClient
-from coview_stream.localization.evidence.words import one_in
+from coview_stream.geometry.protection import one_in
 from coview_stream.recordings import Frame, open_run
 
 

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from coview_stream import BaseMap, Fix
-from coview_stream.localization.evidence.words import one_in
+from coview_stream.geometry.protection import one_in
 from coview_stream.localization.offline import locate
 from coview_stream.recordings import open_run
 

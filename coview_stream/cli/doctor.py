@@ -117,7 +117,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
 def _recorded(args: argparse.Namespace, base_map: BaseMap | None) -> Iterator[Finding]:
     """Judge a recorded run; what cannot be opened is a finding."""
     from coview_stream.doctor.finding import from_error
-    from coview_stream.doctor.run_checks import run_findings
+    from coview_stream.doctor.map_checks import run_findings
     from coview_stream.errors import CoViewError
     from coview_stream.recordings.open_run import open_run
 

@@ -19,10 +19,9 @@ from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError
-from coview_stream.geometry.protection import ProtectionLevel
+from coview_stream.geometry.protection import ProtectionLevel, one_in
 from coview_stream.geometry.transforms import pose_from, pose_from_tum
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.hints import PlaceGuess

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import ProtectionLevel
+from coview_stream.geometry.protection import ProtectionLevel, one_in
 from coview_stream.geometry.transforms import (
     Pose,
     pose_fields,
@@ -19,7 +19,6 @@ from coview_stream.geometry.transforms import (
 )
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.observation import Evidence
-from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift

@@ -12,8 +12,8 @@ from coview_stream.cli import build_parser, main
 from coview_stream.cli.options import acceptance_config
 from coview_stream.config import AcceptanceConfig
 from coview_stream.config.localizer import LEAST_RISK
+from coview_stream.geometry.protection import LEAST
 from coview_stream.localization import offline
-from coview_stream.localization.evidence.words import LEAST
 
 SERVE = ["serve", "site.coview", "--robot", "r1"]
 LOCATE = ["locate", "site.coview", "run", "-o", "out"]

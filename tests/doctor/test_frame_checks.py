@@ -12,7 +12,7 @@ from nightly import nightly
 
 from coview_stream.config.mount import parse_mount
 from coview_stream.doctor.frame_checks import RIVALS, SeenFrame, frame_findings
-from coview_stream.doctor.run_checks import seen_frames
+from coview_stream.doctor.map_checks import seen_frames
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
 from coview_stream.recordings.open_run import open_run
 

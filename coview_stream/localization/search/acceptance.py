@@ -8,8 +8,8 @@ import numpy as np
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import one_in
 from coview_stream.geometry.transforms import Pose, pose_from, yaw_of
-from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE

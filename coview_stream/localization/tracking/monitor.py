@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from coview_stream.config import AcceptanceConfig, TrackingConfig
+from coview_stream.geometry.protection import one_in
 from coview_stream.localization.evidence.observation import Evidence
-from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.state import Event
 from coview_stream.localization.tracking.place_evidence import Observation
 

@@ -8,8 +8,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from coview_stream.geometry.protection import one_in
 from coview_stream.geometry.transforms import yaw_of
-from coview_stream.localization.evidence.words import one_in
 from coview_stream.messages.types import PoseMessage
 
 WINDOW = 5.0  # seconds over which the rate of poses is measured

@@ -24,6 +24,7 @@ from made_up_scans import (
 from nightly import nightly
 from scipy.stats import beta, binom
 
+from coview_stream.geometry.protection import one_in
 from coview_stream.localization.evidence import background, likelihood
 from coview_stream.localization.evidence.background import Background, estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import (
@@ -33,7 +34,6 @@ from coview_stream.localization.evidence.likelihood import (
     posterior,
 )
 from coview_stream.localization.evidence.observation import Share
-from coview_stream.localization.evidence.words import one_in
 
 BACKGROUND = Background(CHANCE, PASSED, (1.5, 1.5), (30.0, 12.0))
 GOOD = np.array([0.75, 0.15, 0.04, 0.06])
