@@ -124,9 +124,11 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 def _dispatch(argv: list[str]) -> int:
     try:
-        args = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(_joined(argv))
+        args, rest = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_known_args(_joined(argv))
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
+    if rest:
+        raise ConfigError(f"unrecognized arguments: {' '.join(rest)}; see `{PROGRAM} {args.command} --help`")
     with naming_missing_libraries(f"{PROGRAM} {args.command}", _EXTRAS.get(args.command)):
         return int(args.run(args))
 

@@ -120,6 +120,8 @@ def run(args: argparse.Namespace) -> int:
 
         draw_run(located, base_map, args.output)
     print(summary(located))
+    if not located.posed:
+        print(f"why, and what to do: coview-stream doctor {args.map} --run {args.run_path}")
     return 0 if located.posed else 1
 
 

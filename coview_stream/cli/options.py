@@ -67,6 +67,8 @@ def fill_from_file(
 ) -> dict[str, dict[str, Any]]:
     """Set the options that were not given to the values of a TOML file, by their names, and return its tables.
 
+    ``args.in_file`` gets the names of the options in the file.
+
     Raises:
         ConfigError: an unknown key, or a value that the option does not take.
     """
@@ -75,7 +77,8 @@ def fill_from_file(
 
     actions: dict[str, argparse.Action] = {}
     for action in parser._actions:
-        names = [option[2:] for option in action.option_strings if option.startswith("--")] or [action.dest]
+        names = [option[2:] for option in action.option_strings if option.startswith("--")]
+        names = names or [str(action.metavar).lower(), action.dest]
         if action.dest not in ("help", "help_all", "config"):
             actions |= {name.replace("-", "_"): action for name in names}
     given = {action for action in actions.values() if not _absent(getattr(args, action.dest))}
@@ -83,6 +86,7 @@ def fill_from_file(
         if given.intersection(group._group_actions):
             given.update(group._group_actions)
     found: dict[str, dict[str, Any]] = {}
+    args.in_file = read = set[str]()
     for key, value in read_settings(path).items():
         name = key.replace("-", "_")
         if name in tables and (isinstance(value, dict) or name not in actions):
@@ -93,6 +97,8 @@ def fill_from_file(
             raise ConfigError(f"{path}: {unknown_key(key, [*tables, *actions])}")
         elif actions[name] not in given:
             setattr(args, actions[name].dest, _value_of(actions[name], value, f"{path}: {key}"))
+        if name in actions and name not in found:
+            read.add(actions[name].dest)
     return found
 
 

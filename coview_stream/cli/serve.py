@@ -69,6 +69,15 @@ _DEFAULTS = {
 }  # fmt: skip
 """Options whose defaults --config may replace; None: the configuration's."""
 
+_TWICE = {
+    "risk": ("localizer", "acceptance", "risk"),
+    "reloc": ("localizer", "reloc"),
+    "registration": ("localizer", "registration", "method"),
+    "gravity": ("lidar_odometry", "gravity"),
+    **{name: ("node", name) for name in _LIMITS},
+}
+"""Options that are fields of a table as well: a file sets one of the two."""
+
 _RARE = (
     *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
     *(
@@ -174,12 +183,20 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
         declared = argparse.ArgumentParser()
         add_arguments(declared)
         tables |= fill_from_file(args, args.config, declared, _TABLES)
+        for option, (table, *path) in _TWICE.items():
+            field: Any = tables[table]
+            for name in path:
+                field = field.get(name) if isinstance(field, dict) else None
+            if option in args.in_file and field is not None:
+                raise ConfigError(
+                    f"{args.config}: {option} and [{'.'.join([table, *path[:-1]])}] {path[-1]}: set one of them"
+                )
     for name, value in _DEFAULTS.items():
         if getattr(args, name) is None:
             setattr(args, name, value)
-    for name, value in (("SITE", args.map), ("--robot", args.robot)):
+    for name, key, value in (("SITE", "site", args.map), ("--robot", "robot", args.robot)):
         if not value:
-            raise ConfigError(f"{name} is missing: give it here or in --config; see `coview-stream serve --help`")
+            raise ConfigError(f"{name} is missing: give it here, or as {key} = ... in the file of --config")
     return tables
 
 

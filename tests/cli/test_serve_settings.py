@@ -45,7 +45,7 @@ def test_an_option_reaches_the_node(world_file, given, read, wanted):
 def test_a_file_sets_options_and_tables(world_file, tmp_path):
     path = tmp_path / "node.toml"
     path.write_text(
-        f'map = "{world_file}"\nrobot = ["a", "b"]\nlisten = "tcp/127.0.0.1:0"\nno_state = true\npose-rate = 20\n'
+        f'site = "{world_file}"\nrobot = ["a", "b"]\nlisten = "tcp/127.0.0.1:0"\nno_state = true\npose-rate = 20\n'
         'cloud_key = "lidar/{robot}"\nmount = "180,0,0"\n[node]\nmax_outage = 7\n[localizer]\nreloc = "coview"\n'
         "[localizer.acceptance]\nrisk = 1e-5\n"
     )
@@ -139,6 +139,11 @@ def test_options_given_replace_the_file_and_leave_the_rest(world_file, tmp_path,
         ("[localizer]\nsensor_leans = false\n", "sensor_leans cannot be set here"),
         ("[node.mount]\nroll = 3\n", "mount cannot be set here: set it above"),
         ("[lidar_odometry]\nnonsense = 3\n", "unknown key 'nonsense'"),
+        ("max_outage = 4\n[node]\nmax_outage = 3\n", r"max_outage and \[node\] max_outage: set one of them"),
+        (
+            "risk = 1e-3\n[localizer.acceptance]\nrisk = 1e-5\n",
+            r"risk and \[localizer.acceptance\] risk: set one of them",
+        ),
     ],
 )
 def test_settings_that_something_else_decides_are_refused(world_file, tmp_path, text, message):
