@@ -18,6 +18,7 @@ import random
 import resource
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -147,7 +148,7 @@ def _rpc() -> Target:
         pairs = [(name, value) for name, _, value in (part.partition("=") for part in text.split(";"))]
         answers = zenoh_io.Answers(RateLimitedErrors(log))
         query = SimpleNamespace(parameters=pairs, key_expr="k", reply=ignore, reply_err=ignore)
-        answers.callback("k", dict)(query)
+        answers.callback("k", dict, threading.Event())(query)
         answers.end()
         answers.run()
         zenoh_io._error_of(data)
