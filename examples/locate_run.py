@@ -36,7 +36,7 @@ def main(world: Path) -> list[float]:
             true_position = truth[np.abs(stamps - fix.stamp).argmin(), :3, 3]
             errors.append(float(np.linalg.norm(fix.T_map_body[:3, 3] - true_position)))
     if errors:
-        print(f"{len(errors)} of {len(stamps)} frames localised, mean position error {np.mean(errors):.3f} m")
+        print(f"{len(errors)} of {len(stamps)} frames localized, mean position error {np.mean(errors):.3f} m")
     return errors
 
 

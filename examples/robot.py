@@ -40,7 +40,7 @@ def main(run: Path, name: str, endpoint: str | None = None, seconds: float = 0.1
         driving = True
         while driving:
             driving = driver.is_alive()
-            for pose in robot.poses(timeout=1.0):  # ends when none came for a second: not localised, or done
+            for pose in robot.poses(timeout=1.0):  # ends when none came for a second: not localized, or done
                 count += 1
                 x, y, z = pose.T_map_body[:3, 3]
                 wrong = one_in(1.0 - pose.confidence)

@@ -3,7 +3,7 @@
 A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Heavy libraries are
 imported inside ``run``: ``coview-stream --help`` must answer at once.
 
-Exit codes: 0 done; 1 could not localise (files are written all the same), no subscriber (replay), a check failed
+Exit codes: 0 done; 1 could not localize (files are written all the same), no subscriber (replay), a check failed
 (doctor); 2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
 """
 

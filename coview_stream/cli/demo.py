@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_web(parser)
     parser.epilog = (
         "Runs `serve`, `replay` and `watch` as processes of their own, which talk over zenoh on the loopback "
-        "interface; at the robot's own pace. Exit code 0 if the robot was localised rightly, 1 if not."
+        "interface; at the robot's own pace. Exit code 0 if the robot was localized rightly, 1 if not."
     )
 
 

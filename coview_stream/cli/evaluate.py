@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from coview_stream.report.evaluation import ErrorStats, Evaluation
 from coview_stream.cli.options import add_json
 
-HELP = "compare a trajectory with the truth: errors, success, share localised, false frames"
+HELP = "compare a trajectory with the truth: errors, success, share localized, false frames"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +45,7 @@ def table(evaluation: Evaluation) -> str:
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     rows = [
         ("success", "yes" if evaluation.success else "no"),
-        ("localised", f"{evaluation.share_localised:.1%} of {evaluation.frames} frames"),
+        ("localized", f"{evaluation.share_localised:.1%} of {evaluation.frames} frames"),
         ("false frames", f"{evaluation.false_frames} of {evaluation.posed} poses"),
         ("first pose", first),
     ]

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Localize and write; exit code 1 if no frame could be localised."""
+    """Localize and write; exit code 1 if no frame could be localized."""
     from tqdm import tqdm
 
     from coview_stream.basemap.basemap import BaseMap

@@ -256,7 +256,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
     by_default = not (args.connect or args.listen or args.zenoh_config)
     opened = open_map_argument(args)
-    return ServeOptions(
+    options = ServeOptions(
         map_path=opened.path,
         keys=keys,
         network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.zenoh_config),
@@ -264,7 +264,6 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node=node,
         localizer=localizer,
         lidar=lidar,
-        state=writable_state_folder(args),
         guesses=initial_guesses(args.initial, args.robot, args.within),
         mirrors=opened.mirrors,
         verify_key=verify_key,
@@ -272,6 +271,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node_keys=node_keys(args.base, args.node_name or default_node),
         metrics=args.metrics,
     )
+    return replace(options, state=writable_state_folder(args))  # last, for it logs the folder
 
 
 def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:

@@ -23,7 +23,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
     """Read stamps (N,) in seconds and poses (N, 4, 4) in metres from a TUM file.
 
     Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
-    without poses gives N = 0 (a run that was never localised).
+    without poses gives N = 0 (a run that was never localized).
 
     Raises:
         RunError: missing or unreadable file, text or a wrong number of columns, NaN, a zero quaternion, or

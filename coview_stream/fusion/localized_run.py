@@ -121,7 +121,7 @@ class LocalizedRun:
         self.stamps, self.poses = self._run.stamps[self._index], poses[at]
         self.without_pose = len(self._run) - len(self._index)
         if not len(self._index):
-            why = f"none at a stamp of {pair.run}" if len(stamps) else "none at all: the run was not localised"
+            why = f"none at a stamp of {pair.run}" if len(stamps) else "none at all: the run was not localized"
             raise InputError(f"{pair.trajectory}: holds poses: {why}; leave it out, or name the right run")
 
     def __len__(self) -> int:
@@ -190,10 +190,10 @@ def _read_result(path: Path) -> dict[str, Any]:
 def _check_map(pair: RunPair, result: dict[str, Any], base_map: BaseMap) -> None:
     sha = result.get("map_sha256")
     if not isinstance(sha, str) or not sha:
-        warn(f"{pair.out}: does not say which map it was localised on; taken for the one given")
+        warn(f"{pair.out}: does not say which map it was localized on; taken for the one given")
     elif base_map.sha256 and sha != base_map.sha256:
         raise InputError(
-            f"{pair.result}: localised on another map ({sha[:8]}, not {base_map.sha256[:8]}); "
+            f"{pair.result}: localized on another map ({sha[:8]}, not {base_map.sha256[:8]}); "
             f"run `coview-stream locate` with this one"
         )
 

@@ -274,7 +274,7 @@ def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
 def summary(located: RunResult) -> str:
     """Say it in a few lines for a person."""
     posed = located.posed
-    lines = [f"{'state':<18} {located.state.reported}", f"{'localised':<18} {len(posed)} of {located.frames} frames"]
+    lines = [f"{'state':<18} {located.state.reported}", f"{'localized':<18} {len(posed)} of {located.frames} frames"]
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")

@@ -1,6 +1,6 @@
 """Errors of a trajectory against the truth (eqs 15-17), and whether a run succeeded.
 
-Both trajectories are poses ``T_map_body``. A frame without a pose is *not localised*; it is never an error.
+Both trajectories are poses ``T_map_body``. A frame without a pose is *not localized*; it is never an error.
 """
 
 from __future__ import annotations
@@ -137,10 +137,10 @@ def driven(poses: Floats) -> Floats:
 
 
 def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Pose] | None = None) -> Evaluation:
-    """Compare an estimated trajectory with the truth; an empty one is "not localised", never an error.
+    """Compare an estimated trajectory with the truth; an empty one is "not localized", never an error.
 
     Args:
-        estimate: stamps and poses ``T_map_body``, only where the robot was localised.
+        estimate: stamps and poses ``T_map_body``, only where the robot was localized.
         truth: stamps and poses ``T_map_body`` of every frame.
         T_map_odom: estimated and true pose of the odometry frame, for ``origin_t_m``.
 

@@ -210,7 +210,7 @@ def plot_trajectory(
 
     Args:
         base: (N, 3) base map points, metres.
-        positions: (K, 3) map positions of the robot, one per frame; NaN where it was not localised: such a
+        positions: (K, 3) map positions of the robot, one per frame; NaN where it was not localized: such a
             frame is not drawn, but counted in the legend.
         states: K states, SEARCHING, AMBIGUOUS, TRACKING or LOST.
         path: picture to write.
@@ -230,7 +230,7 @@ def plot_trajectory(
             axes.plot(line[:, 0], line[:, 1], color=TRUTH, linewidth=1.0, linestyle=(0, (4, 2)), label="truth")
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
         if not drawn.any():
-            draw_notice(axes, "not localised: no frame has a pose")
+            draw_notice(axes, "not localized: no frame has a pose")
         axes.set_title("Trajectory")
         legend_below(drawing, axes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
@@ -116,9 +117,11 @@ def test_node_that_does_not_close_is_abandoned(monkeypatch):
         (["--robot", "a", "--odometry", "kiss-icp", "--odometry-key", "k"], "reads no odometry"),
     ],
 )
-def test_bad_serve_options_are_refused(args, message, world_file, capsys):
+def test_bad_serve_options_are_refused_before_anything_is_logged(args, message, world_file, capsys, caplog):
+    caplog.set_level(logging.INFO)
     assert main(["serve", str(world_file), *args]) == 2
     assert message in capsys.readouterr().err
+    assert not caplog.records
 
 
 @pytest.mark.slow

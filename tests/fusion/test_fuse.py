@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*which map:U
 
 
 def localized(base_map, folder, drive):
-    """Write a drive, take its truth for what was localised, and open both."""
+    """Write a drive, take its truth for what was localized, and open both."""
     path = small_world.write_run(folder / "run", drive, len(drive.clouds))
     stamps = [float(line.split()[0]) for line in (path / "odometry.tum").read_text().splitlines()]
     write_tum(folder / "trajectory.tum", stamps, drive.T_map_body)

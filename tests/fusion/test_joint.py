@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*which map:UserWarning")
 
 
 def located(base_map, folder, drive, off):
-    """Write a drive, take its truth, shifted by ``off`` (K, 3) metres, for what was localised, and open both."""
+    """Write a drive, take its truth, shifted by ``off`` (K, 3) metres, for what was localized, and open both."""
     path = small_world.write_run(folder / "run", drive, len(drive.clouds))
     stamps = [float(line.split()[0]) for line in (path / "odometry.tum").read_text().splitlines()]
     poses = np.array(drive.T_map_body)

@@ -80,7 +80,7 @@ def test_damaged_results_are_refused(world_run, world_map, results, text):
 
 def test_a_run_that_was_not_localised_is_refused(world_run, world_map, tmp_path):
     write_tum(tmp_path / "trajectory.tum", [], [])
-    with pytest.warns(UserWarning, match="which map"), pytest.raises(InputError, match="not localised"):
+    with pytest.warns(UserWarning, match="which map"), pytest.raises(InputError, match="not localized"):
         LocalizedRun(parse_pair(f"{world_run}:{tmp_path}"), world_map, opened)
 
 

@@ -68,7 +68,7 @@ def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, monkeypatch)
     monkeypatch.setattr(plots, "draw_notice", lambda axes, text: said.append(text))
     plots.plot_trajectory(base, np.full((3, 3), np.nan), ["SEARCHING"] * 3, tmp_path / "none.png")
     plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "empty.png")
-    assert [text.split(":")[0] for text in said] == ["not localised", "not localised"]
+    assert [text.split(":")[0] for text in said] == ["not localized", "not localized"]
     pixels(tmp_path / "none.png")
     pixels(tmp_path / "empty.png")
 

@@ -87,6 +87,9 @@ class ServeOptions:
         fleet: prefix of the keys of the fleet of nodes that share the robots; None: this node serves them all.
         node_keys: of the node's own; None for none.
         metrics: ``HOST:PORT`` of health and metrics over HTTP; None for none.
+
+    Raises:
+        ConfigError: robots cannot be told apart by their keys.
     """
 
     map_path: Path
@@ -104,6 +107,9 @@ class ServeOptions:
     node_keys: NodeKeys | None = None
     metrics: str | None = None
 
+    def __post_init__(self) -> None:
+        check_disjoint(self.keys)
+
 
 def open_node(
     options: ServeOptions,
@@ -120,10 +126,9 @@ def open_node(
         notifier: tells systemd; the caller tells by it that the service ends.
 
     Raises:
-        MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
+        MapError: the map is unusable. TransportError: no network.
         CancelledError: as asked. CoViewError: a library that the options ask for is missing.
     """
-    check_disjoint(options.keys)
     names = ", ".join(k.robot for k in options.keys)
     begin = time.monotonic()
     if children is None:
