@@ -21,8 +21,8 @@ that names no codec for this kind of message is a :class:`ConfigError`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import replace
+from typing import Generic, NamedTuple, TypeVar
 
 from coview_stream.errors import ConfigError, MessageError
 from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
@@ -52,14 +52,8 @@ M = TypeVar("M")
 C = TypeVar("C")
 
 
-@dataclass(frozen=True)
-class Codec(Generic[M]):
-    """One encoding of one kind of message, in both directions.
-
-    Attributes:
-        decode: read a sample.
-        encode: write a message.
-    """
+class Codec(NamedTuple, Generic[M]):
+    """One encoding of one kind of message: the function that reads a sample, and the one that writes a message."""
 
     decode: Callable[[Sample], M]
     encode: Callable[[M], Encoded]

@@ -75,7 +75,14 @@ def _claims(kind: MessageKind, encoding: str, key: str) -> tuple[tuple[str, ...]
         if codec not in _MIMES[mime]:
             raise EncodingError(f"{key}: encoding {encoding[:80]!r} contradicts itself")
         return (codec,), ""
-    return (() if mime in _MUTE else _MIMES[mime]), _by_key(kind, key)
+    by_key = ""
+    if rmw := _RMW_KEY.search(key):
+        by_key = _of_schema(kind, _schema(rmw[1]), f"{key}: key")
+    elif keelson := _KEELSON_KEY.search(key):
+        if kind not in _KEELSON.get(keelson[1], (kind,)):
+            raise EncodingError(f"{key}: subject {keelson[1]!r} cannot carry {kind}")
+        by_key = "keelson"
+    return (() if mime in _MUTE else _MIMES[mime]), by_key
 
 
 def _schema(parameters: str) -> str:
@@ -92,16 +99,6 @@ def _of_schema(kind: MessageKind, schema: str, source: str) -> str:
     if kind not in kinds:
         raise EncodingError(f"{source}: {schema!r} cannot carry {kind}")
     return codec
-
-
-def _by_key(kind: MessageKind, key: str) -> str:
-    if rmw := _RMW_KEY.search(key):
-        return _of_schema(kind, _schema(rmw[1]), f"{key}: key")
-    if keelson := _KEELSON_KEY.search(key):
-        if kind not in _KEELSON.get(keelson[1], (kind,)):
-            raise EncodingError(f"{key}: subject {keelson[1]!r} cannot carry {kind}")
-        return "keelson"
-    return ""
 
 
 def _by_magic(sample: Sample) -> str:

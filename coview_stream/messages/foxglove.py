@@ -7,10 +7,10 @@ payload can announce.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,22 +29,13 @@ _ROTATION = 5  # number of FrameTransform.rotation; PoseInFrame has fewer fields
 _LENGTH, _FIXED = 2, {1: 8, 5: 4}  # wire types: with a length, of fixed sizes
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One field on the wire.
-
-    Attributes:
-        number: of the field.
-        sized: whether a length precedes the value.
-        start: offset of the tag, bytes from the start of the message.
-        value: offset of the value, after its length.
-        end: offset behind the value.
-    """
+class Entry(NamedTuple):
+    """One field on the wire; offsets are in bytes from the start of the message."""
 
     number: int
-    sized: bool
-    start: int
-    value: int
+    sized: bool  # a length precedes the value
+    start: int  # of the tag
+    value: int  # after its length
     end: int
 
 
@@ -119,14 +110,9 @@ def wire_timestamp(seconds: int, nanos: int) -> bytes:
 def schemas() -> Any:
     """Import the schema classes on first use, in about 50 ms."""
     require_library("google.protobuf.message", "protobuf>=5", "Foxglove messages")
-    names = ("FrameTransform", "PointCloud", "PoseInFrame")
-    package = "foxglove_schemas_protobuf"
-    return SimpleNamespace(
-        **{
-            name: getattr(require_library(f"{package}.{name}_pb2", _LIBRARY, "Foxglove messages"), name)
-            for name in names
-        }
-    )
+    names, package = ("FrameTransform", "PointCloud", "PoseInFrame"), "foxglove_schemas_protobuf"
+    modules = [require_library(f"{package}.{name}_pb2", _LIBRARY, "Foxglove messages") for name in names]
+    return SimpleNamespace(**{name: getattr(module, name) for name, module in zip(names, modules, strict=True)})
 
 
 def _parse(schema: Any, payload: bytes) -> Any:

@@ -66,18 +66,11 @@ def encode_pose(message: PoseMessage) -> Encoded:
     ``protection_level`` and ``T_map_odom`` (position and orientation, map <- odometry) are null where unknown.
     NaN is a MessageError.
     """
-    fields = {
-        "stamp_ns": int(message.stamp_ns),
-        "robot": message.robot,
-        "state": message.state,
-        **place_fields(message.T_map_body),
+    fields = message.to_json() | {  # NaN stays, to be refused
         "covariance": np.asarray(message.covariance, dtype=np.float64).ravel().tolist(),
         "confidence": float(message.confidence),
         "map_sha256": message.map_sha256,
         "age_s": float(message.age),
-        "frame_id": message.frame_id,
-        "protection_level": None if message.protection is None else message.protection.to_json(),
-        "T_map_odom": None if message.T_map_odom is None else place_fields(message.T_map_odom),
     }
     return _dump(fields, "pose")
 
@@ -108,14 +101,8 @@ def encode_hypotheses(message: HypothesesMessage) -> Encoded:
     ]
     for row, name in zip(rows, message.maps, strict=False):
         row["map"] = name
-    fields = {
-        "stamp_ns": message.stamp_ns,
-        "robot": message.robot,
-        "map_sha256": message.map_sha256,
-        "none": round(message.none, 6),
-        "places": rows,
-    }
-    return _dump(fields, "hypothesis")
+    fields = {"stamp_ns": message.stamp_ns, "robot": message.robot, "map_sha256": message.map_sha256}
+    return _dump(fields | {"none": round(message.none, 6), "places": rows}, "hypothesis")
 
 
 def decode_hypotheses(sample: Sample) -> HypothesesMessage:

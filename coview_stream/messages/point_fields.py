@@ -30,7 +30,7 @@ from coview_stream.errors import MessageError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 from coview_stream.messages.types import CloudMessage
-from coview_stream.messages.validation import check_points
+from coview_stream.messages.validation import MAX_POINTS, OversizedError
 
 TIME_NAMES = ("time", "t", "time_offset", "offset_time", "timestamp")
 RING_NAMES = ("ring", "line", "channel")
@@ -76,23 +76,29 @@ class Table:
 def read_table(table: Table, stamp_ns: int) -> CloudMessage:
     """Read the cloud in a table; packed float32 x y z stay a view. MessageError if fields and data disagree."""
     known = _known_fields(table)
-    if not table.width * table.height:
+    count = table.width * table.height
+    if not count:
         return CloudMessage(stamp_ns, np.zeros((0, 3), np.float32))
-    _check_extent(table)
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; some NaN signal
-        return _read(table, known, stamp_ns)
-
-
-def _read(table: Table, known: dict[str, Field], stamp_ns: int) -> CloudMessage:
-    points = _points(table, known)
+    if count > MAX_POINTS:
+        raise OversizedError(f"a cloud of {count} points; at most {MAX_POINTS} are taken: thin it out")
+    row = table.width * table.step
+    if table.height > 1 and table.row_step < row:
+        raise MessageError(f"a row of {row} bytes exceeds the row step of {table.row_step}")
+    needed = (table.height - 1) * table.row_step + row
+    if needed > len(table.data):
+        raise MessageError(f"{len(table.data)} bytes of points where {needed} are announced: truncated")
+    x, y, z = (known[name] for name in "xyz")
     time = next((known[name] for name in TIME_NAMES if name in known), None)
     ring = next((known[name] for name in RING_NAMES if name in known), None)
-    return CloudMessage(
-        stamp_ns,
-        points,
-        times_from(table.column(time)[:, 0], points, stamp_ns) if time else None,
-        rings_from(table.column(ring)[:, 0]) if ring else None,
-    )
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; some NaN signal
+        if table.step == 12 and (x[1:], y[1:], z[1:]) == (("<f4", 0), ("<f4", 4), ("<f4", 8)):
+            points = np.ascontiguousarray(table.column(x, 3), dtype=np.float32)
+        else:
+            points = np.empty((count, 3), np.float32)
+            for axis, field in enumerate((x, y, z)):  # seven times as fast as copying rows of three
+                points[:, axis] = table.column(field)[:, 0]
+        times = _times_from(table.column(time)[:, 0], points, stamp_ns) if time else None
+        return CloudMessage(stamp_ns, points, times, _rings_from(table.column(ring)[:, 0]) if ring else None)
 
 
 def _known_fields(table: Table) -> dict[str, Field]:
@@ -108,26 +114,6 @@ def _known_fields(table: Table) -> dict[str, Field]:
     if missing := [name for name in "xyz" if name not in known]:
         raise MessageError(f"the cloud has no numeric field {missing[0]!r}; it needs x, y and z")
     return known
-
-
-def _check_extent(table: Table) -> None:
-    check_points(table.width * table.height)
-    row = table.width * table.step
-    if table.height > 1 and table.row_step < row:
-        raise MessageError(f"a row of {row} bytes exceeds the row step of {table.row_step}")
-    needed = (table.height - 1) * table.row_step + row
-    if needed > len(table.data):
-        raise MessageError(f"{len(table.data)} bytes of points where {needed} are announced: truncated")
-
-
-def _points(table: Table, known: dict[str, Field]) -> Points:
-    x, y, z = (known[name] for name in "xyz")
-    if table.step == 12 and (x[1:], y[1:], z[1:]) == (("<f4", 0), ("<f4", 4), ("<f4", 8)):
-        return np.ascontiguousarray(table.column(x, 3), dtype=np.float32)
-    points = np.empty((table.width * table.height, 3), np.float32)
-    for axis, field in enumerate((x, y, z)):  # seven times as fast as copying rows of three
-        points[:, axis] = table.column(field)[:, 0]
-    return points
 
 
 def write_table(message: CloudMessage) -> Table:
@@ -148,31 +134,27 @@ def write_table(message: CloudMessage) -> Table:
     return Table(rows.tobytes(), tuple(fields), offset, len(rows))
 
 
-def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
+def _times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
     """Return (N,) seconds after ``stamp_ns``, 0 where a point is not finite; None if implausible."""
     measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
-    complete = bool(measured.all())
     if not measured.any():
         return None
-    for candidate in _meanings(values, stamp_ns):
-        valid = candidate if complete else candidate[measured]
+    seconds = values.astype(np.float64)
+    if values.dtype.kind in "ui":  # the meanings that the type allows, likeliest first
+        meanings = [1e-9 * seconds] if values.dtype.itemsize == 4 else []
+    elif values.dtype.itemsize == 4:
+        meanings = [seconds]
+    else:
+        meanings = [seconds - 1e-9 * stamp_ns, 1e-9 * (seconds - stamp_ns), seconds]
+    for candidate in meanings:
+        valid = candidate[measured]
         low, high = float(valid.min()), float(valid.max())  # NaN fails the comparisons below
         if low >= -_MAX_SWEEP and high <= _MAX_SWEEP and high - low <= _MAX_SWEEP:
-            return candidate if complete else np.where(measured, candidate, 0.0)
+            return np.where(measured, candidate, 0.0)
     return None
 
 
-def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
-    """Return seconds after the stamp in each meaning that the type allows, likeliest first."""
-    seconds = values.astype(np.float64)
-    if values.dtype.kind in "ui":
-        return [1e-9 * seconds] if values.dtype.itemsize == 4 else []
-    if values.dtype.itemsize == 4:
-        return [seconds]
-    return [seconds - 1e-9 * stamp_ns, 1e-9 * (seconds - stamp_ns), seconds]
-
-
-def rings_from(values: npt.NDArray[Any]) -> npt.NDArray[np.uint16] | None:
+def _rings_from(values: npt.NDArray[Any]) -> npt.NDArray[np.uint16] | None:
     """Return (N,) beam numbers; None if not whole or outside the uint16 range."""
     if values.dtype.kind == "f" and not np.array_equal(values, np.trunc(values)):  # false for NaN too
         return None

@@ -34,12 +34,6 @@ def check_size(payload: bytes, limit: int = MAX_PAYLOAD, size: int | None = None
         raise OversizedError(f"{size} bytes; at most {limit} are taken: send fewer points or fields")
 
 
-def check_points(count: int) -> None:
-    """Raise OversizedError for more than :data:`MAX_POINTS`."""
-    if count > MAX_POINTS:
-        raise OversizedError(f"a cloud of {count} points; at most {MAX_POINTS} are taken: thin it out")
-
-
 def stamp_from(value: object) -> int:
     """Return ``value`` if it is a whole number of nanoseconds in the int64 range, else raise MessageError."""
     if not isinstance(value, int) or isinstance(value, bool):
@@ -73,10 +67,8 @@ def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose
     norm = math.hypot(*quaternion)
     if abs(norm - 1.0) > 1e-2:
         raise MessageError(f"the orientation (qx, qy, qz, qw) has norm {norm:.3g}; a rotation has 1")
-    return _pose(*position, *(part / norm for part in quaternion))
-
-
-def _pose(x: float, y: float, z: float, a: float, b: float, c: float, w: float) -> Pose:
+    x, y, z = position
+    a, b, c, w = (part / norm for part in quaternion)
     # written out: at 16 robots x 100 Hz of odometry, SciPy's 50 us each would take a tenth of a core
     return np.array(
         (
