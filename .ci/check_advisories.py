@@ -1,10 +1,10 @@
-"""Check of what is installed, or locked, against the advisories that are listed beside this file.
+"""Check installed or locked packages against the advisories in advisories.json.
 
-    python .ci/check_advisories.py                   # what this Python has installed
-    python .ci/check_advisories.py .ci/lock/*.txt    # what is locked
+    python .ci/check_advisories.py                   # the packages of this Python
+    python .ci/check_advisories.py .ci/lock/*.txt    # the locked packages
 
-The list is pinned: it knows what was public at its date and was entered by hand. Exit code 1 names each package that
-one of them is about, and the versions that it is about; one with a ``waiver`` is told and does not fail.
+The list was entered by hand and is pinned: it knows nothing newer than its date. Exit code 1 if an advisory applies;
+one with a ``waiver`` is printed and does not fail.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence
 from importlib.metadata import distributions
 from pathlib import Path
 
@@ -23,37 +23,33 @@ ADVISORIES = Path(__file__).with_name("advisories.json")
 _LOCKED = re.compile(r"^([A-Za-z0-9._-]+)==([^\s;]+)", re.M)
 
 
-def locked(text: str) -> dict[str, str]:
-    """Return the versions, by name, of a lock."""
-    return {canonicalize_name(name): version for name, version in _LOCKED.findall(text)}
+def locked(text: str) -> set[tuple[str, str]]:
+    """Return the names and versions in a lock; a package can have a version for each platform."""
+    return {(canonicalize_name(name), version) for name, version in _LOCKED.findall(text)}
 
 
-def installed() -> dict[str, str]:
-    """Return the versions, by name, that this Python has."""
-    return {canonicalize_name(each.metadata["Name"]): each.version for each in distributions() if each.metadata["Name"]}
+def installed() -> set[tuple[str, str]]:
+    """Return the names and versions of the packages of this Python."""
+    return {(canonicalize_name(name), item.version) for item in distributions() if (name := item.metadata["Name"])}
 
 
-def found(versions: Mapping[str, str], advisories: Iterable[Mapping[str, str]]) -> Iterator[Mapping[str, str]]:
-    """Yield the advisories that are about what is there."""
-    for advisory in advisories:
-        version = versions.get(canonicalize_name(advisory["package"]))
-        if version is not None and SpecifierSet(advisory["affected"], prereleases=True).contains(version):
-            yield advisory
-
-
-def main(paths: list[str]) -> int:
+def main(paths: Sequence[str], advisories: Path = ADVISORIES) -> int:
     """Check; return the exit code."""
-    document = json.loads(ADVISORIES.read_text())
+    document = json.loads(advisories.read_text())
     code = 0
-    for where, versions in [(path, locked(Path(path).read_text())) for path in paths] or [("installed", installed())]:
-        hits = list(found(versions, document["advisories"]))
-        for hit in hits:
-            name, waiver = hit["package"], f"; waived: {hit['waiver']}" if hit.get("waiver") else ""
-            about = f"{hit['id']} ({hit['about']}), affected {hit['affected']}{waiver}"
-            sys.stdout.write(f"{where}: {name} {versions[canonicalize_name(name)]}: {about}\n")
-        code |= any(not hit.get("waiver") for hit in hits)
-        known = f"{len(hits)} of {len(document['advisories'])} advisories of {document['date']}"
-        sys.stdout.write(f"{where}: {len(versions)} packages; {known} are about them\n")
+    sets = [(path, locked(Path(path).read_text())) for path in paths] or [("installed", installed())]
+    for source, packages in sets:
+        hits = 0
+        for entry in document["advisories"]:
+            affected, waiver = SpecifierSet(entry["affected"], prereleases=True), entry.get("waiver")
+            for name, version in sorted(packages):
+                if name == canonicalize_name(entry["package"]) and affected.contains(version):
+                    about = f"{entry['id']} ({entry['about']}), affected {entry['affected']}"
+                    sys.stdout.write(f"{source}: {name} {version}: {about}{f'; waived: {waiver}' if waiver else ''}\n")
+                    hits += 1
+                    code |= not waiver
+        known = f"{hits} of {len(document['advisories'])} advisories of {document['date']} apply"
+        sys.stdout.write(f"{source}: {len(packages)} packages; {known}\n")
     return code
 
 
