@@ -19,7 +19,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, pose_from, transform
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.frame import OdometryCorrection
-from coview_stream.recordings.run import Run, SweepCorrection
+from coview_stream.odometry.deskew import SweepCorrection
+from coview_stream.recordings.run import Run
 
 _SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least
 _MAX_RESULT = 1 << 28  # bytes of a result.json

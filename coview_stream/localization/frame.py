@@ -100,7 +100,7 @@ class FramePreparation:
             T = self._motion.refine(self._voxels(raw, np.eye(4)), T, self.estimator, drift)
             self._odometry.move_to(pose_from(T[:3, :3], T[:3, 3] + self.anchor))
         points = self._voxels(raw, T @ self.calibration.T_body_cloud)
-        return Frame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration.R_body_cloud))
+        return Frame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration))
 
     def learn_place(self, T_map_cloud: Pose, T_odom_body: Pose, probability: float | None = None) -> Pose:
         """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) by the calibration that follows.

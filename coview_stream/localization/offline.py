@@ -26,7 +26,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
-from coview_stream.recordings.run import Frame, Run, SweepCorrection
+from coview_stream.recordings.run import Frame, Run
 
 Progress = Callable[[int, int, Fix | None], None]
 """Called with (frames done, frames, newest fix)."""
@@ -174,8 +174,7 @@ def locate(
     driven, before = 0.0, None
     for index in range(len(run)):
         try:
-            calibration = localizer.calibration
-            frame = run.read(index, SweepCorrection(calibration.R_body_cloud, calibration.scale))
+            frame = run.read(index, localizer.calibration.sweep)
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:

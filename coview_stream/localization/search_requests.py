@@ -63,7 +63,7 @@ class SearchRequests:
         """
         anchor, calibration = self._frames.anchor, self._frames.calibration
         assert anchor is not None  # a frame has been prepared
-        keyframe = self._buffer.add(frame.scan, frame.stamp, calibration.R_body_cloud)
+        keyframe = self._buffer.add(frame.scan, frame.stamp)
         if keyframe is not None and keyframe.begins_anew:
             self.next_epoch()
             self.hints.search_begins_anew()
@@ -72,7 +72,7 @@ class SearchRequests:
         area = self.hints.area(anchor, frame.T_odom_body)
         if area is not None:
             hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
-        if self._odometry_check.contradicts(frame.scan.levelled(calibration.R_body_cloud), frame.scan.position):
+        if self._odometry_check.contradicts(frame.scan.levelled(calibration), frame.scan.position):
             self._begin_anew()
             reason = "searching anew: frames do not fit together where odometry puts them"
             return NoSearch(reason, RejectionReason.ODOMETRY)

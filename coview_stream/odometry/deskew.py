@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
@@ -12,14 +14,26 @@ _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 
 _INSTANT = 1e-4  # seconds: times that differ by less are one
 
 
+@dataclass(frozen=True)
+class SweepCorrection:
+    """Calibration of sensor and odometry, for deskewing a sweep.
+
+    Attributes:
+        R_body_cloud: (3, 3) rotation that levels clouds of a sensor that leans against the body.
+        scale: factor that corrects odometry's distances, minus one.
+    """
+
+    R_body_cloud: Floats
+    scale: float = 0.0
+
+
 def deskew(
     points: Points,
     times: Floats,
     segment: Segment,
     stamp_ns: int,
     T_odom_body: Pose,
-    R_body_cloud: Floats | None = None,
-    scale: float = 0.0,
+    correction: SweepCorrection | None = None,
 ) -> Points:
     """Return the points (N, 3) in the body frame at ``stamp_ns``; a cloud that leans goes on leaning.
 
@@ -29,8 +43,7 @@ def deskew(
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
-        R_body_cloud: (3, 3) rotation that levels a cloud whose sensor leans against the body; None for none.
-        scale: factor that corrects odometry's distances, less one.
+        correction: of a sensor that leans against the body and of odometry; default none.
     """
     if len(segment.stamps) < 2 or not len(points):
         return points
@@ -44,10 +57,11 @@ def deskew(
     k = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)
     share = (grid - at[k]) / (at[k + 1] - at[k])
     body = interpolate(relative[k], relative[k + 1], share)
-    body[:, :3, 3] *= 1.0 + scale
-    if R_body_cloud is not None:
-        body[:, :3, :3] = R_body_cloud.T @ body[:, :3, :3] @ R_body_cloud
-        body[:, :3, 3] = body[:, :3, 3] @ R_body_cloud  # each row by the transposed rotation
+    if correction is not None:
+        R = correction.R_body_cloud
+        body[:, :3, 3] *= 1.0 + correction.scale
+        body[:, :3, :3] = R.T @ body[:, :3, :3] @ R
+        body[:, :3, 3] = body[:, :3, 3] @ R  # each row by the transposed rotation
     motion = body.astype(np.float32)
     step = np.rint((clipped - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
     moved = np.einsum("nij,nj->ni", motion[step, :3, :3], points) + motion[step, :3, 3]

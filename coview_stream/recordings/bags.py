@@ -24,9 +24,9 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.buffer import Segment
-from coview_stream.odometry.deskew import deskew
+from coview_stream.odometry.deskew import SweepCorrection, deskew
 from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stamp, readable
-from coview_stream.recordings.run import Run, SweepCorrection
+from coview_stream.recordings.run import Run
 
 SAME_NS = 1000
 """Stamps this close are equal: text files and float64 seconds are good to a microsecond."""
@@ -151,7 +151,7 @@ class BagClouds:
         # false for NaN as well
         usable: Bools = np.all(np.abs(message.points) < MAX_COORDINATE, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
-        builder.add(self._deskewed(index, message, usable, correction or SweepCorrection()))
+        builder.add(self._deskewed(index, message, usable, correction))
         return builder.finish(self._name(index))
 
     def message(self, index: int) -> CloudMessage:
@@ -182,14 +182,14 @@ class BagClouds:
             reads_on = False
         raise ValueError("it is not there any more")
 
-    def _deskewed(self, index: int, message: CloudMessage, usable: Bools, correction: SweepCorrection) -> Points:
+    def _deskewed(self, index: int, message: CloudMessage, usable: Bools, correction: SweepCorrection | None) -> Points:
         points = message.points[usable]
         if message.times is None or not len(points):
             return points
         stamp, times = message.stamp_ns, message.times[usable]
         begin, end = (stamp + round(t / _NS) for t in (min(0.0, times.min()), max(0.0, times.max())))
         sweep = self.track.around(begin, end, stamp)
-        return deskew(points, times, sweep, stamp, self.poses[index], correction.R_body_cloud, correction.scale)
+        return deskew(points, times, sweep, stamp, self.poses[index], correction)
 
 
 def _has_stamp(payload: bytes, stamp_ns: int) -> bool:

@@ -16,6 +16,7 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses
+from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.layouts import Layout
 
 
@@ -44,19 +45,6 @@ class Frame:
     def __repr__(self) -> str:
         """Return index, stamp, size and file in one line."""
         return f"Frame({self.index}: {self.stamp:.3f} s, {len(self.points):,} points, {self.path.name!r})"
-
-
-@dataclass(frozen=True)
-class SweepCorrection:
-    """Calibration of sensor and odometry, for deskewing a sweep.
-
-    Attributes:
-        R_body_cloud: (3, 3) rotation that levels the sensor's clouds; None for none.
-        scale: factor for odometry's distances, minus one.
-    """
-
-    R_body_cloud: Floats | None = None
-    scale: float = 0.0
 
 
 class CloudSource(Protocol):

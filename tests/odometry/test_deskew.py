@@ -8,7 +8,7 @@ from fake_robot import ns, pose
 
 from coview_stream.geometry.transforms import exp_so3, inverse, transform
 from coview_stream.odometry.buffer import Segment
-from coview_stream.odometry.deskew import deskew
+from coview_stream.odometry.deskew import SweepCorrection, deskew
 
 SPEED = 8.0  # m/s
 TURN = 0.6  # rad/s
@@ -113,7 +113,7 @@ def test_leaning_sweep_with_wrong_odometry_is_straight_only_with_the_calibration
         return ODOM_FAR @ pose(1.07 * SPEED * t, 0.0, 0.0)
 
     sweep = segment(too_long, np.arange(-0.14, 0.141, 0.02))
-    known = deskew(swept, times, sweep, ns(0.0), too_long(0.0), lean.T, 1.0 / 1.07 - 1.0)
+    known = deskew(swept, times, sweep, ns(0.0), too_long(0.0), SweepCorrection(lean.T, 1.0 / 1.07 - 1.0))
     assert apart(known, at_once) < 0.01
     assert apart(deskew(swept, times, sweep, ns(0.0), too_long(0.0)), at_once) > 0.05
-    assert apart(deskew(swept, times, sweep, ns(0.0), too_long(0.0), lean.T), at_once) > 0.05
+    assert apart(deskew(swept, times, sweep, ns(0.0), too_long(0.0), SweepCorrection(lean.T)), at_once) > 0.05

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rotation_angle
+from coview_stream.odometry.deskew import SweepCorrection
 
 # smaller corrections are not reported
 _LEAN = math.radians(0.5)
@@ -47,7 +49,7 @@ class Calibration:
     sigma_turn: float = math.radians(0.05)
     ground: float = 0.0
 
-    @property
+    @cached_property
     def R_body_cloud(self) -> Floats:
         """(3, 3) rotation that levels clouds."""
         return exp_so3(np.array([self.roll, self.pitch, 0.0]))
@@ -56,6 +58,15 @@ class Calibration:
     def T_body_cloud(self) -> Pose:
         """(4, 4) the rotation as a transform."""
         return pose_from(self.R_body_cloud, np.zeros(3))
+
+    @property
+    def sweep(self) -> SweepCorrection:
+        """The corrections that deskewing applies."""
+        return SweepCorrection(self.R_body_cloud, self.scale)
+
+    def leans_from(self, other: Calibration) -> float:
+        """Return the angle between the levels of two calibrations, radians."""
+        return rotation_angle(self.R_body_cloud.T @ other.R_body_cloud)
 
     def level(self, cloud: Points) -> Points:
         """Return a cloud (N, 3) in the body's axes, from the sensor's."""
@@ -123,12 +134,14 @@ class RawScan:
 
     Attributes:
         T_odom_body: (4, 4) odometry of the frame.
+        calibration: the calibration of the frame's time.
     """
 
-    def __init__(self, points: Points, T_odom_body: Pose, R_body_cloud: Floats | None = None) -> None:
-        """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``R_body_cloud`` (3, 3), if given."""
+    def __init__(self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None) -> None:
+        """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``calibration`` (default: none)."""
         self.T_odom_body = T_odom_body
-        self._newest = (np.eye(3) if R_body_cloud is None else R_body_cloud), points
+        self.calibration = calibration or Calibration()
+        self._newest = self.calibration.R_body_cloud, points
         self._raw: Points | None = None
 
     def __len__(self) -> int:
@@ -140,14 +153,15 @@ class RawScan:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
 
-    def levelled(self, R_body_cloud: Floats) -> Points:
-        """Return the points (N, 3) in the odometry frame, levelled by a rotation (3, 3)."""
+    def levelled(self, calibration: Calibration) -> Points:
+        """Return the points (N, 3) in the odometry frame, levelled by a calibration."""
         R, points = self._newest
-        if np.array_equal(R, R_body_cloud):
+        level = calibration.R_body_cloud
+        if np.array_equal(R, level):
             return points
         position = self.position.astype(np.float32)
         if self._raw is None:
             self._raw = (points - position) @ (self.T_odom_body[:3, :3] @ R).astype(np.float32)
-        turn = (self.T_odom_body[:3, :3] @ R_body_cloud).astype(np.float32)
-        self._newest = R_body_cloud, self._raw @ turn.T + position
+        turn = (self.T_odom_body[:3, :3] @ level).astype(np.float32)
+        self._newest = level, self._raw @ turn.T + position
         return self._newest[1]

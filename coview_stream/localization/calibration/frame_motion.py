@@ -112,7 +112,7 @@ class FrameMotion:
         far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
         if len(reference.points) < MIN_PAIRS or far > _LONGEST:
             return None
-        level = pose_from(estimator.calibration.R_body_cloud, np.zeros(3))
+        level = estimator.calibration.T_body_cloud
         then = reference.T_odom_body @ level
         target = LocalMap(
             np.ascontiguousarray(transform(then, reference.points)),

@@ -9,7 +9,8 @@ import numpy as np
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import one_in
-from coview_stream.geometry.transforms import Pose, pose_from, yaw_of
+from coview_stream.geometry.transforms import Pose, yaw_of
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
@@ -65,7 +66,7 @@ class SearchResult:
         leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
             without any place.
         T_odom_body: (4, 4) of the keyframe.
-        R_body_cloud: (3, 3) rotation that levelled the keyframe's clouds.
+        calibration: levelled the keyframe's clouds.
         considered: the most probable places, for people to look at; None where none was scored.
     """
 
@@ -76,7 +77,7 @@ class SearchResult:
     rivals: Rivals = field(default_factory=Rivals)
     leader: Pose | None = None
     T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
-    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
+    calibration: Calibration = field(default_factory=Calibration)
     considered: Considered | None = None
 
     @property
@@ -84,7 +85,7 @@ class SearchResult:
         """(4, 4) the leader's pose of the keyframe's cloud in the sensor's own axes; None without a leader."""
         if self.leader is None:
             return None
-        return self.leader @ self.T_odom_body @ pose_from(self.R_body_cloud, np.zeros(3))
+        return self.leader @ self.T_odom_body @ self.calibration.T_body_cloud
 
 
 def decide(
@@ -118,7 +119,7 @@ def decide(
         T_map_odom = (leader or best).T_map_odom
     return SearchResult(
         leader if state is State.TRACKING else None, evidence, request.travelled, request.epoch, scored.rivals,
-        T_map_odom, request.T_odom_body, request.R_body_cloud,
+        T_map_odom, request.T_odom_body, request.calibration,
     )  # fmt: skip
 
 

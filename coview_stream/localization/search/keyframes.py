@@ -11,8 +11,8 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.arrays import Floats, Ints
-from coview_stream.geometry.transforms import Points, Pose, rotation_angle
-from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
 
 _PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points
 _RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
@@ -69,15 +69,15 @@ class KeyframeBuffer:
 
     Attributes:
         keyframes: the newest ones, oldest first.
-        R_body_cloud: (3, 3) rotation that levels the clouds, as given with the newest frame.
+        calibration: of the newest frame; levels all points that are read.
     """
 
     def __init__(self, config: KeyframeConfig, reach: float = math.inf) -> None:
         self.config = config
         self.reach = reach
         self.keyframes: deque[Keyframe] = deque(maxlen=min(config.capacity, _RECENT))
-        self.R_body_cloud = np.eye(3)
-        self._gathered_by: deque[Floats] = deque(maxlen=self.keyframes.maxlen)  # rotations, of the keyframes
+        self.calibration = Calibration()
+        self._gathered_by: deque[Calibration] = deque(maxlen=self.keyframes.maxlen)
         self._levelled_at: Floats | None = None  # position where the gathered points were last levelled again
         self._pending: list[RawScan] = []  # frames since the newest keyframe
         # the points of so many keyframes each, one per voxel, which are dropped as a whole
@@ -85,9 +85,9 @@ class KeyframeBuffer:
         self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)
         self._in_part = 0  # keyframes in the newest of them
 
-    def add(self, scan: RawScan, stamp: float, R_body_cloud: Floats | None = None) -> Keyframe | None:
-        """Add a frame, whose clouds ``R_body_cloud`` (3, 3) levels; return the keyframe that it completes, if any."""
-        self.R_body_cloud = np.eye(3) if R_body_cloud is None else R_body_cloud
+    def add(self, scan: RawScan, stamp: float) -> Keyframe | None:
+        """Add a frame; return the keyframe that it completes, if any."""
+        self.calibration = scan.calibration
         if anew := self._leans() and self._has_driven_on(scan.position):
             self._gather_again()
             self._levelled_at = scan.position.copy()
@@ -105,7 +105,7 @@ class KeyframeBuffer:
 
     def _leans(self) -> bool:
         """Whether a keyframe was levelled by a rotation more than a degree off the present one."""
-        return any(rotation_angle(self.R_body_cloud.T @ R) > _SMEARED for R in self._gathered_by)
+        return any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
 
     def _has_driven_on(self, position: Floats) -> bool:
         """Whether the robot has driven on since the last levelling: from the same position nothing new is seen."""
@@ -115,19 +115,19 @@ class KeyframeBuffer:
     def _gather(self, keyframe: Keyframe) -> None:
         """Add a keyframe, its points to the newest part: where it has none in their voxels, and within reach."""
         self.keyframes.append(keyframe)
-        self._gathered_by.append(self.R_body_cloud)
+        self._gathered_by.append(self.calibration)
         if not self._parts or self._in_part == self._part_size:
             near = [_within(part, keyframe.position, self.reach) for part in self._parts]
             self._parts = deque([*near, np.empty((0, 3), dtype=np.float32)], maxlen=self._parts.maxlen)
             self._in_part = 0
-        points = np.concatenate((self._parts[-1], keyframe.scan.levelled(self.R_body_cloud)))
+        points = np.concatenate((self._parts[-1], keyframe.scan.levelled(self.calibration)))
         self._parts[-1] = self._unique(_within(points, keyframe.position, self.reach))
         self._in_part += 1
 
     def recent(self, count: int) -> Points:
         """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since."""
         scans = [*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending]
-        parts = [scan.levelled(self.R_body_cloud) for scan in scans]
+        parts = [scan.levelled(self.calibration) for scan in scans]
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
@@ -157,8 +157,8 @@ class KeyframeBuffer:
 
     def _merged(self, newest: RawScan) -> RawScan:
         """Return all frames since the newest keyframe as one."""
-        frames = [scan.levelled(self.R_body_cloud) for scan in self._pending]
-        return RawScan(self._unique(np.concatenate(frames)), newest.T_odom_body, self.R_body_cloud)
+        frames = [scan.levelled(self.calibration) for scan in self._pending]
+        return RawScan(self._unique(np.concatenate(frames)), newest.T_odom_body, self.calibration)
 
     def _unique(self, points: Points, voxel: float | None = None) -> Points:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]

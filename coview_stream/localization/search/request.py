@@ -10,6 +10,7 @@ import numpy as np
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rotation_angle
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
 _SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift
@@ -65,7 +66,7 @@ class SearchRequest:
         guesses: (4, 4) each, ``T_map_odom`` of a place that somebody named, heights open: tried likewise.
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
-        R_body_cloud: (3, 3) rotation that ``cloud`` has been levelled by.
+        calibration: has levelled ``cloud``.
         area: of the map, metres from its zero, that is searched alone; None for all of it.
     """
 
@@ -79,7 +80,7 @@ class SearchRequest:
     hints: tuple[Pose, ...] = ()
     guesses: tuple[Pose, ...] = ()
     surroundings: Points = field(default_factory=_no_points)
-    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
+    calibration: Calibration = field(default_factory=Calibration)
     area: Circle | None = None
 
     @property
@@ -118,7 +119,7 @@ class SearchRequest:
             hints=hints,
             guesses=guesses,
             surroundings=surroundings,
-            R_body_cloud=buffer.R_body_cloud,
+            calibration=buffer.calibration,
             area=area,
         )
 

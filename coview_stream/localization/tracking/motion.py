@@ -265,16 +265,16 @@ class ScanBuffer:
     @property
     def newest(self) -> Points | None:
         """(N, 3) points of the newest frame, odometry frame."""
-        return self._frames[-1][1].levelled(self._calibration.calibration.R_body_cloud) if self._frames else None
+        return self._frames[-1][1].levelled(self._calibration.calibration) if self._frames else None
 
     def window(self) -> Points:
         """Points (N, 3) of the newest frames, as many as :class:`coview_stream.config.TrackingConfig` allows."""
         parts: list[Points] = []
-        count, R_body_cloud = 0, self._calibration.calibration.R_body_cloud
+        count = 0
         for travelled, scan in reversed(self._frames):
             old = self._frames[-1][0] - travelled > self._config.window
             if count >= self._config.max_points or (old and count >= self._config.min_points):
                 break
-            parts.append(scan.levelled(R_body_cloud))
+            parts.append(scan.levelled(self._calibration.calibration))
             count += len(parts[-1])
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)

@@ -103,10 +103,8 @@ class TrackEngine:
             localizer.guess_place(job.guess, check=False)  # the node has said that it is taken
         points = job.points
         if job.times is not None and job.segment is not None:
-            known = localizer.calibration
-            points = deskew(
-                points, job.times, job.segment, job.stamp_ns, job.T_odom_body, known.R_body_cloud, known.scale
-            )
+            sweep = localizer.calibration.sweep
+            points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body, sweep)
         request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer)
         return FrameResult(localizer.fix(), request, time.perf_counter() - begin, localizer.take_events())
 

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from small_world import ODOM_FAR
 
 from coview_stream.config import KeyframeConfig
-from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z, transform
-from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.keyframes import _PATIENCE, KeyframeBuffer, OdometryCheck
 
@@ -121,15 +121,15 @@ def test_clear_drops_all_keyframes():
 
 def test_keyframes_are_levelled_by_the_newest_calibration():
     """Whatever was known when a frame was taken: read again, all lie as if it had been known from the beginning."""
-    known = [exp_so3(np.radians([0.0, pitch, 0.0])) for pitch in (0.0, 0.7, 2.6)]
+    known = [Calibration(pitch=np.radians(pitch)) for pitch in (0.0, 0.7, 2.6)]
     leaning, straight = (KeyframeBuffer(KeyframeConfig(distance=1.0)) for _ in range(2))
     began_anew = []
-    for k, R in enumerate(known):
+    for k, present in enumerate(known):
         T, ahead, points = at(1.5 * k, 0.3 * k), at(1.5 * k + 0.4, 0.3 * k), cloud(k, 300)
-        for buffer, level in ((leaning, R), (straight, known[-1])):
-            scans = [RawScan(transform(T, (points @ level.T).astype(np.float32)), T, level) for T in (T, ahead)]
-            began_anew.append(buffer.add(scans[0], float(k), level).begins_anew)
-            assert buffer.add(scans[1], k + 0.5, level) is None
+        for buffer, level in ((leaning, present), (straight, known[-1])):
+            scans = [RawScan(transform(pose, level.level(points)), pose, level) for pose in (T, ahead)]
+            began_anew.append(buffer.add(scans[0], float(k)).begins_anew)
+            assert buffer.add(scans[1], k + 0.5) is None
     assert began_anew == [False] * 4 + [True, False]
     apart = cKDTree(straight.recent(3)).query(leaning.recent(3))[0]
     assert np.median(apart) < 0.01
@@ -144,7 +144,7 @@ def test_standing_robot_begins_its_search_anew_once_at_most():
     anew = [
         keyframe.begins_anew
         for k in range(20)
-        if (keyframe := buffer.add(RawScan(cloud(0), at(0.0)), float(k), exp_so3(np.array([0.1 * (k % 2), 0.0, 0.0]))))
+        if (keyframe := buffer.add(RawScan(cloud(0), at(0.0), Calibration(roll=0.1 * (k % 2))), float(k)))
     ]
     assert anew == [False, True]
 
