@@ -25,7 +25,7 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     namespace at once, all others after a day, because their processes cannot be seen from here.
 
     Args:
-        path: the file's name; an existing file stays whole until the new one is complete.
+        path: an existing file stays whole until the new one is complete.
         temporary: name to write under, in the same directory; default: unique to this process.
 
     Raises:

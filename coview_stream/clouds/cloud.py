@@ -75,8 +75,7 @@ class CloudBuilder:
     def add(self, raw: Reals, classification: npt.NDArray[np.uint8] | None = None, dropped: int = 0) -> None:
         """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows that the reader left out."""
         with np.errstate(invalid="ignore"):
-            # false for NaN as well
-            usable = (np.abs(raw) < MAX_COORDINATE).all(axis=1)
+            usable = (np.abs(raw) < MAX_COORDINATE).all(axis=1)  # false for NaN as well
         self.dropped += dropped + int(len(raw) - usable.sum())
         if not usable.all():
             raw = raw[usable]
@@ -146,17 +145,16 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     if len(clouds) == 1:
         return clouds[0]
     origin = clouds[0].origin
-    shifted = [_rebased(cloud, origin) for cloud in clouds]
+    shifts = [cloud.origin - origin for cloud in clouds]
+    points = [
+        (cloud.points + shift).astype(np.float32) if shift.any() else cloud.points
+        for cloud, shift in zip(clouds, shifts, strict=True)
+    ]
     classes = [cloud.classification for cloud in clouds if cloud.classification is not None]
     return Cloud(
-        np.concatenate(shifted),
+        np.concatenate(points),
         origin,
         max(systems, key=lambda text: "+" in text or "VERT" in text, default=None),  # prefer one that states heights
         np.concatenate(classes) if len(classes) == len(clouds) else None,
         sum(cloud.dropped for cloud in clouds),
     )
-
-
-def _rebased(cloud: Cloud, origin: Floats) -> Points:
-    shift = cloud.origin - origin
-    return (cloud.points + shift).astype(np.float32) if shift.any() else cloud.points

@@ -45,7 +45,8 @@ class DecodingChild:
             CloudError: the file is damaged, or asked for more memory than a file of its size can need.
         """
         with self._lock:
-            self._stop_timer()
+            if self._timer is not None:
+                self._timer.cancel()
             try:
                 answer = self._exchange(request, builder)
             except BaseException:
@@ -102,13 +103,9 @@ class DecodingChild:
         self._owner = os.getpid()
         return self._child
 
-    def _stop_timer(self) -> None:
+    def _end(self, kill: bool) -> None:
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
-
-    def _end(self, kill: bool) -> None:
-        self._stop_timer()
         child, self._child = self._child, None
         if child is None or self._owner != os.getpid():
             return
@@ -147,10 +144,10 @@ def copy_window(source: str, low: tuple[float, float], high: tuple[float, float]
     """Write the points of a COPC file's window to the LAS file ``target``, in the shared child.
 
     Returns:
-        ``points``, ``nodes``, ``received`` and ``requests``: fields of :class:`~coview_stream.clouds.fetch.Fetched`.
+        ``points``, ``received`` and ``requests``: fields of :class:`~coview_stream.clouds.fetch.Fetched`.
 
     Raises:
         CloudError: the file cannot be read, is no COPC file, or no point is in the window.
     """
     answer = _shared.ask({"path": source, "low": low, "high": high, "target": str(target)})
-    return {name: answer[name] for name in ("points", "nodes", "received", "requests")}
+    return {name: answer[name] for name in ("points", "received", "requests")}

@@ -42,14 +42,18 @@ def main() -> None:
     with contextlib.suppress(ImportError):  # E57 does without
         import laspy  # noqa: F401 - before the first limit
 
-    before = _address_space()
+    try:
+        before = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:  # not Linux
+        before = 1 << 31
     for line in sys.stdin.buffer:
         request = json.loads(line)
         answer: dict[str, Any] = {"end": True}
         try:
             if "target" in request:
                 _limit(before + _WINDOW_BYTES)
-                answer |= _copy_window(request)
+                low, high = np.array(request["low"]), np.array(request["high"])
+                answer |= _window(request["path"], low, high, request["target"])
             else:
                 path = Path(request["path"])
                 _limit(before + _BASE + _PER_BYTE * path.stat().st_size)
@@ -81,58 +85,44 @@ def _write_line(out: BinaryIO, answer: dict[str, Any]) -> None:
     out.write(json.dumps(answer).encode() + b"\n")
 
 
-def _copy_window(request: dict[str, Any]) -> dict[str, int]:
-    try:
-        return _window(request["path"], np.array(request["low"]), np.array(request["high"]), request["target"])
-    except CloudError:
-        raise
-    except MemoryError as error:
-        raise CloudError(f"{request['path']}: too much for the memory; make the window smaller") from error
-    except Exception as error:
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise CloudError(f"{request['path']}: not a COPC file, or damaged ({reason})") from error
-
-
 def _window(name: str, low: Any, high: Any, target: str) -> dict[str, int]:
     import laspy
     from laspy.copc import Bounds, CopcReader, load_octree_for_query
 
     web = RangeFile(name) if is_web_address(name) else None
-    with contextlib.closing(web or Path(name).open("rb")) as source:
-        reader = CopcReader(source)
-        header = reader.header
-        if (low > header.maxs[:2]).any() or (high < header.mins[:2]).any():
-            raise CloudError(f"{name}: covers {_box(header)}, the window is beside it")
-        bounds = Bounds(low, high)
-        whole = bounds.ensure_3d(header.mins, header.maxs)
-        nodes = load_octree_for_query(source, reader.copc_info, reader.root_page, query_bounds=whole)
-        count = sum(node.point_count for node in nodes)
-        if count > _WINDOW_POINTS:
-            raise CloudError(f"{name}: {count} points to read; make the window smaller")
-        points = reader.query(bounds)
+    try:
+        with contextlib.closing(web or Path(name).open("rb")) as source:
+            reader = CopcReader(source)
+            header = reader.header
+            covered = ",".join(f"{value:.0f}" for value in (*header.mins[:2], *header.maxs[:2]))
+            if (low > header.maxs[:2]).any() or (high < header.mins[:2]).any():
+                raise CloudError(f"{name}: covers {covered}, the window is beside it")
+            bounds = Bounds(low, high)
+            whole = bounds.ensure_3d(header.mins, header.maxs)
+            nodes = load_octree_for_query(source, reader.copc_info, reader.root_page, query_bounds=whole)
+            count = sum(node.point_count for node in nodes)
+            if count > _WINDOW_POINTS:
+                raise CloudError(f"{name}: {count} points to read; make the window smaller")
+            points = reader.query(bounds)
+    except CloudError:
+        raise
+    except MemoryError as error:
+        raise CloudError(f"{name}: too much for the memory; make the window smaller") from error
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise CloudError(f"{name}: not a COPC file, or damaged ({reason})") from error
     if not len(points):
-        raise CloudError(f"{name}: no point is in the window; it covers {_box(header)}")
+        raise CloudError(f"{name}: no point is in the window; it covers {covered}")
     made = laspy.LasHeader(version=header.version, point_format=header.point_format)
     made.scales, made.offsets = header.scales, header.offsets
     made.global_encoding.wkt = header.global_encoding.wkt
     made.vlrs.extend(vlr for vlr in header.vlrs if vlr.user_id == "LASF_Projection")
-    with laspy.open(target, "w", header=made) as writer:
-        writer.write_points(points)
-    return {
-        "points": len(points), "nodes": len(nodes),
-        "received": web.received if web else 0, "requests": web.requests if web else 0,
-    }  # fmt: skip
-
-
-def _box(header: Any) -> str:
-    return ",".join(f"{value:.0f}" for value in (*header.mins[:2], *header.maxs[:2]))
-
-
-def _address_space() -> int:
     try:
-        return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:  # not Linux
-        return 1 << 31
+        with Path(target).open("wb") as stream, las.las_writer(stream, made, Path(target)) as writer:
+            writer.write_points(points)
+    except OSError as error:
+        raise CloudError(f"{target}: cannot be written ({error.strerror or error}); make room there") from error
+    return {"points": len(points), "received": web.received if web else 0, "requests": web.requests if web else 0}
 
 
 def _limit(size: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,8 @@ def decode(path: Path, builder: CloudBuilder) -> None:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     try:
         file = pye57.E57(str(path))
-        builder.crs = _reference_system(file)
+        with contextlib.suppress(Exception):  # absent, or no text
+            builder.crs = str(file.root["coordinateMetadata"].value()).strip() or None
         for index in range(file.scan_count):
             for points, dropped in _scan(file, index):
                 if len(points):
@@ -50,13 +52,6 @@ def decode(path: Path, builder: CloudBuilder) -> None:
     flaw = flaw_of_system(builder.crs, {}, low, high) if np.isfinite([low, high]).all() else None
     if flaw is not None:
         raise CloudError(f"{path}: {flaw}")
-
-
-def _reference_system(file: Any) -> str | None:
-    try:
-        return str(file.root["coordinateMetadata"].value()).strip() or None
-    except Exception:  # absent, or no text
-        return None
 
 
 def _scan(file: Any, index: int) -> Iterator[tuple[Floats, int]]:
@@ -78,12 +73,8 @@ def _scan(file: Any, index: int) -> Iterator[tuple[Floats, int]]:
         valid = np.asarray(values[invalid][:count]) == 0 if invalid in fields else np.ones(count, dtype=bool)
         points = np.stack(columns, axis=1)[valid]
         if names == _SPHERICAL:
-            points = _cartesian(points)
+            distance, azimuth, elevation = points.T  # metres and radians
+            flat = distance * np.cos(elevation)
+            columns = [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)]
+            points = np.stack(columns, axis=1)
         yield points @ rotation.T + translation, int(count - valid.sum())
-
-
-def _cartesian(spherical: Floats) -> Floats:
-    """Return (N, 3) x, y, z of (N, 3) ranges (metres), azimuths and elevations (radians)."""
-    distance, azimuth, elevation = spherical.T
-    flat = distance * np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)

@@ -70,13 +70,11 @@ class Fetched:
 
     Attributes:
         points: in the window.
-        nodes: chunks that were read.
         received: bytes from a web server; 0 of a local file.
         requests: to the web server.
     """
 
     points: int
-    nodes: int
     received: int = 0
     requests: int = 0
 
@@ -116,7 +114,7 @@ def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | N
         raise CloudError(f"{source}: names no file")
     if window is None:
         target = _free(folder / name)
-        return target, Fetched(0, 0, download(str(source), target), 1)
+        return target, Fetched(0, download(str(source), target), 1)
     require_laspy()
     if not is_web_address(source) and not is_copc(Path(source)):
         raise CloudError(f"{source}: not a COPC file; --window reads parts of COPC files (.copc.laz) only")

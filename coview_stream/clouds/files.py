@@ -52,6 +52,7 @@ _MAGIC = (
 )
 
 _LAS_SCALE = 0.001  # metres
+_FORMAT_BYTE = 104  # of a LAS header
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
@@ -74,7 +75,10 @@ def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
         if path.is_dir():
             files = sorted(filter(is_cloud_name, path.iterdir()), key=natural_key)
             if not files:
-                raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {_instead(path)}")
+                folders = (folder for folder in sorted(path.iterdir()) if folder.is_dir())
+                within = next((folder for folder in folders if any(map(is_cloud_name, folder.iterdir()))), None)
+                remedy = "name another folder, or the files" if within is None else f"did you mean {within}?"
+                raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {remedy}")
             out += files
         elif not path.exists() and glob.has_magic(str(path)):  # the shell has not expanded it
             names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern
@@ -91,13 +95,6 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Return a sorting key that puts ``tile2`` before ``tile10``."""
     parts = re.split(r"(\d+)", str(path))
     return tuple((1, int(part), "") if k % 2 else (0, 0, part) for k, part in enumerate(parts))
-
-
-def _instead(folder: Path) -> str:
-    within = next(
-        (sub for sub in sorted(folder.iterdir()) if sub.is_dir() and any(map(is_cloud_name, sub.iterdir()))), None
-    )
-    return "name another folder, or the files" if within is None else f"did you mean {within}?"
 
 
 def check_format(path: Path) -> str:
@@ -133,12 +130,12 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
             holds no usable point. The message names the file and the remedy.
     """
     path = Path(path)
-    reader = _WHOLE_READERS.get(check_format(path))
     try:
-        if reader is not None:
-            return reader(path)
+        kind = check_format(path)
+        if kind in _WHOLE_READERS:
+            return _WHOLE_READERS[kind](path)
         builder = CloudBuilder()
-        stream_cloud(path, builder)
+        _decode(path, kind, builder)
         return builder.finish(os.fspath(path))
     except OSError as error:
         raise CloudError(f"{path}: cannot be read ({error.strerror or error}); check the disk") from error
@@ -159,14 +156,18 @@ def stream_cloud(path: Path, builder: CloudBuilder) -> str | None:
         cloud = read_cloud(path)
         builder.add(cloud.map_points(), cloud.classification, cloud.dropped)
         return cloud.crs
+    _decode(path, kind, builder)
+    return builder.crs
+
+
+def _decode(path: Path, kind: str, builder: CloudBuilder) -> None:
     # a missing library is reported here, not from the child
     require = las.require_laspy if kind == "LAS" else require_pye57
     require()
-    if kind == "E57" or las.is_compressed(path):
+    if kind == "E57" or _head(path)[_FORMAT_BYTE : _FORMAT_BYTE + 1] >= b"\x80":  # the bit of compressed points
         decode_in_child(path, builder)
     else:
         las.decode(path, builder)
-    return builder.crs
 
 
 def _head(path: Path) -> bytes:
@@ -246,10 +247,6 @@ def _write_ply(stream: BinaryIO, rows: Reals, _: Path) -> None:
     stream.write(header.encode("ascii") + rows.tobytes())
 
 
-def _write_npy(stream: BinaryIO, rows: Reals, _: Path) -> None:
-    np.save(stream, rows, allow_pickle=False)
-
-
 def _write_bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
     if rows.dtype.itemsize == 8:
         raise CloudError(f"{path}: float32 rows cannot hold coordinates beyond 10 km; write PCD, PLY or LAZ")
@@ -265,19 +262,16 @@ def _write_las(stream: BinaryIO, rows: Reals, path: Path) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, _LAS_SCALE)
     header.offsets = np.floor(rows.min(axis=0)).astype(np.float64) if len(rows) else np.zeros(3)
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = rows.astype(np.float64).T
-    data.write(stream, do_compress=path.suffix.lower() == ".laz")
+    record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+    record.x, record.y, record.z = rows.astype(np.float64).T
+    with las.las_writer(stream, header, path) as writer:
+        writer.write_points(record)
 
 
 _WRITERS: dict[str, Callable[[BinaryIO, Reals, Path], None]] = {
-    ".pcd": _write_pcd,
-    ".ply": _write_ply,
-    ".npy": _write_npy,
-    ".bin": _write_bin,
-    ".las": _write_las,
-    ".laz": _write_las,
-}
+    ".pcd": _write_pcd, ".ply": _write_ply, ".npy": lambda stream, rows, _: np.save(stream, rows, allow_pickle=False),
+    ".bin": _write_bin, ".las": _write_las, ".laz": _write_las,
+}  # fmt: skip
 
 WRITABLE_SUFFIXES = frozenset(_WRITERS)
 """Suffixes that ``write_cloud`` accepts."""

@@ -7,6 +7,7 @@ makes the LAZ decoder allocate more memory than there is.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import struct
 from collections.abc import Iterator
@@ -28,7 +29,7 @@ NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""
 
 _MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
-_FORMAT_BYTE, _COMPRESSED = 104, 0x80  # of the header; its bit of compressed points
+_WKT_RECORD = "LASF_Projection", 2112
 _POINTWISE = 1  # LASzip's number of the compressor without chunks
 _VARIABLE = 0xFFFFFFFF  # points per chunk, if the chunk table states them
 _POINTS_PER_BYTE = 4  # surveys take 2 to 6 bytes a point, a plane without noise half a byte
@@ -37,14 +38,25 @@ _POINTS_PER_BYTE = 4  # surveys take 2 to 6 bytes a point, a plane without noise
 def require_laspy() -> Any:
     """Return laspy; DependencyError if it or its decoder is not installed."""
     require_library("lazrs", "lazrs>=0.6", "LAS and LAZ files")
-    return require_library("laspy", "laspy[lazrs]>=2.5", "LAS and LAZ files")
+    laspy = require_library("laspy", "laspy[lazrs]>=2.5", "LAS and LAZ files")
+    logging.getLogger("laspy").setLevel(logging.ERROR)  # it warns of records that this module judges itself
+    return laspy
 
 
-def is_compressed(path: Path) -> bool:
-    """Return whether the points are compressed (LAZ), whatever the suffix."""
-    with path.open("rb") as stream:
-        stream.seek(_FORMAT_BYTE)
-        return bool(int.from_bytes(stream.read(1), "little") & _COMPRESSED)
+@contextlib.contextmanager
+def las_writer(stream: BinaryIO, header: Any, path: Path) -> Iterator[Any]:
+    """Open laspy's writer of LAS, or of LAZ by the suffix of ``path``, on a stream that stays open.
+
+    Raises:
+        OSError: the stream cannot be written, also where the LAZ encoder has an exception of its own for that.
+    """
+    laspy, lazrs = require_laspy(), require_library("lazrs", "lazrs>=0.6", "LAS and LAZ files")
+    compress = path.suffix.lower() == ".laz"
+    try:
+        with laspy.open(stream, mode="w", header=header, do_compress=compress, closefd=False) as writer:
+            yield writer
+    except lazrs.LazrsError as error:
+        raise OSError(" ".join(str(error).split())[:160]) from error
 
 
 def read_header(path: Path) -> Any:
@@ -74,11 +86,16 @@ def system_of(path: Path, header: Any) -> str | None:
         CloudError: no map can be made in that system (feet, degrees, lengths that differ from those on the ground).
     """
     records = [*header.vlrs, *(header.evlrs or ())]
-    texts = (record.string for record in records if type(record).__name__ == "WktCoordinateSystemVlr")
-    wkt = next((text.strip("\0 \r\n\t") for text in texts), "")
+    wkt = ""
     keys: dict[int, int] = {}
     for record in records:
-        if type(record).__name__ == "GeoKeyDirectoryVlr":
+        kind = type(record).__name__
+        if kind == "WktCoordinateSystemVlr":
+            wkt = wkt or record.string.strip("\0 \r\n\t")
+        elif (record.user_id, record.record_id) == _WKT_RECORD:  # laspy could not decode it
+            wkt = wkt or record.record_data.decode("utf-8", "replace").strip("\0 \r\n\t")
+            warn(f"{path}: its reference system is not UTF-8, unreadable letters are replaced; export the file again")
+        elif kind == "GeoKeyDirectoryVlr":
             for key in record.geo_keys:
                 if key.tiff_tag_location == 0:  # the value itself; others point into records of doubles or text
                     keys.setdefault(key.id, key.value_offset)
@@ -159,7 +176,7 @@ def _check_sizes(stream: BinaryIO, size: int) -> None:
 
 
 def _check_points(path: Path, header: Any, stream: BinaryIO, size: int) -> None:
-    """Check the sizes that the point decoder believes; the stream stays at the first point."""
+    """Check the sizes that the point decoder believes: points, chunks, and the chunk table of LAZ."""
     start, points = header.offset_to_point_data, header.point_count
     if not header.are_points_compressed:
         stored = max(0, size - start) // header.point_format.size
@@ -173,12 +190,7 @@ def _check_points(path: Path, header: Any, stream: BinaryIO, size: int) -> None:
         raise CloudError(f"{path}: LAZ of LASzip 1.0, without chunks, is not read; write it again with a newer LASzip")
     if max(points, CHUNK) < per_chunk < _VARIABLE:  # the decoder allocates a chunk at once
         raise ValueError(f"{per_chunk} points per chunk")
-    _check_chunk_table(stream, start, size)
-    stream.seek(start)
-
-
-def _check_chunk_table(stream: BinaryIO, start: int, size: int) -> None:
-    """Check the chunk table: its offset precedes the points, or is in the last 8 bytes of a streamed file."""
+    # the table's offset precedes the points, or is in the last 8 bytes of a streamed file
     stream.seek(start)
     table = int.from_bytes(stream.read(8), "little", signed=True)
     if table == -1 and size >= 8:
@@ -190,3 +202,4 @@ def _check_chunk_table(stream: BinaryIO, start: int, size: int) -> None:
     # a chunk holds at least one point, whose first record is stored as it is
     if int.from_bytes(stream.read(4), "little") * 20 > size:
         raise ValueError("more chunks than fit")
+    stream.seek(start)

@@ -49,14 +49,9 @@ def read_pcd(path: Path) -> Cloud:
     """
     content = path.read_bytes()
     header = _parse_header(content, path)
-    if header.encoding == "ascii":
-        raw = _ascii(content, header, path)
-    elif header.encoding == "binary":
-        raw = _binary(content, header, path)
-    else:
-        raw = _compressed(content, header, path)
+    read = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
     builder = CloudBuilder()
-    builder.add(raw)
+    builder.add(read(content, header, path))
     return builder.finish(os.fspath(path))
 
 
@@ -94,7 +89,10 @@ def _header_from(entries: dict[str, list[str]], data_start: int) -> _Header:
             raise ValueError(f"no field {axis} of count 1 among {' '.join(fields)}")
     if sum(size * count for size, count in zip(sizes, counts, strict=True)) > _MAX_ROW:
         raise ValueError(f"COUNT and SIZE make points of more than {_MAX_ROW} bytes")
-    points = int(entries["POINTS"][0]) if "POINTS" in entries else _width_times_height(entries)
+    if "POINTS" in entries:
+        points = int(entries["POINTS"][0])
+    else:
+        points = int(entries["WIDTH"][0]) * int(entries.get("HEIGHT", ["1"])[0])
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"unknown encoding {encoding!r}")
@@ -102,10 +100,6 @@ def _header_from(entries: dict[str, list[str]], data_start: int) -> _Header:
         raise ValueError("POINTS is negative")
     types = tuple(np.dtype(f"<{_KINDS[kind]}{size}") for kind, size in zip(kinds, sizes, strict=True))
     return _Header(fields, types, tuple(counts), points, encoding, data_start)
-
-
-def _width_times_height(entries: dict[str, list[str]]) -> int:
-    return int(entries["WIDTH"][0]) * int(entries.get("HEIGHT", ["1"])[0])
 
 
 def _truncated(path: Path, header: _Header, stored: int) -> CloudError:

@@ -1,4 +1,4 @@
-"""PLY files: ascii and binary in either byte order, with the vertices anywhere among the elements."""
+"""PLY files: ascii and binary in either byte order; before the vertices of a binary file no element has lists."""
 
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _AXES = ("x", "y", "z")
 _MAX_HEADER = 64 * 1024  # bytes
-_MAX_LISTS = 8  # in one element; files have one or two, and each costs a pass over its bytes
-_WINDOW = 1 << 18  # bytes examined together: 20 MB of temporaries
 
 
 @dataclass
@@ -32,20 +30,8 @@ class _Element:
 
     name: str
     count: int
-    # (name, type) of a scalar; (name, type of the length, type of the items) of a list
-    properties: list[tuple[str, ...]] = field(default_factory=list)
-
-    @property
-    def has_list(self) -> bool:
-        return any(len(prop) == 3 for prop in self.properties)
-
-    @property
-    def least_bytes(self) -> int:
-        """Bytes of a binary row with empty lists."""
-        return sum(np.dtype(prop[1]).itemsize for prop in self.properties)
-
-    def row(self, order: str) -> np.dtype[np.void]:
-        return np.dtype([(prop[0], order + prop[1]) for prop in self.properties])
+    properties: list[tuple[str, str]] = field(default_factory=list)  # name and type of the scalars
+    has_list: bool = False
 
 
 def read_ply(path: Path) -> Cloud:
@@ -59,7 +45,7 @@ def read_ply(path: Path) -> Cloud:
     vertex = next((element for element in elements if element.name == "vertex"), None)
     if vertex is None:
         raise CloudError(f"{path}: PLY without a vertex element; export the file as a point cloud")
-    names = [prop[0] for prop in vertex.properties]
+    names = [name for name, _ in vertex.properties]
     missing = [axis for axis in _AXES if axis not in names]
     if missing or vertex.has_list or len(set(names)) < len(names):
         fault = f"have no {', '.join(missing)}" if missing else "hold lists or a property twice"
@@ -89,9 +75,11 @@ def _parse_header(content: bytes, path: Path) -> tuple[str, list[_Element], int]
                 case ["format", name, _]:
                     order = _ORDERS[name]
                 case ["element", name, count]:
-                    elements.append(_Element(name, _natural(count)))
-                case ["property", "list", length, item, name]:
-                    _add_list(elements[-1], name, _TYPES[length], _TYPES[item])
+                    elements.append(_Element(name, int(count)))
+                    if elements[-1].count < 0:
+                        raise ValueError(count)
+                case ["property", "list", *_]:
+                    elements[-1].has_list = True
                 case ["property", kind, name]:
                     elements[-1].properties.append((name.lower(), _TYPES[kind]))
                 case [] | ["ply"] | ["comment" | "obj_info", *_]:
@@ -106,21 +94,6 @@ def _parse_header(content: bytes, path: Path) -> tuple[str, list[_Element], int]
     return order, elements, start
 
 
-def _add_list(element: _Element, name: str, length: str, item: str) -> None:
-    if length.startswith("f"):
-        raise ValueError("the length of a list is an integer")
-    element.properties.append((name, length, item))
-    if sum(len(prop) == 3 for prop in element.properties) > _MAX_LISTS:
-        raise ValueError(f"more than {_MAX_LISTS} lists")
-
-
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise ValueError(text)
-    return value
-
-
 def _truncated(path: Path, vertex: _Element, stored: int) -> CloudError:
     return CloudError(
         f"{path}: truncated PLY, the header promises {vertex.count} vertices, the file has {max(0, stored)}; "
@@ -133,7 +106,7 @@ def _ascii(content: bytes, start: int, _: str, before: list[_Element], vertex: _
     for _row in range(sum(element.count for element in before)):
         if not stream.readline():
             raise _truncated(path, vertex, 0)
-    names = [prop[0] for prop in vertex.properties]
+    names = [name for name, _ in vertex.properties]
     lines: list[bytes] = []
     for line in stream:
         if len(lines) == vertex.count:
@@ -156,99 +129,13 @@ def _ascii(content: bytes, start: int, _: str, before: list[_Element], vertex: _
 
 def _binary(content: bytes, start: int, order: str, before: list[_Element], vertex: _Element, path: Path) -> Reals:
     for element in before:
-        start = _skip(content, start, order, element, path)
-    row = vertex.row(order)
+        if element.has_list:
+            raise CloudError(f"{path}: PLY with lists before its vertices ({element.name}); export it as a point cloud")
+        start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
+    row = np.dtype([(name, order + kind) for name, kind in vertex.properties])
     stored = (len(content) - start) // row.itemsize
     if stored < vertex.count:
         raise _truncated(path, vertex, stored)
     rows = np.frombuffer(content, row, vertex.count, start)
     double = any(rows.dtype[axis].itemsize != 4 or rows.dtype[axis].kind != "f" for axis in _AXES)
     return np.stack([rows[axis].astype(np.float64 if double else np.float32) for axis in _AXES], axis=1)
-
-
-def _skip(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
-    """Return the offset behind an element's rows, in time linear in the file's size whatever the header claims.
-
-    Raises:
-        CloudError: a list of negative length, or fewer bytes than the rows need.
-    """
-    end = start + element.count * element.least_bytes
-    if end > len(content):
-        raise CloudError(
-            f"{path}: truncated PLY, {element.count} rows of {element.name} do not fit into it; copy or export it again"
-        )
-    if not element.has_list or not element.count:
-        return end
-    stride = _after_row(content, start, order, element, path) - start
-    if _all_like_the_first(content, start, stride, order, element):
-        return start + element.count * stride
-    return _walk(content, start, order, element, path)
-
-
-def _after_row(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
-    for prop in element.properties:
-        kind = np.dtype(order + prop[1])
-        if len(prop) == 3:
-            if start + kind.itemsize > len(content):
-                raise _bad_list(path, element)
-            length = int(np.frombuffer(content, kind, 1, start)[0])
-            if length < 0:
-                raise _bad_list(path, element)
-            start += length * np.dtype(prop[2]).itemsize
-        start += kind.itemsize
-    if start > len(content):
-        raise _bad_list(path, element)
-    return start
-
-
-def _all_like_the_first(content: bytes, start: int, stride: int, order: str, element: _Element) -> bool:
-    """Return whether all rows have lists of the same lengths as the first."""
-    if start + element.count * stride > len(content):
-        return False
-    for prop in element.properties:
-        kind = np.dtype(order + prop[1])
-        if len(prop) == 3:
-            lengths = np.ndarray(element.count, kind, content, start, stride)
-            if not (lengths == lengths[0]).all():
-                return False
-            start += int(lengths[0]) * np.dtype(prop[2]).itemsize
-        start += kind.itemsize
-    return True
-
-
-def _walk(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
-    """Follow rows of different lengths; row ends are computed for every byte of a window at once."""
-    left, size = element.count, len(content)
-    octets = np.frombuffer(content, np.uint8)
-    while left:
-        window = np.arange(start, min(start + _WINDOW, size))
-        if not len(window):
-            raise _bad_list(path, element)
-        position = window.copy()
-        wrong = np.zeros(len(window), bool)
-        for prop in element.properties:
-            kind = np.dtype(order + prop[1])
-            if len(prop) == 3:
-                wrong |= position > size - kind.itemsize
-                position[wrong] = 0
-                raw = octets[position[:, None] + np.arange(kind.itemsize)]
-                lengths = raw.view(kind)[:, 0].astype(np.int64)
-                wrong |= lengths < 0
-                position += lengths * np.dtype(prop[2]).itemsize
-            position += kind.itemsize
-        position[wrong | (position > size)] = -1
-        following, at, begin = position.tolist(), 0, start
-        while left and 0 <= at < len(following):
-            at = following[at] - begin
-            left -= 1
-        start = begin + at
-        if start < 0:
-            raise _bad_list(path, element)
-    return start
-
-
-def _bad_list(path: Path, element: _Element) -> CloudError:
-    return CloudError(
-        f"{path}: damaged PLY, a list of {element.name} has a negative length or reaches beyond the file; "
-        "copy or export it again"
-    )

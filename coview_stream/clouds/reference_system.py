@@ -10,7 +10,6 @@ import importlib.util
 import math
 import re
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,8 +35,8 @@ def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
     horizontal = next((keys[key] for key in (_PROJECTED, _GEOGRAPHIC) if keys.get(key, 0) in _CODES), None)
     if horizontal is None:
         return None
-    vertical = keys.get(_VERTICAL, 0)
-    return f"EPSG:{horizontal}+{vertical}" if vertical in _CODES and _knows(vertical) else f"EPSG:{horizontal}"
+    name, vertical = f"EPSG:{horizontal}", keys.get(_VERTICAL, 0)
+    return f"{name}+{vertical}" if vertical in _CODES and _parse(f"EPSG:{vertical}") else name
 
 
 def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high: Floats) -> str | None:
@@ -49,8 +48,17 @@ def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high:
         low: (3,) lower corner of the coordinates.
         high: (3,) upper corner.
     """
-    flaw = _stated_unit(keys) or _unit_in_text(text or "", low, high)
-    system = _parse(text)
+    flaw, system, text = None, _parse(text), text or ""
+    geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
+    units = {key: _UNITS.get(keys.get(key, _METRE)) for key in (_LINEAR_UNIT, _VERTICAL_UNIT)}
+    if units[_LINEAR_UNIT]:
+        flaw = f"coordinates are in {units[_LINEAR_UNIT]}"
+    elif units[_VERTICAL_UNIT]:
+        flaw = f"heights are in {units[_VERTICAL_UNIT]}"
+    elif re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE):
+        flaw = "coordinates are in feet"
+    elif geographic and _like_degrees(low, high):
+        flaw = "coordinates are in degrees"
     if flaw is None and system is not None:
         flaw = _flaw(system, 0.5 * (low + high))
     if flaw is None:
@@ -82,8 +90,11 @@ def same_system(one: str | None, other: str | None) -> bool:
     first, second = _parse(one), _parse(other)
     if first is None or second is None:
         return False
-    parts = [_parts(system) for system in (first, second)]
-    return all(_equal(a, b) for a, b in zip(*parts, strict=False))
+    for a, b in zip(_parts(first), _parts(second), strict=False):
+        code = a.to_epsg()
+        if not a.equals(b, ignore_axis_order=True) and (code is None or code != b.to_epsg()):
+            return False
+    return True
 
 
 def short_name(text: str | None) -> str:
@@ -98,26 +109,10 @@ def short_name(text: str | None) -> str:
     return named.group(1) if named else " ".join(text.split())[:60]
 
 
-def _stated_unit(keys: Mapping[int, int]) -> str | None:
-    for key, subject in ((_LINEAR_UNIT, "coordinates are"), (_VERTICAL_UNIT, "heights are")):
-        unit = keys.get(key, _METRE)
-        if unit in _UNITS:
-            return f"{subject} in {_UNITS[unit]}"
-    return None
-
-
-def _unit_in_text(text: str, low: Floats, high: Floats) -> str | None:
-    if re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE):
-        return "coordinates are in feet"
-    geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
-    return "coordinates are in degrees" if geographic and _like_degrees(low, high) else None
-
-
 def _like_degrees(low: Floats, high: Floats) -> bool:
     return bool(np.abs([low[:2], high[:2]]).max() <= 360.0)
 
 
-@lru_cache(maxsize=64)
 def _parse(text: str | None) -> Any:
     """Return a pyproj.CRS; None without pyproj, or for an unknown text, since its points may be good."""
     if not text or importlib.util.find_spec("pyproj") is None:
@@ -130,19 +125,10 @@ def _parse(text: str | None) -> Any:
         return None
 
 
-def _knows(code: int) -> bool:
-    return _parse(f"EPSG:{code}") is not None
-
-
 def _parts(system: Any) -> list[Any]:
     """Return the horizontal part of a system and, if it has one, the vertical."""
     whole = system.source_crs if system.is_bound and system.source_crs is not None else system
     return [part.source_crs if part.is_bound else part for part in (whole.sub_crs_list or [whole])]
-
-
-def _equal(one: Any, other: Any) -> bool:
-    codes = one.to_epsg(), other.to_epsg()
-    return bool(one.equals(other, ignore_axis_order=True)) or (None not in codes and codes[0] == codes[1])
 
 
 def _flaw(system: Any, centre: Floats) -> str | None:

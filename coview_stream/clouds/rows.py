@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TextIO
@@ -13,7 +12,7 @@ import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
-from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Floats, Floats32
 
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzrgb")
 """Suffixes, lower case, of text that is read as points."""
@@ -62,7 +61,9 @@ def read_text(path: Path) -> Cloud:
 def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], list[str], int]:
     """Return the separator, the columns of x, y and z, the first line with a point, and its number."""
     columns: tuple[int, ...] = (0, 1, 2)
-    for number, line in enumerate(_short_lines(path, islice(stream, _MAX_HEAD)), start=1):
+    for number, line in enumerate(islice(stream, _MAX_HEAD), start=1):
+        if len(line) > _MAX_LINE:
+            raise CloudError(f"{path}:{number}: a line of {len(line)} characters is no point; write one point a line")
         text = line.strip()
         if not text or text.startswith(_COMMENTS):
             columns = _titled_columns(text.lstrip("#/;% ")) or columns
@@ -135,13 +136,6 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _short_lines(path: Path, lines: Iterator[str]) -> Iterator[str]:
-    for number, line in enumerate(lines, start=1):
-        if len(line) > _MAX_LINE:
-            raise CloudError(f"{path}:{number}: a line of {len(line)} characters is no point; write one point a line")
-        yield line
-
-
 def read_npy(path: Path) -> Cloud:
     """Read an (N, 3 or more) array of numbers whose first three columns are x, y and z in metres.
 
@@ -206,15 +200,12 @@ def likely_columns(values: Floats32, expected: int) -> int:
         return expected
     edges = np.unique(np.quantile(values[np.isfinite(values)], np.linspace(0.0, 1.0, _BINS + 1)[1:-1]))
     bins = np.searchsorted(edges, values, side="right")
-    information = {columns: _information(bins, columns, len(edges) + 1) for columns in _COLUMNS}
+    count, information = len(edges) + 1, {}
+    for columns in _COLUMNS:  # nats
+        at = np.arange(len(bins)) % columns * count + bins
+        share = np.bincount(at, minlength=columns * count).reshape(columns, count) / len(bins)
+        independent = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
+        filled = share > 0
+        information[columns] = float(np.sum(share[filled] * np.log(share[filled] / independent[filled])))
     best = min(columns for columns in _COLUMNS if information[columns] > _ALIKE * max(information.values()))
     return best if information[best] > _CLEARLY * information[expected] + _LEAST else expected
-
-
-def _information(bins: Ints, columns: int, count: int) -> float:
-    """Return the mutual information of a value's column and its bin, nats."""
-    cells = np.arange(len(bins)) % columns * count + bins
-    share = np.bincount(cells, minlength=columns * count).reshape(columns, count) / len(bins)
-    independent = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
-    filled = share > 0
-    return float(np.sum(share[filled] * np.log(share[filled] / independent[filled])))

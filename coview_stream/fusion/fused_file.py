@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.clouds.las import require_laspy
+from coview_stream.clouds.las import las_writer, require_laspy
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.errors import CloudError, DependencyError, require_library, warn
 from coview_stream.fusion.fuse import GONE, NEW, RECORD, SAME, Fused
@@ -97,9 +97,7 @@ def _las(stream: BinaryIO, fused: Fused, path: Path) -> None:
     if wkt is not None:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
         header.global_encoding.wkt = True
-    with laspy.open(
-        stream, mode="w", header=header, do_compress=path.suffix.lower() == ".laz", closefd=False
-    ) as writer:
+    with las_writer(stream, header, path) as writer:
         for rows in fused.chunks():
             record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
             record.x, record.y, record.z = rows["x"], rows["y"], rows["z"]

@@ -76,7 +76,8 @@ def test_the_process_that_decodes_laz_imports_nothing_from_the_current_directory
 
 
 def test_relative_entries_of_the_search_path_are_not_handed_on(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "path", ["", ".", "folder", *sys.path])
+    for entry in ("folder", ".", ""):
+        monkeypatch.syspath_prepend(entry)
     monkeypatch.chdir(tmp_path)
     for name in ("numpy.py", "this.py"):
         (tmp_path / name).write_text("raise SystemExit('imported from the current directory')")

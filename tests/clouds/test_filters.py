@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,45 +94,39 @@ def test_filters_refuse_bad_parameters() -> None:
         estimate_normals(points, radius=0.0)
 
 
-@pytest.fixture(autouse=True)
-def _fresh_cache() -> Iterator[None]:
+@pytest.fixture
+def broken_open3d(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """Return the file of an ``open3d`` that is imported instead of the real one."""
+    for name in [name for name in sys.modules if name == "open3d" or name.startswith("open3d.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(tmp_path)
     filters.open3d.cache_clear()
-    yield
+    yield tmp_path / "open3d.py"
     filters.open3d.cache_clear()
+    sys.modules.pop("open3d", None)
 
 
 @pytest.mark.parametrize(
     ("error", "remedy"),
     [
-        (ImportError("libusb-1.0.so.0: cannot open shared object file"), "libusb-1.0-0.*libusb-package"),
-        (ImportError("libGL.so.1: cannot open shared object file"), "apt-get install libgl1"),
-        (ImportError("libgomp.so.1: cannot open shared object file"), "apt-get install libgomp1"),
-        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install 'coview-stream\\[build\\]'"),
-        (ImportError("undefined symbol: xyz"), "undefined symbol: xyz.*reinstall"),
+        ("ImportError('libusb-1.0.so.0: cannot open shared object file')", "libusb-1.0-0.*libusb-package"),
+        ("OSError('libGL.so.1: cannot open shared object file')", "apt-get install libgl1"),
+        ("ImportError('libgomp.so.1: cannot open shared object file')", "apt-get install libgomp1"),
+        ("ModuleNotFoundError('none', name='open3d')", "pip install 'coview-stream\\[build\\]'"),
+        ("ImportError('undefined symbol: xyz')", "undefined symbol: xyz.*reinstall"),
     ],
 )
-def test_missing_open3d_library_is_named_with_remedy(
-    monkeypatch: pytest.MonkeyPatch, error: ImportError, remedy: str
-) -> None:
-    def fail() -> None:
-        raise error
-
-    monkeypatch.setattr(filters, "_import_open3d", fail)
+def test_missing_open3d_library_is_named_with_remedy(broken_open3d: Path, error: str, remedy: str) -> None:
+    broken_open3d.write_text(f"raise {error}")
     with pytest.raises(DependencyError, match=remedy):
         filters.open3d()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libusb is preloaded on Linux only")
-def test_libusb_is_preloaded_and_open3d_import_retried(monkeypatch: pytest.MonkeyPatch) -> None:
-    attempts = []
-    real = filters._import_open3d
-
-    def first_without_libusb() -> object:
-        attempts.append(1)
-        if len(attempts) == 1:
-            raise ImportError("libusb-1.0.so.0: cannot open shared object file")
-        return real()
-
-    monkeypatch.setattr(filters, "_import_open3d", first_without_libusb)
-    assert filters.open3d().__name__ == "open3d"
-    assert len(attempts) == 2
+def test_libusb_is_preloaded_and_open3d_import_retried(broken_open3d: Path) -> None:
+    broken_open3d.write_text(
+        "from pathlib import Path\nfrom unittest import mock\nutility = mock.Mock()\n"
+        "if not Path(__file__).with_name('tried').exists():\n    Path(__file__).with_name('tried').touch()\n"
+        "    raise ImportError('libusb-1.0.so.0: cannot open shared object file')\n"
+    )
+    assert filters.open3d().__file__ == str(broken_open3d)

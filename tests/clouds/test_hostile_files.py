@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from coview_stream.clouds import read_cloud, write_cloud
-from coview_stream.clouds.pcd import lzf_decompress
 from coview_stream.errors import CloudError
 
 POINTS = np.random.default_rng(2).normal(0, 20, (60, 3)).astype(np.float32)
@@ -58,26 +56,16 @@ def ply_with(path: Path, before: str, body: bytes, axes: str = AXES) -> None:
     path.write_bytes(PLY.format(before=before, axes=axes).encode() + body + ROWS)
 
 
-@pytest.mark.parametrize(
-    ("kind", "value"),
-    [("int", -1), ("char", -3), ("short", -1), ("float", -1.0), ("float", np.nan), ("double", np.inf), ("float", 2.0)],
-)
-@pytest.mark.parametrize("count", [1, 10**12])
-def test_ply_list_whose_length_is_no_natural_number_is_refused(
-    tmp_path: Path, kind: str, value: float, count: int
-) -> None:
-    code = {"int": "i", "char": "b", "short": "h", "float": "f", "double": "d"}[kind]
-    body = struct.pack(f"<{code}", value) + bytes(40)
-    ply_with(tmp_path / "a.ply", f"element face {count}\nproperty list {kind} int indices\n", body)
-    with pytest.raises(CloudError, match=r"a\.ply"):
+def test_ply_element_of_a_trillion_rows_is_refused(tmp_path: Path) -> None:
+    ply_with(tmp_path / "a.ply", f"element face {10**12}\nproperty uchar a\n", bytes(100))
+    with pytest.raises(CloudError, match="truncated PLY"):
         read_cloud(tmp_path / "a.ply")
 
 
-def test_ply_element_of_a_trillion_rows_is_refused(tmp_path: Path) -> None:
-    for properties in ("property list uchar int indices\n", "property uchar a\n"):
-        ply_with(tmp_path / "a.ply", f"element face {10**12}\n{properties}", bytes(100))
-        with pytest.raises(CloudError, match="do not fit"):
-            read_cloud(tmp_path / "a.ply")
+def test_ply_with_lists_before_its_vertices_is_refused(tmp_path: Path) -> None:
+    ply_with(tmp_path / "a.ply", "element face 1\nproperty list uchar int v\n", bytes(1))
+    with pytest.raises(CloudError, match=r"a\.ply: PLY with lists before its vertices \(face\); export it"):
+        read_cloud(tmp_path / "a.ply")
 
 
 def test_ply_property_named_twice(tmp_path: Path) -> None:
@@ -87,30 +75,6 @@ def test_ply_property_named_twice(tmp_path: Path) -> None:
     ply_with(tmp_path / "b.ply", "", b"", AXES + "property float x\n")
     with pytest.raises(CloudError, match="twice"):
         read_cloud(tmp_path / "b.ply")
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("lengths", [[3] * 50, [3, 4] * 25, [0] * 50, [0, 9, 1], [200] + [1] * 3000])
-def test_ply_lists_before_the_vertices_are_skipped_to_the_byte(tmp_path: Path, order: str, lengths: list[int]) -> None:
-    rng = np.random.default_rng(0)
-    body = b"".join(
-        struct.pack(f"{order}B", n) + rng.bytes(4 * n) + struct.pack(f"{order}h", 2) + rng.bytes(16) for n in lengths
-    )
-    properties = "property list uchar int indices\nproperty list short double weights\n"
-    head = PLY.format(before=f"element face {len(lengths)}\n{properties}", axes=AXES)
-    head = head if order == "<" else head.replace("little", "big")
-    rows = np.arange(6, dtype=f"{order}f4")
-    (tmp_path / "a.ply").write_bytes(head.encode() + body + rows.tobytes())
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points, rows.reshape(2, 3))
-
-
-def test_ply_of_many_short_lists_does_not_walk_them_in_slow_steps(tmp_path: Path) -> None:
-    # 11 MB: rows of one and of two bytes in turn
-    count = 7_000_000
-    ply_with(tmp_path / "a.ply", f"element odd {count}\nproperty list uchar char a\n", b"\0\1\7" * (count // 2))
-    begin = time.process_time()
-    assert len(read_cloud(tmp_path / "a.ply")) == 2
-    assert time.process_time() - begin < 15  # the limit that is promised, not a measurement: it takes 1.5 s
 
 
 def pcd(path: Path, count: str = "1", points: str = "1", data: str = "binary", body: bytes = bytes(16)) -> Path:
@@ -131,11 +95,6 @@ def test_pcd_that_claims_to_unpack_to_more_than_lzf_can_is_refused(tmp_path: Pat
     body = struct.pack("<II", 100, 0xFFFFFFFF) + bytes(100)
     with pytest.raises(CloudError, match="cannot unpack"):
         read_cloud(pcd(tmp_path / "a.pcd", data="binary_compressed", body=body))
-
-
-def test_lzf_of_overlapping_references() -> None:
-    assert lzf_decompress(b"\x01ab" + b"\xe0\x03\x01", 2 + 12) == b"ab" * 7
-    assert lzf_decompress(b"\x02abc" + b"\x40\x02", 3 + 4) == b"abcabca"
 
 
 def test_npy_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:

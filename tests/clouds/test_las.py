@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
-from coview_stream.clouds.files import read_cloud
-from coview_stream.errors import CloudError
+from coview_stream.clouds.cloud_head import read_head
+from coview_stream.clouds.files import read_cloud, write_cloud
+from coview_stream.errors import CloudError, CoViewWarning
 
 UTM = np.array([351_154.5, 4_025_876.25, 14.0])
 PROJECTED = 'PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["{unit}",1]]'
@@ -107,3 +108,29 @@ def test_file_of_laszip_1_0_is_refused_with_the_remedy(tmp_path, points):
     path.write_bytes(raw)
     with pytest.raises(CloudError, match=r"a\.laz: LAZ of LASzip 1\.0.* write it again with a newer LASzip"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_system_that_is_not_utf8_is_read_and_told(tmp_path, points, suffix, capfd):
+    text = PROJECTED.replace('"x"', '"Gau\xdf"').format(unit="metre")
+    path = written(
+        tmp_path / f"a.{suffix}", points, "1.4", 6, [laspy.VLR("LASF_Projection", 2112, "", text.encode("latin-1"))]
+    )
+    with pytest.warns(CoViewWarning, match=rf"a\.{suffix}: its reference system is not UTF-8"):
+        assert read_head(path).crs == text.replace("\xdf", "\ufffd")
+    assert capfd.readouterr().err == ""  # laspy's own line
+
+
+def test_full_disk_while_laz_is_written_is_one_line(tmp_path, points):
+    resource = pytest.importorskip("resource", reason="limits of processes are of POSIX")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # the header fits, the points do not
+    try:
+        with pytest.raises(
+            CloudError, match=r"a\.laz: cannot be written \(.*\); check the directory and the disk"
+        ) as error:
+            write_cloud(tmp_path / "a.laz", points[:1000])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
