@@ -27,7 +27,7 @@ from coview_stream.errors import InputError
 PAGE = ROOT / "docs" / "results.md"
 
 COMMANDS = {
-    **{name: name for name in ("kernels", "match", "frame", "map_build", "registration", "engine", "stages")},
+    **{name: name for name in ("kernels", "match", "frame", "map_build", "registration", "engine")},
     "search": "search",
     "scale": "scale",
     "city": "city --side 2 4",

@@ -1,24 +1,22 @@
-"""Results kept on disk as long as the code that made them is the same; code of an earlier commit; stage clocks."""
+"""Results on disk that are valid for the code that made them; processes, their threads and memory; stage clocks."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import resource
 import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import coview_kernels
 import coview_stream
@@ -27,8 +25,8 @@ from coview_stream.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 
-COMMIT = "1c85769b98b75633f82754048a1a67ec46fd42d2"
-"""The last commit whose search registered and verified every place of a vote, one by one."""
+PYTHON = (sys.executable, "-P")
+"""Begins a command: this interpreter, with no import root but those of :func:`environment`."""
 
 _ROOTS = {
     "coview_stream": Path(coview_stream.__file__).parent,
@@ -45,16 +43,16 @@ def folder() -> Path:
 
 
 def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dict[str, Any]:
-    """Return the result in ``file`` if it was made for an equal ``spec``; else make it and keep it there.
+    """Return the result in ``file`` if it was made for an equal ``spec``; else make it and store it there.
 
-    So an interrupted benchmark resumes, but never on results of other code: ``spec`` holds a :func:`fingerprint`.
-    Only a dictionary is kept; ``make`` may return something else after writing files itself.
+    An interrupted benchmark resumes on results of the same code, because ``spec`` holds a :func:`fingerprint`. Only a
+    dictionary is stored; ``make`` may write files itself and return something else.
     """
     spec = json.loads(json.dumps(spec))
     if file.is_file():
-        known = json.loads(file.read_text())
-        if known["spec"] == spec:
-            return dict(known["result"])
+        stored = json.loads(file.read_text())
+        if stored["spec"] == spec:
+            return dict(stored["result"])
     made = make()
     result = json.loads(json.dumps(made if isinstance(made, dict) else {}))
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -85,16 +83,15 @@ def peak_megabytes() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
-def thread_settings(threads: int | None) -> dict[str, str]:
-    """Environment that gives BLAS, OpenMP and our kernels so many threads; empty for the machine's own."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS")
-    return {} if threads is None else dict.fromkeys(names, str(threads))
+def thread_settings(threads: int) -> dict[str, str]:
+    """Return the environment that gives BLAS, OpenMP and our kernels so many threads."""
+    return dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS"), str(threads))
 
 
 def environment(threads: int | None = None) -> dict[str, str]:
-    """Our environment with both import roots of this checkout in front and so many threads."""
+    """Return our environment with the import roots of this checkout in front; the machine's threads, or so many."""
     path = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "kernels"), os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "PYTHONPATH": path, **thread_settings(threads)}
+    return {**os.environ, "PYTHONPATH": path, **(thread_settings(threads) if threads else {})}
 
 
 class Clock:
@@ -113,58 +110,19 @@ class Clock:
             self.seconds[name] += time.perf_counter() - begin
 
 
-class Code(NamedTuple):
-    """Checkout with both import roots, and the version that its results depend on."""
+def built(source: Path, site: Path) -> Path:
+    """Return the map that ``coview-stream build`` makes of a cloud; build it unless it is there."""
 
-    root: Path
-    version: str
+    def build() -> None:
+        site.parent.mkdir(parents=True, exist_ok=True)
+        words = (*PYTHON, "-m", "coview_stream", "build", str(source), "-o", str(site))
+        done = subprocess.run(words, env=environment(2), cwd=site.parent, capture_output=True, text=True)
+        if done.returncode:
+            raise InputError(f"building {site.name}: {done.stderr.strip().splitlines()[-1]}")
 
-    def command(self, *words: str) -> list[str]:
-        """Return the command that runs Python with these words, the working directory no import root."""
-        return [sys.executable, "-P", *words]
-
-    def environment(self, threads: int = 1) -> dict[str, str]:
-        """Return ours with this code's import roots and so many threads."""
-        roots = os.pathsep.join((str(self.root), str(self.root / "kernels")))
-        return {**os.environ, "PYTHONPATH": roots, **thread_settings(threads)}
-
-    def built(self, sources: Sequence[Path], site: Path, threads: int = 2) -> Path:
-        """Return the map that this code's command builds of clouds, built now unless it is there."""
-        words = ("-m", "coview_stream", "build", *map(str, sources), "-o", str(site))
-
-        def build() -> None:
-            site.parent.mkdir(parents=True, exist_ok=True)
-            done = subprocess.run(
-                self.command(*words), env=self.environment(threads), cwd=site.parent, capture_output=True, text=True
-            )
-            if done.returncode:
-                raise InputError(f"building {site.name}: {done.stderr.strip().splitlines()[-1]}")
-
-        spec = {"sources": [[path.name, path.stat().st_size] for path in sources], "code": self.version}
-        remembered(site.with_suffix(".json"), spec, build)
-        return site
-
-
-def today() -> Code:
-    """Return this checkout; its maps depend on map building, descriptors and configuration."""
-    return Code(ROOT, fingerprint("coview_stream/basemap", "coview_stream/descriptors", "coview_stream/config"))
-
-
-def pinned(commit: str = COMMIT) -> Code:
-    """Return the product at a commit, extracted from this repository's history; InputError if it is not there."""
-    root = folder() / f"code-{commit[:7]}"
-    if not (root / "kernels").is_dir():
-        words = ["git", "-C", str(ROOT), "archive", commit, "coview_stream", "kernels"]
-        try:
-            packed = subprocess.run(words, check=True, capture_output=True).stdout
-        except (OSError, subprocess.CalledProcessError) as error:
-            raise InputError(f"commit {commit[:7]} is not in this history; fetch all of it") from error
-        root.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=root.parent) as part:
-            with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
-                archive.extractall(Path(part) / "code", filter="data")
-            (Path(part) / "code").rename(root)
-    return Code(root, commit)
+    parts = (f"coview_stream/{part}" for part in ("basemap", "descriptors", "config"))
+    remembered(site.with_suffix(".json"), {"bytes": source.stat().st_size, "code": fingerprint(*parts)}, build)
+    return site
 
 
 def commit() -> str:

@@ -1,8 +1,8 @@
 """A figure with its comparison and verdict, as every benchmark yields it; tables for a terminal and for Markdown.
 
-A benchmark is a module with ``rows(asked) -> Iterator[Row]``, where ``asked`` are its parsed options (``quick`` always
-among them). It may have ``options(parser)``, which adds options, and ``tables(rows, asked)``, which returns wider
-Markdown tables by name. Times are medians of wall time; the sides of a comparison take turns in one process.
+A benchmark is a module with ``rows(asked) -> Iterator[Row]``; ``asked`` are its parsed options, always with ``quick``.
+It may have ``options(parser)``, which adds options, and ``tables(rows, asked)``, which returns Markdown tables by name.
+Times are medians of wall time; the sides of a comparison take turns in one process.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -147,6 +147,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([line(head, widths), rule(widths), *(line(row, widths) for row in rows)])
 
 
+def listed(columns: Sequence[tuple[str, str, int | None]], figures: Iterable[Mapping[str, Any]]) -> str:
+    """Table of figures; columns are heading, key and decimals, or None where the figure is a text."""
+    rows = [[str(f[key]) if k is None else number(f[key], k) for _, key, k in columns] for f in figures]
+    return table([head for head, *_ in columns], rows)
+
+
 def number(value: float | None, digits: int) -> str:
     """Write a number, or a dash for none."""
     return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
@@ -162,18 +168,6 @@ def upper(events: int, runs: int, confidence: float = 0.95) -> float:
     """Return Clopper-Pearson's one-sided upper bound of a share; 1 without runs."""
     from scipy.stats import beta
 
-    _checked(events, runs)
-    return 1.0 if events == runs else float(beta.ppf(confidence, events + 1, runs - events))
-
-
-def lower(events: int, runs: int, confidence: float = 0.95) -> float:
-    """Return Clopper-Pearson's one-sided lower bound of a share; 0 without runs."""
-    from scipy.stats import beta
-
-    _checked(events, runs)
-    return 0.0 if events == 0 else float(beta.ppf(1.0 - confidence, events, runs - events + 1))
-
-
-def _checked(events: int, runs: int) -> None:
     if not 0 <= events <= runs:
         raise ValueError(f"{events} events of {runs} runs: use 0 to {runs} events")
+    return 1.0 if events == runs else float(beta.ppf(confidence, events + 1, runs - events))

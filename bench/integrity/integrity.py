@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.harness.files import fingerprint, folder
-from bench.harness.rows import NOTHING, Row, informs, judged, lower, number, table, upper
+from bench.harness.rows import NOTHING, Row, informs, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan
 from bench.integrity.run import Result, Task, everywhere, read
 from coview_stream.errors import InputError
@@ -165,9 +165,8 @@ def reliability_table(results: Sequence[Result]) -> str:
     for name, stated in _stated(results).items():
         count, wrong = len(stated), sum(not right for _, right in stated)
         mean = f"{np.mean([error for error, _ in stated]):.1e}" if count else NOTHING
-        between = f"{percent(lower(wrong, count))} to {percent(upper(wrong, count))}" if count else NOTHING
-        lines.append([f"< {name}", str(count), mean, str(wrong), between])
-    return table(("stated error", "first times", "mean stated", "wrong", "wrong, between (95 % each)"), lines)
+        lines.append([f"< {name}", str(count), mean, str(wrong)])
+    return table(("stated error", "first times", "mean stated", "wrong"), lines)
 
 
 def _stated(results: Sequence[Result]) -> dict[str, list[tuple[float, bool]]]:

@@ -1,10 +1,9 @@
 """A city of simulated towns, as a directory of tiles: building, opening and searching it, and the memory of each.
 
-The towns lie side by side in one reference system, each with a survey and a drive of its own. The product's command
-builds them with two workers, without features. Then a process opens the site and searches for the robots of some
-drives, each as one that was just switched on; its memory is counted with and without pages of files. Votes of the
-keyframes are compared: all stations, squares of stations (as the product does on large maps), squares in the circle of
-a prior. In a wrong circle no robot may come to a pose.
+The towns lie side by side in one reference system, each with a survey and a drive. The product's command builds them
+with two workers, without features. A process then opens the site and searches for robots that were just switched on.
+Votes of keyframes are compared: all stations, squares of stations (the product's way on large maps), squares in the
+circle of a prior. In a wrong circle no robot may come to a pose.
 """
 
 from __future__ import annotations
@@ -24,17 +23,16 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
-from bench.accuracy.ablation import keyframes_of, right
-from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered, today
+from bench.harness.files import PYTHON, environment, fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, against, bounded, informs, judged, reached
 from bench.harness.worlds import MAPPER, prepared_run, world_name
-from bench.speed.search import last_core
+from bench.speed.scale import described, place_of, timed
+from bench.speed.search import bind_to_one_core
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
 from coview_stream.config import ConsensusConfig
-from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.hints import PlaceGuess
@@ -49,6 +47,12 @@ building process."""
 
 VOTE_MS, LEAST_KEPT = 30.0, 99.0
 """Targets: milliseconds of a vote within the circle on one core, per cent of right places that squares keep."""
+
+GROWING = (
+    "build, two workers", "memory of a worker, peak", "working file made, the first time", "memory for that, peak",
+    "memory, resident at the end",
+)  # fmt: skip
+"""Figures whose slope over the points is shown."""
 
 RADIUS, ELSEWHERE = 1000.0, (50.0, 240.0)  # metres of the prior's circle, and of those in another town
 _CORNER = (400_000.0, 5_600_000.0, 100.0)
@@ -78,46 +82,40 @@ def towns(side: int) -> list[SimulationConfig]:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield the figures of building, opening and searching, and their growth with the points."""
     sides = [1] if asked.quick else asked.side
-    growing: dict[int, dict[str, float]] = {side: {} for side in sides}
+    values: dict[str, list[float]] = {}
     for side in sides:
-        yield from _figures(side, growing[side])
-    if len(sides) > 1:
-        points = np.log10([growing[side]["points"] for side in sides])
-        for name in growing[sides[0]].keys() - {"points"}:
-            slope = np.polyfit(points, np.log10([growing[side][name] for side in sides]), 1)[0]
-            yield informs(f"city/slope over the points: {name}", float(slope), "")
+        for row in _figures(side):
+            values.setdefault(row.name.partition(": ")[2], []).append(row.ours)
+            yield row
+    for name in GROWING if len(sides) > 1 else ():
+        slope = np.polyfit(np.log10(values["points read"]), np.log10(values[name]), 1)[0]
+        yield informs(f"city/slope over the points: {name}", float(slope), "")
 
 
-def _figures(side: int, growing: dict[str, float]) -> Iterator[Row]:
-    """Yield the figures of one city, and keep those that grow."""
+def _figures(side: int) -> Iterator[Row]:
+    """Yield the figures of one city."""
     below, area = folder() / f"city{side}", side * side * (EDGE / 1e3) ** 2
     worlds = [prepared_run(below, config) for config in towns(side)]
     site, title = below / "site", f"city/{side * side} towns"
     made = {"towns": [world_name(config) for config in towns(side)], "code": fingerprint(*MAPPER)}
     built = remembered(below / "built.json", made, lambda: isolated(_built, worlds, site))
     manifest = Manifest.load(site)
-    growing |= {"points": float(built["points"]), "build, seconds": built["seconds"]}
-    growing["build, memory"] = built["megabytes"]
     yield informs(f"{title}: stations", sum(tile.stations for tile in manifest.tiles), "")
     yield informs(f"{title}: points read", built["points"] / 1e6, "million")
     yield informs(f"{title}: build, two workers", built["seconds"], "s")
-    yield informs(f"{title}: points a second and worker", built["points"] / built["seconds"] / 2.0, "")
     yield bounded(f"{title}: memory of a worker, peak", built["megabytes"], "MB", WORKER_MEGABYTES)
     yield bounded(f"{title}: directory, per km2", manifest.nbytes / 1e6 / area, "MB", PER_KM2)
     os.environ["COVIEW_CACHE"] = str(below / "cache")
     spec = {"site": manifest.sha256, "code": fingerprint()}
     first = remembered(below / "first.json", spec, lambda: isolated(_first_opened, site))
-    growing |= {"first opening, seconds": first["seconds"], "first opening, memory": first["peak"]}
     yield informs(f"{title}: working file made, the first time", first["seconds"], "s")
     yield informs(f"{title}: memory for that, peak", first["peak"], "MB")
     found = isolated(_searched, site, worlds[:: max(1, len(worlds) // _DRIVES)][:_DRIVES])
     yield bounded(f"{title}: load", found["load"], "s", OPEN_S)
     yield informs(f"{title}: localizer, and the first robot found, with compilation", found["first"], "s")
     if searches := [step for step in found["steps"] if step > _SEARCHING]:
-        growing["search, seconds"] = float(np.median(searches))
-        yield informs(f"{title}: steps until later robots are found, median", growing["search, seconds"], "s")
+        yield informs(f"{title}: steps until later robots are found, median", float(np.median(searches)), "s")
         yield bounded(f"{title}: steps until later robots are found, longest", max(searches), "s", SEARCH_S)
-    growing["search, memory"] = found["VmRSS"]
     yield bounded(f"{title}: memory, resident at the end", found["VmRSS"], "MB", MEGABYTES)
     yield informs(f"{title}: of it, without pages of files", found["RssAnon"], "MB")
     yield informs(f"{title}: memory, peak", found["VmHWM"], "MB")
@@ -134,10 +132,10 @@ def _figures(side: int, growing: dict[str, float]) -> Iterator[Row]:
 def _built(worlds: list[Path], site: Path) -> dict[str, float]:
     """Build the site: points read, seconds, and the memory of its largest process."""
     sources = [str(world / "base.laz") for world in worlds]
-    words = ("-m", "coview_stream", "build", *sources, "-o", f"{site}/", "--workers", "2", "--no-learned")
+    words = (*PYTHON, "-m", "coview_stream", "build", *sources, "-o", f"{site}/", "--workers", "2", "--no-learned")
     shutil.rmtree(site, ignore_errors=True)
     begin = time.monotonic()
-    subprocess.run(today().command(*words), env=today().environment(), check=True, stdout=sys.stderr)
+    subprocess.run(words, env=environment(1), check=True, stdout=sys.stderr)
     seconds = time.monotonic() - begin
     megabytes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
     points = int(Manifest.load(site).parameters["source_points"])
@@ -188,37 +186,22 @@ class _AllCompared(Retrieval):
 
 def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:
     """Milliseconds of votes on one core, and the ranks of the right places, by the stations that are compared."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {last_core()})
+    bind_to_one_core()
     base_map, config = BaseMap.load(site), ConsensusConfig()
     config = replace(config, peaks=coview_peaks(config.peaks, len(base_map)))
     middle = 0.5 * (base_map.stations.min(axis=0) + base_map.stations.max(axis=0))
     circle = Circle(float(middle[0]), float(middle[1]), RADIUS)
-    descriptor = base_map.descriptor_config
-    drives = []
-    for world in worlds:
-        drive = []
-        for seen in keyframes_of(world, base_map.origin, descriptor):
-            centre = np.array([*seen.position[:2], seen.ground])
-            drive.append((seen, centre, describe(seen.scan, centre, descriptor)))
-        drives.append(drive)
+    drives = [described(world, base_map) for world in worlds]
     kernels.warm_up()
     out: dict[str, Any] = {"in_circle": int(circle.holds(base_map.stations).sum())}
     for name, kind, area in (("all", _AllCompared, None), ("squares", Retrieval, None), ("circle", Retrieval, circle)):
         consensus = StationConsensus(kind(base_map), config)
-        times, ranks = list[float](), list[int | None]()
+        out[name] = {"ms": [], "ranks": []}
         for drive in drives:
-            places = np.array([(seen.T_map_odom @ np.append(seen.position, 1.0))[:2] for seen, _, _ in drive])
-            if area is not None and not area.holds(places).all():
-                continue
-            consensus.clear()
-            for seen, centre, described in drive:
-                begin = time.perf_counter()
-                consensus.vote(centre, described, area)
-                named = consensus.hypotheses()
-                times.append(1e3 * (time.perf_counter() - begin))
-                ranks.append(next((k for k, place in enumerate(named) if right(place.T_map_odom, seen)), None))
-        out[name] = {"ms": times, "ranks": ranks}
+            if area is None or area.holds(np.array([place_of(seen)[:2] for seen, *_ in drive])).all():
+                consensus.clear()
+                for key, values in timed(consensus, drive, area).items():
+                    out[name][key] += values
     return out
 
 

@@ -22,6 +22,14 @@ from coview_stream.geometry.transforms import pose_from
 
 def cases() -> Iterator[tuple[str, Callable[..., Any], Callable[..., Any], tuple[Any, ...]]]:
     """Name, our kernel, its twin, and what both are called with."""
+
+    def nearest_in_tree(grid: ck.PointGrid, scan: np.ndarray, radius: float) -> object:
+        return reference.nearest(grid.tree, scan, radius)  # SciPy's k-d tree, queries alone
+
+    def einsum_distance(query: np.ndarray, spectra: np.ndarray, sectors: int) -> np.ndarray:
+        product = np.einsum("fmr,qrf->qmf", spectra.conj(), np.fft.rfft(ck.unit_columns(query), axis=-1))
+        return 1.0 - np.fft.irfft(product, n=sectors, axis=-1) / sectors
+
     rng = np.random.default_rng(0)
     cloud = rng.normal(0.0, 20.0, (131_072, 3)).astype(np.float32)
     T = pose_from([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], [1.0, 2.0, 3.0])
@@ -35,35 +43,20 @@ def cases() -> Iterator[tuple[str, Callable[..., Any], Callable[..., Any], tuple
     raster = (top, count, 0.5, *at, rng.normal(size=300).astype(np.float32), 20, 60, 50.0)
     yield "station_bins 300", ck.station_bins, reference.station_bins, raster
     yield "coview 300", ck.coview, reference.coview, reference.station_bins(*raster)
-    street = _street(rng)
+    along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))  # a street's ground and two walls
+    parts = [np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])]
+    parts += [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]
+    street = np.concatenate(parts).astype(np.float32)
+    street += rng.normal(0, 0.02, street.shape).astype(np.float32)
     grid = ck.PointGrid(street)
     scan = street[rng.permutation(len(street))[:5_000]]
     scan += rng.normal(0, 0.1, scan.shape).astype(np.float32)
     for radius in (0.4, 3.0):
-        yield f"nearest 5000, {radius} m", ck.nearest, _nearest_in_tree, (grid, scan, radius)
+        yield f"nearest 5000, {radius} m", ck.nearest, nearest_in_tree, (grid, scan, radius)
     desc = rng.normal(2.0, 1.0, (9_527, 20, 60)).astype(np.float32)
     spectra = ck.column_spectra(desc)
     for q in (1, 8):  # BLAS beside einsum
-        yield f"all_shift_distance {q} x 9527", ck.all_shift_distance, _einsum_distance, (desc[:q], spectra, 60)
-
-
-def _street(rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 3) of the ground and two walls of a street, one every quarter metre."""
-    along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
-    flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
-    walls = [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]
-    street = np.concatenate([flat, *walls]).astype(np.float32)
-    return street + rng.normal(0, 0.02, street.shape).astype(np.float32)
-
-
-def _nearest_in_tree(grid: ck.PointGrid, scan: np.ndarray, radius: float) -> object:
-    return reference.nearest(grid.tree, scan, radius)  # SciPy's k-d tree, queries alone
-
-
-def _einsum_distance(query: np.ndarray, spectra: np.ndarray, sectors: int) -> np.ndarray:
-    wave = np.fft.rfft(ck.unit_columns(query), axis=-1)
-    product = np.einsum("fmr,qrf->qmf", spectra.conj(), wave)
-    return 1.0 - np.fft.irfft(product, n=sectors, axis=-1) / sectors
+        yield f"all_shift_distance {q} x 9527", ck.all_shift_distance, einsum_distance, (desc[:q], spectra, 60)
 
 
 def rows(asked: Namespace) -> Iterator[Row]:

@@ -1,14 +1,11 @@
 """A keyframe's best score with every station, of 9,527 at all 60 shifts, beside the best that NumPy can do.
 
-Scores are those of both channels together. The baselines are exact and have everything made beforehand that depends on
-the map; the ratio is against the faster of the two in the same run, one query at a time. Stations and keyframes are
-those of a simulated town. What the codes leave out and what that costs the search: ``python -m bench scale``. See
-docs/results.md.
+Scores are of both channels together. The baselines are exact and have prepared all that depends on the map; the ratio
+is against the faster of the two in the same run, one query at a time, in a simulated town.
 """
 
 from __future__ import annotations
 
-import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -24,8 +21,6 @@ from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats32
 
 STATIONS, MANY = 9_527, 100_000
-LOOKED_AT = 2_048  # stations and single pairs whose scores are asked for besides
-
 F16 = npt.NDArray[np.float16]
 
 
@@ -64,17 +59,11 @@ class Turned:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Time the screen of all stations beside the best of NumPy, then single scores, sizes and limits."""
+    """Time the best score of all stations beside NumPy, its memory, and its growth with the stations."""
     repeat = 5 if asked.quick else REPEAT
     stations, columns = town()
-    array = np.ones(64_000_000, dtype=np.float32)  # 256 MB
-    read = min(medians(array.sum, array.view(np.int8).max, repeat=7))
-    bandwidth = array.nbytes / read / 1e6
-    yield informs("match/memory bandwidth, a large array summed by one thread", bandwidth, "GB/s")
-    some = [each[:STATIONS] for each in stations]
-    start = time.perf_counter()
+    some = [channel[:STATIONS] for channel in stations]
     codes = kernels.StationCodes.of(some)
-    yield informs("match/making the codes", (time.perf_counter() - start) * 1e3, "ms")
     query = codes.query(columns)
     spectral, turned = Spectral(some), Turned(some)
     np.testing.assert_allclose(spectral(columns), turned(columns), atol=1e-4)
@@ -82,16 +71,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     ours, *others = medians(*sides, repeat=repeat)
     yield against(f"match/best score of each of {STATIONS} stations", ours, min(others), "ms", 3.0)
     yield bounded("match/memory per station", codes.codes.nbytes / len(codes), "B", 512.0)
-    floor = codes.codes.nbytes / bandwidth / 1e6
-    yield against("match/the same beside one reading of the codes from memory", ours, floor, "ms", None)
-    rng = np.random.default_rng(0)
-    few, shifts = rng.permutation(STATIONS)[:LOOKED_AT], rng.integers(0, columns.shape[1], LOOKED_AT)
-    every, single = medians(partial(codes.all_shifts, query, few), partial(codes.at, query, few, shifts), repeat=repeat)
-    yield informs(f"match/scores of {LOOKED_AT} stations at all shifts", every, "ms")
-    yield informs(f"match/scores of {LOOKED_AT} stations at one shift each", single, "ms")
-    large = kernels.StationCodes.of([multiplied(each, MANY) for each in stations])
-    asked_of_many = large.query(columns)
-    short, long = medians(partial(codes.best, query), partial(large.best, asked_of_many), repeat=repeat)
+    large = kernels.StationCodes.of([multiplied(channel, MANY) for channel in stations])
+    short, long = medians(partial(codes.best, query), partial(large.best, large.query(columns)), repeat=repeat)
     yield informs(f"match/best score of each of {MANY} stations", long, "ms")
     yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "x", 1.5)
 

@@ -11,8 +11,7 @@ direction and 3 degrees of heading ("search"), or a tenth of that ("tracking").
   and 1.9 cm), correspondences within 1 and 2 m (34 and 33 ms) and the source thinned to 0.5 m (23 ms, 1.8 cm); for
   GICP within 1 and 2 m (52 and 67 ms; 1.8 and 2.0 cm), thinned 52 and 42 ms (1.7 and 1.9 cm). So both get the thinned
   source and 10 neighbours, VGICP 1 m and 2 m, GICP 1 m. Fewer points still serve either side; that is not compared.
-  The tile is prepared before, as ours is; the source's covariances, which ours does not need, are part of the time:
-  "align only" leaves them out, and has no target, since a scan needs them.
+  The tile is prepared before, as ours is; the source's covariances, which ours does not need, are part of the time.
 
 A row compares median times; the sides take turns at every start. It holds where we are 1.5 times as fast at equal
 error: our root mean square, in metres and in degrees, at most 5 % above the peer's, with COVIEW_THREADS threads.
@@ -77,7 +76,6 @@ def rows(asked: Namespace) -> Iterator[Row]:
             row = against(name, took, took_them, "ms", LEAST)
             holds = bool(row.holds) and all(a <= EQUAL * b for a, b in zip(error, error_them, strict=True))
             yield replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
-            yield against(f"{name}, align only", took, results[f"{way}, align only"][0], "ms", None)
         for name in ("ours", *WAYS):
             _, metres, degrees = results[name]
             yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm")
@@ -98,18 +96,14 @@ def places(count: int) -> Iterator[Place]:
         if index in wanted:
             T_map_body = to_local(poses[np.abs(stamps - frame.stamp).argmin()], base_map.origin)
             target = maps.around(T_map_body[:3, 3])
-            source = _source(np.concatenate([points for _, points in recent]), T[:3, 3])
-            if target is not None and len(source.points) >= POINTS // 2:
+            points = np.concatenate([points for _, points in recent])
+            thin, _ = transform_unique(points, np.eye(4), VOXEL, 0.0, REACH, T[:3, 3])
+            height = height_above_lowest(thin)
+            some = np.random.default_rng(1).permutation(len(thin))[:POINTS]
+            some = some[np.lexsort(np.floor(thin[some, :2] / 2.0).T)]  # the engine's order: by place
+            source = RegistrationCloud(thin[some], height[some] > _CLEAR, height[some])
+            if target is not None and len(some) >= POINTS // 2:
                 yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
-
-
-def _source(points: Floats32, position: Floats) -> RegistrationCloud:
-    """Thin a scan to some points, in the engine's order: by place."""
-    thin, _ = transform_unique(points, np.eye(4), VOXEL, 0.0, REACH, position)
-    height = height_above_lowest(thin)
-    some = np.random.default_rng(1).permutation(len(thin))[:POINTS]
-    some = some[np.lexsort(np.floor(thin[some, :2] / 2.0).T)]
-    return RegistrationCloud(thin[some], height[some] > _CLEAR, height[some])
 
 
 def _start(place: Place, kind: str, seed: int) -> Pose:
@@ -130,15 +124,22 @@ def _error(place: Place, T: Pose | None) -> tuple[float, float]:
     return float(np.linalg.norm(off)), float(np.degrees(rotation_angle(inverse(place.truth) @ T)))
 
 
-Way = Callable[[Place, Pose], tuple[float, Pose | None]]
 Peers = dict[tuple[str, int], SmallGicp]  # by way and tile
 
 
 def _trials(found: list[Place], kind: str, peers: Peers) -> dict[str, tuple[float, float, float]]:
     """Median milliseconds and root mean squares of metres and degrees of every way, two starts at each place."""
-    sides: dict[str, Way] = {"ours": partial(_ours, kind)}
-    for way in WAYS:
-        sides |= {way: partial(_theirs, peers, way, True), f"{way}, align only": partial(_theirs, peers, way, False)}
+
+    def ours(place: Place, begin: Pose) -> Pose | None:
+        answer = register(place.source, begin, place.target, CONFIG, SCALES[kind], centre=place.position)
+        return None if answer is None else answer.T_map_source
+
+    def theirs(way: str, place: Place, begin: Pose) -> Pose:
+        peer = peers[way, id(place.target)]
+        return np.array(peer.align(peer.prepared(place.source.points, 0.5)[0], begin).T_target_source)
+
+    sides: dict[str, Callable[[Place, Pose], Pose | None]] = {"ours": ours}
+    sides |= {way: partial(theirs, way) for way in WAYS}
     values: dict[str, list[tuple[float, float, float]]] = {name: [] for name in sides}
     order = list(sides)
     for name in order:
@@ -147,26 +148,10 @@ def _trials(found: list[Place], kind: str, peers: Peers) -> dict[str, tuple[floa
         place = found[seed // 2]
         begin = _start(place, kind, seed)
         for name in order:
-            seconds, T = sides[name](place, begin)
-            values[name].append((1e3 * seconds, *_error(place, T)))
+            clock = time.perf_counter()
+            T = sides[name](place, begin)
+            values[name].append((1e3 * (time.perf_counter() - clock), *_error(place, T)))
         order.reverse()
     ms = {name: float(np.median([each[0] for each in v])) for name, v in values.items()}
     rms = {name: np.sqrt(np.mean(np.square(v), axis=0)).tolist()[1:] for name, v in values.items()}
     return {name: (ms[name], *rms[name]) for name in sides}
-
-
-def _ours(kind: str, place: Place, begin: Pose) -> tuple[float, Pose | None]:
-    clock = time.perf_counter()
-    answer = register(place.source, begin, place.target, CONFIG, SCALES[kind], centre=place.position)
-    return time.perf_counter() - clock, None if answer is None else answer.T_map_source
-
-
-def _theirs(peers: Peers, way: str, whole: bool, place: Place, begin: Pose) -> tuple[float, Pose]:
-    """Seconds, with the source's covariances or without, and the pose."""
-    peer = peers[way, id(place.target)]
-    clock = time.perf_counter()
-    source, _ = peer.prepared(place.source.points, 0.5)
-    if not whole:
-        clock = time.perf_counter()
-    T = np.array(peer.align(source, begin).T_target_source)
-    return time.perf_counter() - clock, T

@@ -1,19 +1,18 @@
 """Growth of a keyframe's vote with the map: a thousand to a million stations, on one core.
 
-A keyframe's descriptors are compared with all stations, and the places that ten keyframes agree on are named: the
-search by descriptors as in the product, without registration. The map is a simulated town, and around it on the same
-grid synthetic stations: halves of two of its own, each turned. The keyframes are those of a drive through the town.
-Each size has processes of its own: one makes the map, the others vote. ``bench city`` compares the named places with
-those of an exhaustive search.
+The search by descriptors as in the product, without registration: a keyframe is compared with all stations, and ten
+keyframes agree on places. The map is a simulated town, and around it synthetic stations on the same grid: halves of two
+of its own, each turned. One process makes the map of a size, others vote. ``bench city`` compares with an exhaustive
+search.
 """
 
 from __future__ import annotations
 
-import os
+import pickle
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,10 +26,11 @@ from bench.accuracy.ablation import Seen, keyframes_of, right
 from bench.harness.files import folder, isolated, peak_megabytes
 from bench.harness.rows import Row, bounded, informs
 from bench.harness.worlds import WORLDS, opened, prepare, world_name
-from bench.speed.search import last_core
+from bench.speed.search import bind_to_one_core
+from coview_stream import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import ConsensusConfig
+from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Circle
@@ -46,25 +46,20 @@ RADIUS = 1000.0  # metres of the prior's circle; around the drive it holds 785,0
 APART = 10  # factor by which stations are moved apart: every 20 m, as of 20 x 20 km
 _BLOCK = 8192
 _SEED = 1
-_KEPT = ("position", "ground", "truth", "descriptors")  # of keyframes
+
+Keyframe = tuple[Seen, Floats, dict[Channel, Floats32]]
+"""A keyframe, its centre (3,) in the odometry frame on the ground, and its descriptors by channel."""
 
 
 def make(size: int, out: Path) -> None:
     """Write stations, descriptors and index of a map of ``size`` stations, and the keyframes of the drive."""
     config = WORLDS["town"]
     site, _, _ = opened(config)
-    seen = list(keyframes_of(folder() / world_name(config), site.origin, site.descriptor_config))
-    middle = np.mean([_place(keyframe) for keyframe in seen], axis=0)
+    keyframes = described(folder() / world_name(config), site)
+    middle = np.mean([place_of(seen) for seen, *_ in keyframes], axis=0)
     own = np.argsort(np.linalg.norm(site.stations - middle, axis=1), kind="stable")[:size]
     known = [site.descriptors(name)[own] for name in site.descriptor_config.channels]
-    centres = [np.array([*keyframe.position[:2], keyframe.ground]) for keyframe in seen]
-    described = [describe(k.scan, at, site.descriptor_config) for k, at in zip(seen, centres, strict=True)]
-    np.savez(
-        out / "queries.npz", channels=list(site.descriptor_config.channels), block=site.config.block,
-        position=[keyframe.position for keyframe in seen], ground=[keyframe.ground for keyframe in seen],
-        truth=[keyframe.T_map_odom for keyframe in seen],
-        descriptors=[list(channels.values()) for channels in described],
-    )  # fmt: skip
+    (out / "queries.pkl").write_bytes(pickle.dumps((site.config.block, keyframes)))
     np.save(out / "stations.npy", widened(site.stations[own], size, site.config.block))
     shape = (size, *known[0].shape[1:])
     files = [np.lib.format.open_memmap(out / f"{k}.npy", "w+", np.float16, shape) for k in range(len(known))]
@@ -80,11 +75,8 @@ def make(size: int, out: Path) -> None:
             made[:, :, :half] = values[other][:, :, :half]
             file[start:stop] = made
     descriptors: dict[Any, npt.NDArray[Any]] = dict(zip(site.descriptor_config.channels, files, strict=True))
-    begin = time.perf_counter()
-    index = StationIndex.of(descriptors)
-    (out / "seconds").write_text(str(time.perf_counter() - begin))
     (out / "index").mkdir()
-    for name, values in index.arrays().items():
+    for name, values in StationIndex.of(descriptors).arrays().items():
         np.save(out / "index" / f"{name}.npy", values)
 
 
@@ -104,52 +96,55 @@ def widened(stations: Floats32, count: int, block: float) -> Floats32:
 
 
 def voted(out: Path, radius: float | None = None, apart: int = 1) -> dict[str, Any]:
-    """Milliseconds of every keyframe's vote, the ranks of the right places, and the process's memory.
+    """Return the votes of the keyframes, and the memory of the process.
 
-    With a ``radius``, within a circle of so many metres around the first keyframe. With stations moved ``apart`` by a
+    With a ``radius``, metres, they search a circle around the first keyframe. Where stations are moved ``apart`` by a
     factor, ranks have no meaning.
     """
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {last_core()})
-    kept, stations = np.load(out / "queries.npz"), np.load(out / "stations.npy")
-    names, block = kept["channels"].tolist(), float(kept["block"])
-    descriptors = {name: np.load(out / f"{k}.npy", mmap_mode="r") for k, name in enumerate(names)}
+    bind_to_one_core()
+    block, keyframes = pickle.loads((out / "queries.pkl").read_bytes())
+    stations = np.load(out / "stations.npy")
+    descriptors = {name: np.load(out / f"{k}.npy", mmap_mode="r") for k, name in enumerate(keyframes[0][2])}
     arrays = {path.stem: np.load(path, mmap_mode="r") for path in (out / "index").glob("*.npy")}
     index = StationIndex.from_arrays(arrays, descriptors)
     assert index is not None
     stations[:, :2] *= apart
     site: Any = SimpleNamespace(station_index=index, station_grid=StationGrid(stations, apart * block))
     retrieval, config = Retrieval(site), ConsensusConfig()
-    keyframes = [
-        (
-            Seen(np.zeros((0, 3), dtype=np.float32), position, float(ground), truth),
-            dict(zip(names, values, strict=True)),
-        )
-        for position, ground, truth, values in zip(*(kept[k] for k in _KEPT), strict=True)
-    ]
-    area = None if radius is None else Circle(*(apart * _place(keyframes[0][0])[:2]).tolist(), radius)
+    area = None if radius is None else Circle(*(apart * place_of(keyframes[0][0])[:2]).tolist(), radius)
     kernels.warm_up()
     retrieval.compared(area).index.prepare()
     consensus = StationConsensus(retrieval, replace(config, peaks=coview_peaks(config.peaks, len(stations))))
-    times, ranks = list[float](), list[int | None]()
-    for number, (seen, described) in enumerate([keyframes[0], *keyframes]):
-        centre = np.array([*seen.position[:2], seen.ground])
-        begin = time.perf_counter()
-        consensus.vote(centre, described, area)
-        if not number:  # the first vote copies the codes that it compares
-            consensus.clear()
-            continue
-        places = consensus.hypotheses()
-        times.append(1e3 * (time.perf_counter() - begin))
-        ranks.append(next((k for k, place in enumerate(places) if right(place.T_map_odom, seen)), None))
+    timed(consensus, keyframes[:1], area)  # the first vote copies the codes that it compares
+    consensus.clear()
     return {
-        "ms": times, "ranks": ranks, "megabytes": peak_megabytes(),
+        **timed(consensus, keyframes, area), "megabytes": peak_megabytes(),
         "index_bytes": sum(values.nbytes for values in index.arrays().values()),
-        "build_s": float((out / "seconds").read_text()),
     }  # fmt: skip
 
 
-def _place(seen: Seen) -> Floats:
+def described(world: Path, site: BaseMap) -> list[Keyframe]:
+    """Return the keyframes of a world's drive, without their scans."""
+    config, out = site.descriptor_config, list[Keyframe]()
+    for seen in keyframes_of(world, site.origin, config):
+        centre = np.array([*seen.position[:2], seen.ground])
+        out.append((replace(seen, scan=seen.scan[:0]), centre, describe(seen.scan, centre, config)))
+    return out
+
+
+def timed(consensus: StationConsensus, keyframes: Sequence[Keyframe], area: Circle | None) -> dict[str, Any]:
+    """Let keyframes vote: milliseconds of each vote with its places, and the rank of the right place, or None."""
+    times, ranks = list[float](), list[int | None]()
+    for seen, centre, descriptors in keyframes:
+        begin = time.perf_counter()
+        consensus.vote(centre, descriptors, area)
+        places = consensus.hypotheses()
+        times.append(1e3 * (time.perf_counter() - begin))
+        ranks.append(next((k for k, place in enumerate(places) if right(place.T_map_odom, seen)), None))
+    return {"ms": times, "ranks": ranks}
+
+
+def place_of(seen: Seen) -> Floats:
     """Place of a keyframe (3,) in the map."""
     return np.asarray((seen.T_map_odom @ np.append(seen.position, 1.0))[:3])
 
@@ -169,7 +164,6 @@ def rows(asked: Namespace) -> Iterator[Row]:
             yield informs(f"{name}: right place named, of {len(votes['ranks'])}", _named(votes), "%")
             yield informs(f"{name}: memory of the process, peak", votes["megabytes"], "MB")
             yield informs(f"{name}: index per station", votes["index_bytes"] / size, "B")
-            yield informs(f"{name}: making the index", votes["build_s"], "s")
             if size == SIZES[-1]:
                 near = isolated(voted, Path(scratch), RADIUS)
                 circle = f"{name}, in a circle of {RADIUS:g} m"

@@ -1,29 +1,35 @@
-"""The whole search step on one core, beside the code of an earlier commit, in a town and on a campus.
+"""The whole search step on one core, in a town and on a campus.
 
-A robot without a place drives twelve keyframes from each of many starts along a simulated run; no place is ever
-accepted, so that the votes of ten keyframes have added up for most steps. Each code builds the map with its own
-command, learned features included, and searches it in a process of its own on the same core; they take turns, drive
-by drive. A row's time is that of ``GlobalSearch.update``, without the frames between keyframes.
+A robot without a place drives twelve keyframes from each of many starts along a simulated run. No place is ever
+accepted, so that most steps have the votes of ten keyframes. The same drives are then searched as usual, for the step
+that accepts a place. The map is built by the command, learned features included. A row's time is that of
+``GlobalSearch.update``, without the frames between keyframes.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
 import sys
+import time
 from argparse import Namespace
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.harness.files import COMMIT, Code, folder, pinned, today
-from bench.harness.rows import Row, against, bounded, informs, reached
+import coview_kernels
+from bench.harness.files import built, folder, isolated, peak_megabytes
+from bench.harness.rows import Row, bounded, informs, reached
 from bench.harness.worlds import prepare
-from coview_stream.errors import InputError
+from coview_stream import BaseMap, Localizer, LocalizerConfig
+from coview_stream.config import AcceptanceConfig
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Run
 from coview_stream.sim import SimulationConfig
 
 WORLDS = {
@@ -32,104 +38,79 @@ WORLDS = {
 }
 """About 10,000 stations each; seeds that nothing was tuned on."""
 
-P50_MS, P95_MS, LEAST_RIVALS, LEAST_RATIO = 60.0, 100.0, 200, 5.0
+P50_MS, P95_MS, LEAST_RIVALS = 60.0, 100.0, 200
 """The targets."""
 
-KEYFRAMES = 12  # of a drive; the consensus has a window of ten
-DRIVES = 9
-_WORKER = Path(__file__).with_name("search_worker.py")
+KEYFRAMES, DRIVES = 12, 9  # of a drive, where the consensus has a window of ten; of a world
+_CROPS = 24  # of the map, as the search engine has it
+_STARTS = 7  # a run's starts lie this share of it apart, then between those
 
 
-class Searcher:
-    """Process that searches a map with the keyframes of a run, drive by drive; close it as a context."""
-
-    def __init__(self, code: Code, site: Path, run: Path, core: int | None = None) -> None:
-        """Start it, on a core (by default the last one that this process may use)."""
-        self._process = subprocess.Popen(
-            code.command(str(_WORKER), str(site), str(run), str(last_core() if core is None else core), str(KEYFRAMES)),
-            env=code.environment(), cwd=site.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        self.steps: list[dict[str, Any]] = []
-        self.fixes: list[dict[str, Any]] = []  # the steps that accepted a place
-        self.megabytes = 0.0
-        self.about = self._answer()
-        self.drive()
-        self.steps.clear()  # of the first drive, while caches fill
-        self.fixes.clear()
-
-    def __enter__(self) -> Searcher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.communicate()
-
-    def _answer(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise InputError(f"a searching process ended with exit code {self._process.wait()}")
-        return dict(json.loads(line))
-
-    def drive(self) -> None:
-        """Search along another drive."""
-        assert self._process.stdin is not None
-        print(flush=True, file=self._process.stdin)
-        found = self._answer()
-        self.steps += found["steps"]
-        self.fixes += [found["fix"]] if found["fix"] else []
-        self.megabytes = found["megabytes"]
-
-    def percentile(self, share: float, key: str = "ms") -> float:
-        """Return a percentile of the steps' milliseconds, of wall time or of the processor's (``cpu_ms``)."""
-        return float(np.percentile([step[key] for step in self.steps], share))
-
-    def rivals(self) -> float:
-        """Return the median number of scored rivals; NaN where results do not tell."""
-        known = [step["rivals"] for step in self.steps if step["rivals"] is not None]
-        return float(np.median(known)) if known else np.nan
+def bind_to_one_core() -> None:
+    """Bind this process to the last core that it may use, where the system can; call it before a kernel starts."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
-def last_core() -> int:
-    """Return the last core that this process may use."""
-    return max(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+def requests(run: Run, localizer: Localizer, number: int) -> Iterator[SearchRequest]:
+    """Yield the search requests of the ``number``-th drive; one that ends with the run begins anew at its start."""
+    share = (number % _STARTS) / _STARTS + (number // _STARTS % 4) / (4 * _STARTS)
+    start, made = int(share * len(run)), 0
+    localizer.reset(number + 1)
+    for step in range(4 * len(run)):
+        at = (start + step) % len(run)
+        if step and not at:
+            localizer.reset(number + 1)  # odometry does not lead from the end to the beginning
+        frame = run.read(at)
+        request = localizer.add_frame(frame.points, frame.T_odom_body, 0.1 * step)
+        if request is not None:
+            made += 1
+            yield request
+        if made == KEYFRAMES:
+            return
+
+
+def searched(site: Path, run_folder: Path, drives: int) -> dict[str, Any]:
+    """Search along some drives: milliseconds of the steps and of those that accept, rivals, and memory."""
+    bind_to_one_core()
+    rule = AcceptanceConfig()
+    object.__setattr__(rule, "risk", sys.float_info.min)  # no place meets it, and no user may ask for it
+    never, usual = LocalizerConfig(acceptance=rule), LocalizerConfig()
+    base_map, run = BaseMap.load(site), open_run(run_folder)
+    maps, index = LocalMaps(base_map, usual.registration.source_range, _CROPS), SearchIndex.of(base_map, usual)
+    coview_kernels.warm_up()
+    index.prepare()
+    searches = [GlobalSearch(base_map, config, maps, index) for config in (never, usual)]
+    localizer = Localizer(base_map, never, maps, index)
+    times, rivals, fixes = list[float](), list[int](), list[float]()
+    for number in range(drives + 1):
+        for search in searches:
+            for request in requests(run, localizer, number):
+                begin = time.perf_counter()
+                result = search.update(request)
+                took = 1e3 * (time.perf_counter() - begin)
+                if not number:  # caches fill during the first drive
+                    continue
+                if search is searches[0]:
+                    times.append(took)
+                    rivals.append(len(result.rivals))
+                elif result.accepted is not None:
+                    fixes.append(took)
+                    break
+    return {"stations": len(base_map), "ms": times, "rivals": rivals, "fixes": fixes, "megabytes": peak_megabytes()}
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Time both worlds."""
-    try:
-        codes = {"ours": today(), "pinned": pinned()}
-    except InputError as error:
-        print(f"search: no ratio: {error}", file=sys.stderr)
-        codes = {"ours": today()}
-    for name, config in WORLDS.items():
-        world = prepare(folder(), config)
-        with ExitStack() as stack:
-            sides = {}
-            for side, code in codes.items():
-                site = code.built([world / "base.laz"], world / f"{side}.coview")
-                sides[side] = stack.enter_context(Searcher(code, site, world / "run"))
-            for turn in range(3 if asked.quick else DRIVES):
-                for side in list(sides)[:: -1 if turn % 2 else 1]:
-                    sides[side].drive()
-            yield from _judged(name, sides)
-
-
-def _judged(world: str, sides: dict[str, Searcher]) -> Iterator[Row]:
-    ours, other = sides["ours"], sides.get("pinned")
-    name = f"search/{world}, {ours.about['stations']} stations"
-    details = {side: {"steps": searcher.steps, **searcher.about} for side, searcher in sides.items()}
-    for label, share, most in (("p50", 50, P50_MS), ("p95", 95, P95_MS)):
-        yield bounded(f"{name}: step {label}", ours.percentile(share), "ms", most)
-    if other is not None:
-        earlier = f"beside commit {COMMIT[:7]}"
-        for label, share, least in (("p50", 50, LEAST_RATIO), ("p95", 95, None)):
-            both = [side.percentile(share) for side in (ours, other)]
-            yield against(f"{name}: step {label} {earlier}", both[0], both[1], "ms", least)
-        both = [side.percentile(50, "cpu_ms") for side in (ours, other)]  # nearly the same on a busy machine
-        yield against(f"{name}: step p50 {earlier}, processor time", both[0], both[1], "ms", None)
-    yield reached(f"{name}: rivals scored per step, median", ours.rivals(), "", LEAST_RIVALS)
-    if ours.fixes:
-        median = float(np.median([step["ms"] for step in ours.fixes]))
-        yield informs(f"{name}: step that accepts a place, median of {len(ours.fixes)}", median, "ms", {})
-    yield informs(f"{name}: memory of the searching process, peak", ours.megabytes, "MB", details)
+    for world, config in WORLDS.items():
+        below = prepare(folder(), config)
+        site = built(below / "base.laz", below / "searched.coview")
+        done = isolated(searched, site, below / "run", 3 if asked.quick else DRIVES)
+        name = f"search/{world}, {done['stations']} stations"
+        for share, most in ((50, P50_MS), (95, P95_MS)):
+            yield bounded(f"{name}: step p{share}", float(np.percentile(done["ms"], share)), "ms", most)
+        yield reached(f"{name}: rivals scored per step, median", float(np.median(done["rivals"])), "", LEAST_RIVALS)
+        if done["fixes"]:
+            median = float(np.median(done["fixes"]))
+            yield informs(f"{name}: step that accepts a place, median of {len(done['fixes'])}", median, "ms")
+        yield informs(f"{name}: memory of the searching process, peak", done["megabytes"], "MB", done)

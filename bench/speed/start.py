@@ -1,10 +1,8 @@
 """From nothing to ready: import, ``serve``, its search engine, and the first run ever; new processes, wall time.
 
-``serve`` is ready when it says so: map open, sessions open, and the tracking engine waits for frames with the kernels
-that the first of them launch. ``search prepared`` is a search engine alone, until a keyframe would be searched for at
-once: all its kernels loaded, the map's index and features read. The first run ever is the same with an empty cache of
-compiled kernels; what the tracking engine compiles between its first frames takes seconds then. The map is a small
-simulated one: opening maps a file of any size.
+``serve`` is ready when it reports so: map and sessions are open, and the tracking engine waits for frames with its
+first kernels loaded. ``search prepared`` is a search engine alone, until it has its kernels, index and features. The
+first run ever has an empty cache of compiled kernels. The map is small and simulated: files of any size are mapped.
 """
 
 from __future__ import annotations
@@ -58,19 +56,15 @@ def served(site: Path, **variables: str) -> float:
 
 def search_prepared(site: Path, **variables: str) -> float:
     """Seconds until a new search engine would begin with a keyframe."""
-    with mock.patch.dict(os.environ, variables):
-        return _search_prepared(site)
-
-
-def _search_prepared(site: Path) -> float:
     engine = EngineProcess("search", str(site), BaseMap.load(site).sha256)
-    begin = time.perf_counter()
-    try:
-        engine.start()
-        engine.wait_prepared()
-        return time.perf_counter() - begin
-    finally:
-        engine.close()
+    with mock.patch.dict(os.environ, variables):
+        begin = time.perf_counter()
+        try:
+            engine.start()
+            engine.wait_prepared()
+            return time.perf_counter() - begin
+        finally:
+            engine.close()
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -82,10 +76,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     site = map_of(folder(), config)
     served(site)  # leaves the compiled kernels in the cache
     yield bounded("start/serve ready", float(np.median([served(site) for _ in range(serves)])), "s", READY)
-    prepared = float(np.median([search_prepared(site) for _ in range(serves)]))
-    yield informs("start/search prepared", prepared, "s")
-    with tempfile.TemporaryDirectory(prefix="coview-cache.") as cache:
-        yield bounded("start/serve ready, first run ever", served(site, TI_OFFLINE_CACHE_FILE_PATH=cache), "s", FIRST)
-    with tempfile.TemporaryDirectory(prefix="coview-cache.") as cache:
-        prepared = search_prepared(site, TI_OFFLINE_CACHE_FILE_PATH=cache)
-        yield bounded("start/search prepared, first run ever", prepared, "s", FIRST)
+    yield informs("start/search prepared", float(np.median([search_prepared(site) for _ in range(serves)])), "s")
+    for name, measure in (("serve ready", served), ("search prepared", search_prepared)):
+        with tempfile.TemporaryDirectory(prefix="coview-cache.") as cache:
+            seconds = measure(site, TI_OFFLINE_CACHE_FILE_PATH=cache)
+            yield bounded(f"start/{name}, first run ever", seconds, "s", FIRST)

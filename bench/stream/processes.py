@@ -1,7 +1,7 @@
 """The processes around the node: a router with a metronome, senders, a rogue; and the recorder, in this process.
 
-They use raw zenoh and the documented keys. The metronome ticks at 10 Hz through the same router: what the recorder sees
-of its jitter is the machine's own, to be compared with that of the poses.
+They use raw zenoh and the documented keys. The metronome ticks at 10 Hz through the same router; its jitter at the
+recorder is the machine's own, to be compared with the poses'.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from coview_stream.recordings.run import Run
 from coview_stream.report.evaluation import driven
 
 EPOCH_NS = 1_700_000_000 * 10**9
-"""Where the robots' sensor clocks begin: no clock of the machine, as a robot's is none of the node's."""
+"""The begin of the robots' sensor clocks, which is no time of the machine."""
 
 _APART = 31  # frames between the starts of neighbouring robots
 
@@ -49,20 +49,15 @@ class RobotPlan:
     odometry: str = "json"
     cloud_period: float = 0.1
     odometry_period: float = 0.02
-    frame_seconds: float = 0.1  # how long one frame of the run lasts (recorded: 0.1)
+    frame_seconds: float = 0.1  # between frames of the run (recorded: 0.1)
     points: int | None = None  # to which every cloud is resampled
 
-
-def schedule(plan: RobotPlan) -> list[tuple[float, Kind]]:
-    """Everything the robot sends as (time, kind), in order; at equal times odometry first."""
-    periods: dict[Kind, float] = {"odometry": plan.odometry_period, "cloud": plan.cloud_period}
-    times = [
-        (round(k * period, 6), kind)
-        for kind, period in periods.items()
-        if period > 0
-        for k in range(round(plan.seconds / period))
-    ]
-    return sorted(times, key=lambda item: item[0])
+    def schedule(self) -> list[tuple[float, Kind]]:
+        """Return the times of all messages with their kinds, in order; at equal times odometry first."""
+        periods: dict[Kind, float] = {"odometry": self.odometry_period, "cloud": self.cloud_period}
+        counts = {kind: round(self.seconds / period) if period else 0 for kind, period in periods.items()}
+        times = [(round(k * periods[kind], 6), kind) for kind, count in counts.items() for k in range(count)]
+        return sorted(times, key=lambda item: item[0])
 
 
 def stamp_of(content: float) -> int:
@@ -90,21 +85,17 @@ class Drive:
 
     def T_odom_body(self, content: float) -> Pose:
         """Return the odometry, between frames as well."""
-        return _odometry(self._world, round(self._at(content), 6))
+        return _between(_run(self._world).poses, self._at(content))
 
     def truth(self, stamp_ns: int) -> Pose:
         """Return the true T_map_body at a published stamp."""
-        return _between(self._truth, self._at(_content(stamp_ns)))
+        return _between(self._truth, self._at((stamp_ns - EPOCH_NS) / 1e9))
 
     def metres(self, stamp_ns: int) -> float:
         """Distance driven until a published stamp; only for drives that do not turn back before."""
         way = driven(self._truth)
-        at = self._start + _content(stamp_ns) / self._plan.frame_seconds
+        at = self._start + (stamp_ns - EPOCH_NS) / 1e9 / self._plan.frame_seconds
         return float(np.interp(at, np.arange(len(way)), way) - way[self._start])
-
-
-def _content(stamp_ns: int) -> float:
-    return (stamp_ns - EPOCH_NS) / 1e9
 
 
 def _between(poses: Floats, at: float) -> Pose:
@@ -115,11 +106,6 @@ def _between(poses: Floats, at: float) -> Pose:
 @functools.cache
 def _run(world: Path) -> Run:
     return open_run(world / "run")
-
-
-@functools.lru_cache(20_000)  # shared by the robots of a process, likewise
-def _odometry(world: Path, at: float) -> Pose:
-    return _between(_run(world).poses, at)
 
 
 @functools.cache  # shared by the robots of a process
@@ -218,7 +204,7 @@ def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan
     import zenoh
 
     drives = {plan.robot: Drive(world, plan) for plan in plans}
-    todo = sorted(((due, plan) for plan in plans for due in schedule(plan)), key=lambda item: item[0][0])
+    todo = sorted(((due, plan) for plan in plans for due in plan.schedule()), key=lambda item: item[0][0])
     for (content, kind), plan in todo:
         if kind == "cloud":
             drives[plan.robot].cloud(content)
@@ -286,33 +272,31 @@ def rubbish(seed: int) -> Iterator[Encoded]:
 
 @dataclass
 class Recorder:
-    """Everything the robots' outputs said, with the time of its arrival; costs microseconds per message."""
+    """All outputs of the robots with their times of arrival; costs microseconds a message."""
 
     endpoint: str
     arrived: list[tuple[float, str, bytes, str]] = field(default_factory=list)
-    tokens: list[tuple[float, str, bool]] = field(default_factory=list)
+    tokens: dict[str, bool] = field(default_factory=dict)
     unreadable: int = 0
 
     def __enter__(self) -> Recorder:
         import zenoh
 
+        def record(sample: Any) -> None:
+            at = time.monotonic()
+            self.arrived.append((at, str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
+
+        def token(sample: Any) -> None:
+            self.tokens[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
+
         self.session = open_session("client", connect=[self.endpoint])
-        direct = zenoh.handlers.Callback(self._record, indirect=False)
+        direct = zenoh.handlers.Callback(record, indirect=False)
         self._held = [self.session.declare_subscriber(key, direct) for key in ("coview/*/out/*", METRONOME)]
-        self._held.append(self.session.liveliness().declare_subscriber("coview/*/alive", self._token, history=True))
+        self._held.append(self.session.liveliness().declare_subscriber("coview/*/alive", token, history=True))
         return self
 
     def __exit__(self, *_: object) -> None:
         self.session.close()
-
-    def _record(self, sample: Any) -> None:
-        at = time.monotonic()
-        self.arrived.append((at, str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
-
-    def _token(self, sample: Any) -> None:
-        import zenoh
-
-        self.tokens.append((time.monotonic(), str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     def _of(self, key: str, begin: float, end: float) -> list[tuple[float, str, bytes, str]]:
         return [row for row in list(self.arrived) if row[1] == key and begin <= row[0] < end]
@@ -331,8 +315,8 @@ class Recorder:
 
     def told(self, robot: str, begin: float = 0.0, end: float = float("inf")) -> list[Told]:
         """Statuses of a robot that arrived within a period."""
-        rows = self._of(f"coview/{robot}/out/status", begin, end)
-        return [Told(at, json.loads(payload)) for at, _, payload, _ in rows]
+        statuses = self._of(f"coview/{robot}/out/status", begin, end)
+        return [Told(at, json.loads(payload)) for at, _, payload, _ in statuses]
 
     def ticks(self, begin: float = 0.0, end: float = float("inf")) -> list[float]:
         """Arrivals of the metronome."""
@@ -340,16 +324,7 @@ class Recorder:
 
     def alive(self, robot: str) -> bool:
         """Whether the robot's token is there."""
-        known = [put for _, key, put in list(self.tokens) if key == f"coview/{robot}/alive"]
-        return bool(known and known[-1])
-
-    def query(self, robot: str, name: str, payload: bytes | None = None, parameters: str = "") -> list[str]:
-        """Ask one of the node's procedures; every reply as text, errors with their mark."""
-        selector = f"coview/{robot}/rpc/{name}" + (f"?{parameters}" if parameters else "")
-        return [
-            reply.ok.payload.to_string() if reply.ok else "error: " + reply.err.payload.to_string()
-            for reply in self.session.get(selector, payload=payload, timeout=3.0)
-        ]
+        return self.tokens.get(f"coview/{robot}/alive", False)
 
 
 def wait_until(true: Callable[[], bool], seconds: float, every: float = 0.05) -> bool:

@@ -12,7 +12,6 @@ from bench.__main__ import BENCHMARKS, Benchmark, run
 from bench.harness import rows
 from bench.harness.files import fingerprint, remembered
 from bench.harness.rows import Row, against, bounded, failed, informs, judged, medians, reached
-from bench.speed import stages
 from coview_stream.errors import InputError
 
 
@@ -108,12 +107,6 @@ def test_every_benchmark_loads():
     for entry in BENCHMARKS.values():
         if not entry.module.startswith(("stream", "soak")):  # they watch processes with psutil: extra bench
             assert callable(entry.load().rows)
-
-
-def test_every_stage_names_a_function():
-    for _, where in (*stages.TRACKING, *stages.SEARCH):
-        owner, name = stages.looked_up(where)
-        assert callable(getattr(owner, name))
 
 
 @pytest.mark.slow

@@ -1,6 +1,4 @@
-"""Scores of the forest benchmarks follow from planted answers; sets of others are read with care."""
-
-import pickle
+"""Scores of the forest benchmarks follow from planted answers."""
 
 import numpy as np
 import pytest
@@ -8,8 +6,6 @@ from drives_with_truth import track
 
 from bench.forest import runs
 from bench.forest.forest import METHODS, STEPS, distinct, false, metric_table, recall, success
-from bench.forest.recognition import rank, read_sites, recalls
-from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 
 
@@ -59,35 +55,3 @@ def test_a_run_is_scored_by_two_metres_and_outside_every_pose_is_false():
     assert (row["driven_m"], row["first_fix_m"], row["posed"], row["false"]) == (40.0, 10.0, 0.6, 1)
     assert row["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
     assert runs.scored(drive, truth, outside=True)["false"] == 3
-
-
-def test_ranks_and_recalls():
-    distance = np.array([0.4, 0.1, 0.3, 0.2], np.float32)
-    assert (rank(distance, [1]), rank(distance, [0, 2]), rank(np.ones(4, np.float32), [2])) == (1, 3, 4)
-    found = recalls(np.array([1, 2, 5, 10]), 300)
-    assert found == pytest.approx({"AR@1": 25.0, "AR@5": 75.0, "AR@1 %": 50.0, "MRR": 45.0})
-
-
-class Harmful:
-    def __reduce__(self):
-        return (print, ("run",))
-
-
-def test_nothing_in_a_pickle_is_run(tmp_path, capsys):
-    for name in ("database", "query"):
-        (tmp_path / f"umd_evaluation_{name}.pickle").write_bytes(pickle.dumps([{0: Harmful()}]))
-    with pytest.raises(InputError, match="no plain data"):
-        read_sites(tmp_path)
-    assert "run" not in capsys.readouterr().out
-
-
-def test_submaps_of_a_traverse_are_right_within_metres(tmp_path):
-    for name, y in (("01", 0.0), ("02", 1.0)):
-        (tmp_path / "Tiny" / name / "Clouds").mkdir(parents=True)
-        lines = [f"{k},{20.0 * k},{y},0,0,0,0,1" for k in range(5)]
-        head = "timestamp,x,y,z,qx,qy,qz,qw"
-        (tmp_path / "Tiny" / name / "poses.csv").write_text("\n".join([head, *lines, ""]))
-    (site,) = read_sites(tmp_path)
-    assert site.pairs() == [(0, 1), (1, 0)]
-    assert site.right(0, 1, 3) == [3]
-    assert read_sites(tmp_path, within=30.0)[0].right(0, 1, 3) == [2, 3, 4]

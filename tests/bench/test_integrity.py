@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from bench.harness.rows import lower, upper
+from bench.harness.rows import upper
 from bench.integrity import integrity
 from bench.integrity.integrity import Tally, class_table, classes, false_list, family_table, plain, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
@@ -30,20 +30,18 @@ def test_upper_bound_is_clopper_pearsons(events, runs, bound):
 
 def test_bound_without_events_is_that_of_the_rule_of_three():
     assert upper(0, 1000) == pytest.approx(1 - 0.05 ** (1 / 1000))
-    assert lower(1000, 1000) == pytest.approx(0.05 ** (1 / 1000))
 
 
 @pytest.mark.parametrize(("events", "runs"), [(1, 20), (7, 20), (19, 20)])
-def test_bounds_leave_five_percent_of_the_binomial_on_either_side(events, runs):
+def test_a_bound_leaves_five_percent_of_the_binomial(events, runs):
     def at_most(k, p):
         return sum(math.comb(runs, j) * p**j * (1 - p) ** (runs - j) for j in range(k + 1))
 
     assert at_most(events, upper(events, runs)) == pytest.approx(0.05)
-    assert 1 - at_most(events - 1, lower(events, runs)) == pytest.approx(0.05)
 
 
-def test_bounds_of_nothing_say_nothing_and_impossible_counts_are_refused():
-    assert (lower(0, 0), upper(0, 0)) == (0.0, 1.0)
+def test_a_bound_of_nothing_is_one_and_impossible_counts_are_refused():
+    assert upper(0, 0) == 1.0
     with pytest.raises(ValueError, match="5 events of 4 runs"):
         upper(5, 4)
 
