@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import small_world
 
+from coview_kernels import Registration
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.localization.calibration.calibration import RawScan
@@ -14,7 +15,6 @@ from coview_stream.localization.calibration.estimator import CalibrationEstimato
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import Registration
 from coview_stream.localization.tracking.tracker import Tracker
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])

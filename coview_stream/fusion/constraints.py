@@ -21,7 +21,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, along_body, boxminus, inverse, pose_from, yaw_of
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
-from coview_stream.localization.registration.register import Prior, register, registration_covariance, remove_prior
+from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 # chosen by hand
@@ -193,18 +193,19 @@ class Registrar:
         if not len(scan.points):
             return None
         information, pivot, config = np.diag(_BELIEF**-2), np.zeros(3), self._config
-        prior = Prior(T_start @ inverse(turn), information)
+        prior = kernels.Prior(T_start @ inverse(turn), information)
         match = register(scan, prior.T_map_source, target, config, _SCALES, prior, pivot)
         if match is None or match.pairs < (_ON_MAP if other < 0 else _ON_SUBMAP) * config.keep * len(scan.points):
             return None
         shared = SharedErrorModel(config)
         shared.learn(scan, match.T_map_source, target, pivot)
         try:
-            measured = remove_prior(match.T_map_source @ turn, match.information, T_start, information, config)
-            covariance = registration_covariance(measured.information, config) + shared.covariance
+            of_body = match._replace(T_map_source=match.T_map_source @ turn)
+            T, measured = remove_prior(of_body, kernels.Prior(T_start, information), config)
+            covariance = registration_covariance(measured, config) + shared.covariance
         except InputError:
             return None
-        return Constraint(k, other, T_answer @ measured.T_map_body, along_body(covariance, measured.T_map_body))
+        return Constraint(k, other, T_answer @ T, along_body(covariance, T))
 
     def apart_from_map(self, k: int, T_map_body: Pose) -> Floats:
         """Return distances (M,) of a submap's points to the base map's surfaces, within half a metre."""

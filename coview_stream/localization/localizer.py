@@ -208,7 +208,7 @@ class Localizer:
         self._confidence = result.evidence.confidence or 0.0
         assert result.T_map_cloud is not None  # the accepted place leads
         T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
-        registration = replace(registration, T_map_source=T_map_odom)
+        registration = registration._replace(T_map_source=T_map_odom)
         self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._requests.place_accepted()

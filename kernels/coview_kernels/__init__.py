@@ -12,7 +12,7 @@ from coview_kernels.covisibility import coview
 from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.distinct import distinct_poses
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, Move, field_scores, near_structure, unexplained
-from coview_kernels.icp import SCATTER, Alignment, Belief, Scale, align_planes
+from coview_kernels.icp import SCATTER, Prior, Registration, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.polar import describe_points, polar_bin, station_bins
@@ -25,8 +25,6 @@ from coview_kernels.windows import WindowImages, WindowRaster, window_products
 
 __all__ = [
     "SCATTER",
-    "Alignment",
-    "Belief",
     "CodedQuery",
     "Crop",
     "Cut",
@@ -37,7 +35,9 @@ __all__ = [
     "OverheadGrid",
     "PointGrid",
     "PolarGrid",
+    "Prior",
     "Raster",
+    "Registration",
     "Scale",
     "StationCodes",
     "VoxelFilter",

@@ -23,10 +23,10 @@ from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I64, Mask, as_finite64, as_float32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import SAMPLE_GRID, PointGrid
-from coview_kernels.reference.icp import SCATTER, Alignment, Plan, Scale
+from coview_kernels.reference.icp import SCATTER, Plan, Registration, Scale
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-__all__ = ["SCATTER", "Alignment", "Belief", "Scale", "align_planes"]
+__all__ = ["SCATTER", "Prior", "Registration", "Scale", "align_planes"]
 
 _TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS = 14, 15, 16, 17, 53
 _LOST = 2
@@ -34,13 +34,13 @@ _BINS = 2048
 _FAR = 1e18  # metres, where the partner of a point is that has none
 
 
-class Belief(NamedTuple):
-    """A Gaussian belief about the pose, fused with the normal equations of the pairs."""
+class Prior(NamedTuple):
+    """A Gaussian over the pose, by its information, as it may leave directions open."""
 
-    mean: npt.ArrayLike
-    """(4, 4) ``T_target_source``."""
-    information: npt.ArrayLike
-    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the pivot, then a shift, along the target's axes."""
+    T_map_source: F64
+    """(4, 4) mean."""
+    information: F64
+    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the pivot, then a shift, along the map's axes."""
 
 
 def align_planes(
@@ -55,8 +55,8 @@ def align_planes(
     keep: float,
     iterations: int,
     min_pairs: int = 50,
-    prior: Belief | None = None,
-) -> Alignment | None:
+    prior: Prior | None = None,
+) -> Registration | None:
     """Register points to a map of points with normals.
 
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
@@ -71,16 +71,16 @@ def align_planes(
         normals: (K, 3) float32, its normals, as long as the planarity around each point: 1 on a surface, 0 in scatter.
         source: (N, 3) float32, source frame, metres. Rows with NaN or inf find no partner.
         kind: (N,) bool.
-        T: (4, 4) ``T_target_source`` to begin with.
+        T: (4, 4) ``T_map_source`` to begin with.
         pivot: (3,) source-frame point that rotations are about.
         scales: coarse to fine.
         keep: share of the pairs in (0, 1].
         iterations: at most, on each scale.
         min_pairs: pairs that an answer needs, at least 1.
-        prior: belief to fuse.
+        prior: fused with the normal equations of the pairs.
 
     Returns:
-        The pose with its evidence (see :class:`Alignment`), or None where too few points find a partner.
+        The pose with its evidence (see :class:`Registration`), or None where too few points find a partner.
 
     Raises:
         ValueError: a shape is wrong, a pose not finite, or a setting out of its range; the message names it.
@@ -104,7 +104,7 @@ def align_planes(
         raise ValueError(f"min_pairs must be at least 1, got {min_pairs}")
     belief = None
     if prior is not None:
-        mean = as_finite64("the prior's mean", prior.mean, 4, 4)
+        mean = as_finite64("the prior's mean", prior.T_map_source, 4, 4)
         belief = mean, as_finite64("the prior's information", prior.information, 6, 6)
     plan = Plan(
         as_finite64("T", T, 4, 4), as_finite64("pivot", pivot, 3), tuple(scales), keep, iterations, min_pairs,
@@ -117,7 +117,7 @@ def align_planes(
     )
 
 
-def _plain(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
+def _plain(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Registration | None:
     return reference.align_planes(grid.tree, normals, source, kind, plan)
 
 
@@ -130,7 +130,7 @@ _launch = Launch(
 """One is enough: only one call of native code runs at a time."""
 
 
-def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
+def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Registration | None:
     cells, chunks, n = grid.cells, runtime.workers(), len(source)
     memory, partners = np.full(4 * n, -1.0), np.full(6 * n, _FAR, dtype=np.float32)
     bins = np.empty(n + 2 * chunks * _BINS, dtype=np.int32)
@@ -151,7 +151,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     pose[:3] = state[:12].reshape(3, 4)
     information = state[_INFORMATION:_SUMS].reshape(6, 6).copy()
     squares, weights, pairs = state[_SUMS + 27 : _SUMS + 30]
-    return Alignment(
+    return Registration(
         pose, information, math.sqrt(squares / weights), int(pairs), int(state[_TOTAL]), bool(state[_CONVERGED])
     )
 

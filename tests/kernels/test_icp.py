@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kernel_cases import parallel_parts
 from scipy.spatial.transform import Rotation
 
-from coview_kernels import Belief, PointGrid, Scale, align_planes, reference
+from coview_kernels import PointGrid, Prior, Scale, align_planes, reference
 from coview_kernels.reference.icp import Plan
 
 SCALES = (Scale(1.5, 0.5, 0.02, 1e-3), Scale(0.8, 0.26), Scale(0.4, 0.13))
@@ -55,7 +55,7 @@ def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, min_p
     """Answers of the kernel and of its twin."""
     options = FIXED | changes
     ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, min_pairs=min_pairs, **options)
-    belief = None if prior is None else (np.asarray(prior.mean), np.asarray(prior.information))
+    belief = None if prior is None else (np.asarray(prior.T_map_source), np.asarray(prior.information))
     plan = Plan(T, pivot, scales, options["keep"], options["iterations"], min_pairs, belief)
     return ours, reference.align_planes(grid.tree, normals, local, above, plan)
 
@@ -67,8 +67,8 @@ def assert_same(ours, plain, pivot):
         return
     assert (ours.pairs, ours.iterations, ours.converged) == (plain.pairs, plain.iterations, plain.converged)
     middle = np.append(pivot, 1.0)
-    np.testing.assert_allclose(ours.T @ middle, plain.T @ middle, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(ours.T[:3, :3], plain.T[:3, :3], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(ours.T_map_source @ middle, plain.T_map_source @ middle, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(ours.T_map_source[:3, :3], plain.T_map_source[:3, :3], rtol=0, atol=1e-7)
     scale = np.abs(plain.information).max()
     np.testing.assert_allclose(ours.information, plain.information, rtol=1e-6, atol=1e-7 * scale)
     assert ours.rmse == pytest.approx(plain.rmse, rel=1e-6, abs=1e-9)
@@ -89,12 +89,12 @@ def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every, scat
     start = truth @ pose(rng.normal(0, 0.02, 3), np.zeros(3))
     start[:3, 3] += truth[:3, :3] @ pivot - start[:3, :3] @ pivot + rng.uniform(-0.4, 0.4, 3)
     local[::97] = np.nan
-    prior = Belief(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
+    prior = Prior(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
     with parallel_parts(threads):
         scales = tuple(scale._replace(every=n) for scale, n in zip(SCALES, every, strict=True))
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior, scales)
     assert_same(ours, plain, pivot)
-    assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < (0.2 if scattered else 0.1)
+    assert np.linalg.norm((ours.T_map_source - truth) @ np.append(pivot, 1.0)) < (0.2 if scattered else 0.1)
 
 
 def test_scatter_tells_of_all_directions_whatever_its_normals():
@@ -114,7 +114,7 @@ def test_scatter_tells_of_all_directions_whatever_its_normals():
         normals[: len(blobs)] *= planarity
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot)
         assert_same(ours, plain, pivot)
-        off[planarity] = np.linalg.norm((ours.T @ np.append(pivot, 1.0))[:2] - pivot[:2])
+        off[planarity] = np.linalg.norm((ours.T_map_source @ np.append(pivot, 1.0))[:2] - pivot[:2])
     assert off[0.0] < 0.1 < 0.2 < off[1.0]
 
 
@@ -131,7 +131,7 @@ def test_pairs_of_equal_distance_are_kept_together():
         )
         assert_same(ours, plain, np.zeros(3))
         assert ours.pairs == len(local)
-        np.testing.assert_allclose(ours.T, np.eye(4), atol=1e-6)
+        np.testing.assert_allclose(ours.T_map_source, np.eye(4), atol=1e-6)
 
 
 def test_converges_from_a_start_half_a_radian_off():
@@ -170,10 +170,10 @@ def test_prior_decides_unobservable_directions():
     local = floor[::3]
     pivot = local.mean(axis=0, dtype=np.float64)
     mean = pose([0, 0, 0.05], [0.3, -0.2, 0.0])
-    belief = Belief(mean, np.diag([1.0, 1.0, 1e6, 1e6, 1e6, 1.0]))
+    belief = Prior(mean, np.diag([1.0, 1.0, 1e6, 1e6, 1e6, 1.0]))
     ours, plain = both(PointGrid(floor), up, local, np.zeros(len(local), bool), np.eye(4), pivot, belief)
     assert_same(ours, plain, pivot)
-    np.testing.assert_allclose(ours.T, mean, atol=2e-3)
+    np.testing.assert_allclose(ours.T_map_source, mean, atol=2e-3)
 
 
 def test_empty_map_or_source_returns_none():
@@ -193,7 +193,7 @@ def test_errors_name_the_argument():
     bad = {
         "normals": cloud[:1], "source": np.zeros(3), "kind": np.ones(3), "T": np.full((4, 4), np.nan),
         "pivot": [0, 0, np.inf], "scales": [Scale(0.0, 1.0)], "keep": 1.1, "iterations": 0,
-        "prior": Belief(np.eye(4), np.full((6, 6), np.inf)),
+        "prior": Prior(np.eye(4), np.full((6, 6), np.inf)),
     }  # fmt: skip
     for name, value in bad.items():
         with pytest.raises(ValueError, match=name.rstrip("s")):

@@ -36,7 +36,7 @@ def succeeds(code: str, **environment: str) -> str:
 
 def test_public_names():
     assert set(coview_kernels.__all__) == {
-        *("SCATTER", "Alignment", "Belief", "Scale", "align_planes"),
+        *("SCATTER", "Prior", "Registration", "Scale", "align_planes"),
         *("VoxelFilter", "describe_points"),
         *("Raster", "Crop", "Cut", "crop_points"),
         *("WindowImages", "WindowRaster", "window_products"),

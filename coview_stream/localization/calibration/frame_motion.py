@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
@@ -28,7 +29,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import Prior, register
+from coview_stream.localization.registration.register import register
 
 # set by hand
 _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
@@ -122,7 +123,7 @@ class FrameMotion:
         if len(scan.points) < MIN_PAIRS:
             return None
         free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
-        prior = Prior(np.eye(4), np.diag(free**-2.0))
+        prior = kernels.Prior(np.eye(4), np.diag(free**-2.0))
         registration = register(scan, np.eye(4), target, self._config, _SCALES, prior, T_odom_body[:3, 3])
         return None if registration is None else registration.T_map_source @ T_odom_body
 

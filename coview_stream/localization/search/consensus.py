@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_kernels import Registration
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import Evidence
-from coview_stream.localization.registration.register import Registration
 
 _KEPT = 8  # places per requested hypothesis that stay from keyframe to keyframe
 _BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of the distances that make places distinct: bins that keep the best place each

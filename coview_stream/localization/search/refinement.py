@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_kernels import Move
+from coview_kernels import Move, Prior
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
@@ -21,7 +21,7 @@ from coview_stream.localization.evidence.background import observe_with_backgrou
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import Prior, register
+from coview_stream.localization.registration.register import register
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from coview_kernels import Prior
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.errors import InputError
@@ -15,7 +16,7 @@ from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.evidence.observation import Evidence, ObservedScan
 from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.register import Prior, register, registration_covariance, remove_prior
+from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
@@ -202,14 +203,14 @@ class MapMatcher:
         if tilt > acceptance.max_tilt:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
-            T_map_body = T_map_odom @ scan.T_odom_body
-            measured = remove_prior(T_map_body, registration.information, belief.T_map_body, information, settings)
-            covariance = registration_covariance(measured.information, settings)
-            innovation = predicted.innovation(measured.T_map_body, covariance)
+            of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
+            T_map_body, measured = remove_prior(of_body, Prior(belief.T_map_body, information), settings)
+            covariance = registration_covariance(measured, settings)
+            innovation = predicted.innovation(T_map_body, covariance)
         except InputError as error:
             return _failed(belief, str(error), evidence, observation)
         verdict = MatchVerdict(cause, reason, evidence, innovation, observation)
-        return MapMatch(verdict, measured.T_map_body, covariance, innovation, scan, target, tuple(rivals))
+        return MapMatch(verdict, T_map_body, covariance, innovation, scan, target, tuple(rivals))
 
     def match_widely(
         self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, predicted: Estimate

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from coview_kernels import Registration
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
@@ -18,7 +19,6 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import (
-    Registration,
     propagate,
     registration_covariance,
     swap_rotation_translation,

@@ -46,11 +46,11 @@ class Plan(NamedTuple):
     prior: tuple[F64, F64] | None
 
 
-class Alignment(NamedTuple):
-    """Result of a registration, with its evidence."""
+class Registration(NamedTuple):
+    """Registered pose, its information, and how the points fit there."""
 
-    T: F64
-    """(4, 4) ``T_target_source``."""
+    T_map_source: F64
+    """(4, 4)."""
     information: F64
     """(6, 6) over (rx, ry, rz, x, y, z) about the moved pivot before the last step, the prior included."""
     rmse: float
@@ -63,7 +63,7 @@ class Alignment(NamedTuple):
     """Whether the last step was small enough to stop."""
 
 
-def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
+def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan) -> Registration | None:
     """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
     T, total, answer = plan.T, 0, None
     for scale in plan.scales:
@@ -79,7 +79,7 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
             total += 1
             turn, shift = np.linalg.norm(increment[:3]), np.linalg.norm(increment[3:])
             converged = bool(shift < scale.shift and turn < scale.turn)
-            answer = Alignment(T, information, rmse, pairs, total, converged)
+            answer = Registration(T, information, rmse, pairs, total, converged)
             if converged:
                 break
     return answer

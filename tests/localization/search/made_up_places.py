@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from coview_kernels import Registration
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import Evidence
-from coview_stream.localization.registration.register import Registration
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest
