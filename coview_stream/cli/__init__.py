@@ -31,13 +31,10 @@ COMMANDS = (
 )
 """Names in the order of ``--help``."""
 
-_MODULES = {
-    "eval": "evaluate",
-    "serve-map": "serve_map",
-}  # a module called eval would shadow the builtin where it is imported
+_MODULES = {"eval": "evaluate", "serve-map": "serve_map"}  # a module called eval would shadow the builtin
 
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
-"""Extras that bring all that a command needs; what the others lack says it by itself."""
+"""Extras with the libraries of a command; other commands name what they lack themselves."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -88,10 +85,12 @@ def _main(argv: Sequence[str] | None) -> int:
         print(file=sys.stderr)
         return 130
     except BrokenPipeError:
-        _discard_stdout()
+        with contextlib.suppress(OSError, ValueError):  # or the interpreter would report the closed pipe at its exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        return _fail(_describe(error))
+        reason = error.strerror or str(error) or type(error).__name__
+        return _fail(f"{error.filename}: {reason}" if error.filename else reason)
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
@@ -155,14 +154,3 @@ def _show_warning(
         print(f"{PROGRAM}: warning: {' '.join(str(message).split())}", file=sys.stderr)
     else:
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
-
-
-def _describe(error: OSError) -> str:
-    reason = error.strerror or str(error) or type(error).__name__
-    return f"{error.filename}: {reason}" if error.filename else reason
-
-
-def _discard_stdout() -> None:
-    """Point stdout at the null device; the interpreter would report the closed pipe at its exit."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from coview_stream.cli.options import add_progress
+from coview_stream.cli.options import add_shared
 
 if TYPE_CHECKING:
     import os
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
-    add_progress(parser)
+    add_shared(parser, "--progress")
     tiles = parser.add_argument_group("directories of tiles")
     tiles.add_argument(
         "--workers", type=int, metavar="N", help="processes that build tiles (as many as cores, 8 at most)"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, local_map
-from coview_stream.cli.options import add_json, add_mount, add_network, add_preset, add_topics, check_codec, mount_of
+from coview_stream.cli.options import add_network, add_shared, check_codec, mount_of
 from coview_stream.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
@@ -33,18 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--run", type=Path, dest="run_path", metavar="RUN", help="judge it, and search the map for it"
     )
     recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="of the run, as for locate (auto)")
-    add_mount(recorded)
-    add_topics(recorded)
+    add_shared(recorded, "--mount", "--cloud-topic", "--odometry-topic")
     add_network(parser, "not checked, but with --robot --connect tcp/127.0.0.1:7447")
     parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="to listen to robots (3)")
     keys = parser.add_argument_group("keys and encodings, as for serve")
-    add_preset(keys)
+    add_shared(keys, "--preset")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's")
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
     keys.add_argument("--cloud-encoding", metavar="CODEC", help="for all frames")
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="likewise")
-    add_json(parser)
+    add_shared(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:

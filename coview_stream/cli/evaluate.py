@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coview_stream.report.evaluation import ErrorStats, Evaluation
-from coview_stream.cli.options import add_json
+from coview_stream.cli.options import add_shared
 
 HELP = "compare a trajectory with the truth: errors, success, share localized, false frames"
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("estimate", type=Path, metavar="EST.tum", help="trajectory of `locate`, map <- body")
     parser.add_argument("truth", type=Path, metavar="TRUTH.tum", help="true trajectory, map <- body")
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the errors over the distance driven")
-    add_json(parser)
+    add_shared(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:

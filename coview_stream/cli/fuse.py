@@ -7,15 +7,7 @@ import sys
 from pathlib import Path
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import (
-    add_gravity,
-    add_mount,
-    add_progress,
-    add_topics,
-    add_verify_key,
-    check_picture,
-    lidar_config,
-)
+from coview_stream.cli.options import add_shared, check_picture, lidar_config
 
 HELP = "merge localized runs with the base map: one cloud, tagged by source and change"
 
@@ -37,11 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it from above")
     parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as `locate` was given (auto)")
-    add_gravity(parser)
-    add_mount(parser)
-    add_topics(parser)
-    add_verify_key(parser)
-    add_progress(parser)
+    add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic", "--verify-key", "--progress")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
     from coview_stream.fusion.fused_file import check_name, summary, write_fused, write_trajectories
     from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
+    from coview_stream.odometry.lidar_odometry import LidarOdometry
     from coview_stream.recordings.open_run import open_run
     from coview_stream.recordings.run import Run
 
@@ -75,11 +64,7 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
 
     def open_it(path: Path, mount: Mount | None) -> Run:
-        lidar = None
-        if lidar_options is not None:
-            from coview_stream.odometry.lidar_odometry import LidarOdometry
-
-            lidar = LidarOdometry(lidar_options)
+        lidar = None if lidar_options is None else LidarOdometry(lidar_options)
         return open_run(path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, None, given or mount)
 
     runs = [LocalizedRun(pair, base_map, open_it) for pair in pairs]

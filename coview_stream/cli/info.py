@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import acceptance_config, add_json, add_risk, add_verify_key, check_picture
+from coview_stream.cli.options import acceptance_config, add_shared, check_picture
 from coview_stream.errors import naming_missing_libraries
 
 if TYPE_CHECKING:
@@ -29,10 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "there; takes about a minute",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="A.png", help="draw the ambiguity")
-    add_risk(parser)
-    add_verify_key(parser)
+    add_shared(parser, "--risk", "--verify-key")
     parser.set_defaults(risk=None)
-    add_json(parser)
+    add_shared(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,28 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import (
-    acceptance_config,
-    add_gravity,
-    add_initial,
-    add_mount,
-    add_progress,
-    add_registration,
-    add_reloc,
-    add_risk,
-    add_run_path,
-    add_topics,
-    add_verify_key,
-    initial_guess,
-    lidar_config,
-    mount_of,
-)
-
-if TYPE_CHECKING:
-    from coview_stream.odometry.lidar_odometry import LidarOdometry
+from coview_stream.cli.options import acceptance_config, add_initial, add_shared, initial_guess, lidar_config, mount_of
 
 HELP = "localize a recorded run on a base map, offline"
 
@@ -34,7 +15,7 @@ HELP = "localize a recorded run on a base map, offline"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add_map(parser)
-    add_run_path(parser)
+    add_shared(parser, "run_path")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
     parser.add_argument(
         "--odometry",
@@ -42,19 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|kiss-icp",
         help="the run's, a file's, or made of the clouds (auto)",
     )
-    add_gravity(parser)
-    add_mount(parser)
-    add_topics(parser)
+    add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic")
     parser.add_argument(
         "--export", metavar="A,B", help="also trajectory.csv, .kitti, .geojson or .gpx: csv,kitti,geojson,gpx"
     )
     add_initial(parser)
-    add_registration(parser)
-    add_reloc(parser)
-    add_risk(parser)
-    add_verify_key(parser)
+    add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
-    add_progress(parser)
+    add_shared(parser, "--progress")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,9 +40,10 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import InputError
-    from coview_stream.localization.offline import locate, summary, write
+    from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, locate, summary, write
     from coview_stream.localization.registration.gicp import library
     from coview_stream.localization.result import Fix
+    from coview_stream.odometry.lidar_odometry import LidarOdometry
     from coview_stream.recordings.open_run import open_run
     from coview_stream.report.export import chosen_formats, export, reference_for, trajectory_of
 
@@ -74,9 +51,10 @@ def run(args: argparse.Namespace) -> int:
     formats = () if args.export is None else chosen_formats(args.export)
     mount = mount_of(args)
     guess = initial_guess(args.initial, args.within)
-    lidar = _lidar_odometry(args.odometry, args.gravity)
+    lidar_options = lidar_config(args.odometry, args.gravity)
+    lidar = None if lidar_options is None else LidarOdometry(lidar_options)  # now: its library may be missing
     if args.registration == "gicp":
-        library()  # before anything is read: it may be missing
+        library()  # likewise
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     draws = not args.no_pictures and _can_draw()
@@ -111,15 +89,19 @@ def run(args: argparse.Namespace) -> int:
 
         located = locate(base_map, recorded, config, step, guess)
     write(located, base_map, args.output)
+    written = ["trajectory.tum", "result.json"]
     if formats:
         posed = located.posed
         stamps, poses = [fix.stamp for fix in posed], [fix.T_map_body for fix in posed if fix.T_map_body is not None]
-        export(trajectory_of(args.run_path.name, stamps, poses, geo), args.output, formats)
+        track = trajectory_of(args.run_path.name, stamps, poses, geo)
+        written += [path.name for path in export(track, args.output, formats)]
     if draws:
         from coview_stream.report.plots import draw_run
 
         draw_run(located, base_map, args.output)
+        written += [name for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG) if (args.output / name).exists()]
     print(summary(located))
+    print(f"{'written':<18} {args.output}: {', '.join(written)}")
     if not located.posed:
         print(f"why, and what to do: coview-stream doctor {args.map} --run {args.run_path}")
     return 0 if located.posed else 1
@@ -135,17 +117,3 @@ def _can_draw() -> bool:
         print(error, file=sys.stderr)
         return False
     return True
-
-
-def _lidar_odometry(odometry: str, gravity: str | None) -> LidarOdometry | None:
-    """Return what makes odometry of the clouds, None if that is not asked for.
-
-    Raises:
-        DependencyError: KISS-ICP is not installed; asked before anything is read.
-    """
-    config = lidar_config(odometry, gravity)
-    if config is None:
-        return None
-    from coview_stream.odometry.lidar_odometry import LidarOdometry
-
-    return LidarOdometry(config)

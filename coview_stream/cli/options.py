@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
+import logging
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
+
+from coview_stream.errors import ConfigError, CoViewError, InputError
 
 if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
     from coview_stream.config.mount import Mount
     from coview_stream.config.odometry import LidarOdometryConfig
     from coview_stream.localization.search.hints import PlaceGuess
+
+
+_SHORT = {"dead_reckoning_timeout": "coast"}
+"""Options that are called otherwise than their field."""
 
 
 def documented_fields(kind: type[Any]) -> dict[str, str]:
@@ -58,10 +66,6 @@ def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mappin
         )  # fmt: skip
 
 
-_SHORT = {"dead_reckoning_timeout": "coast"}
-"""Options that are called otherwise than their field."""
-
-
 def fill_from_file(
     args: argparse.Namespace, path: Path, parser: argparse.ArgumentParser, tables: Collection[str]
 ) -> dict[str, dict[str, Any]]:
@@ -69,11 +73,12 @@ def fill_from_file(
 
     ``args.in_file`` gets the names of the options in the file.
 
+    ``args.in_file`` gets the options in the file, ``args.from_file`` those of them that it decides, by all their names.
+
     Raises:
         ConfigError: an unknown key, or a value that the option does not take.
     """
     from coview_stream.config.settings_file import read_settings, unknown_key
-    from coview_stream.errors import ConfigError
 
     actions: dict[str, argparse.Action] = {}
     for action in parser._actions:
@@ -81,36 +86,47 @@ def fill_from_file(
         names = names or [str(action.metavar).lower(), action.dest]
         if action.dest not in ("help", "help_all", "config"):
             actions |= {name.replace("-", "_"): action for name in names}
-    given = {action for action in actions.values() if not _absent(getattr(args, action.dest))}
+    given = set[argparse.Action]()
+    for action in actions.values():
+        value = getattr(args, action.dest)
+        if not (value is None or value is False or value == []):  # 0 is a value
+            given.add(action)
     for group in parser._mutually_exclusive_groups:  # one of them on the command line: the file's others are replaced
         if given.intersection(group._group_actions):
             given.update(group._group_actions)
-    found: dict[str, dict[str, Any]] = {}
-    args.in_file = read = set[str]()
+    file_tables: dict[str, dict[str, Any]] = {}
+    args.in_file, args.from_file = set[str](), set[str]()
     for key, value in read_settings(path).items():
         name = key.replace("-", "_")
         if name in tables and (isinstance(value, dict) or name not in actions):
             if not isinstance(value, dict):
                 raise ConfigError(f"{path}: {key} is {value!r}; write a table [{key}]")
-            found[name] = value
-        elif name not in actions:
+            file_tables[name] = value
+            continue
+        if name not in actions:
             raise ConfigError(f"{path}: {unknown_key(key, [*tables, *actions])}")
-        elif actions[name] not in given:
-            setattr(args, actions[name].dest, _value_of(actions[name], value, f"{path}: {key}"))
-        if name in actions and name not in found:
-            read.add(actions[name].dest)
-    return found
+        action = actions[name]
+        args.in_file.add(action.dest)
+        if action not in given:
+            args.from_file |= {name, action.dest}
+            setattr(args, action.dest, _value_of(action, value, f"{path}: {key}"))
+    return file_tables
 
 
-def _absent(value: Any) -> bool:
-    """Whether an option was not given: None, False or an empty list, but not 0."""
-    return value is None or value is False or value == []
+@contextlib.contextmanager
+def blaming_file(args: argparse.Namespace) -> Iterator[None]:
+    """Have an error about an option that ``--config`` has set name the file and the key, not the option."""
+    try:
+        yield
+    except CoViewError as error:
+        subject = re.match(r"(?:--)?([a-z][a-z_-]*)", str(error))
+        if subject is None or subject[1].replace("-", "_") not in args.from_file:
+            raise
+        raise type(error)(f"{args.config}: {str(error).removeprefix('--')}") from error
 
 
 def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
     """Return a value of a settings file as the command line would give it."""
-    from coview_stream.errors import ConfigError
-
     if action.nargs == 0 or (action.nargs == "?" and value is True):
         if not isinstance(value, bool):
             raise ConfigError(f"{where} is {value!r}; write true or false")
@@ -146,15 +162,51 @@ ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
 
 
-def add_run_path(parser: argparse.ArgumentParser) -> None:
-    """Declare ``RUN``, a recorded run."""
-    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag")
+SHARED: dict[str, dict[str, Any]] = {
+    "run_path": {"type": Path, "metavar": "RUN", "help": "run directory, cloud file, or rosbag2, mcap, bag"},
+    "--cloud-topic": {"metavar": "TOPIC", "help": "clouds of a recording with several such topics"},
+    "--odometry-topic": {"metavar": "TOPIC", "help": "its odometry, likewise"},
+    "--preset": {"default": "native", "help": "keys: native, ros2dds, rmw_zenoh or keelson (native)"},
+    "--progress": {"action": "store_true", "help": "draw progress bars even without a terminal"},
+    "--json": {"action": "store_true", "help": "print JSON"},
+    "--quiet": {"action": "store_true", "help": "log errors only"},
+    "--registration": {
+        "choices": ("trimmed-icp", "gicp"),
+        "default": "trimmed-icp",
+        "help": "of scans to the map while tracking; gicp is slower, extra gicp (trimmed-icp)",
+    },
+    "--reloc": {
+        "choices": ("auto", "coview", "learned"),
+        "default": "auto",
+        "help": "place recognition: co-view descriptors, learned features, or both where the map has them (auto)",
+    },
+    "--risk": {
+        "default": 1e-4,
+        "metavar": "P",
+        "help": "probability of a wrong place below which a pose is given, 1e-6 to 0.5 (1e-4)",
+    },
+    "--mount": {
+        "metavar": "R,P,Y[,X,Y,Z]",
+        "help": "pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down",
+    },
+    "--verify-key": {
+        "type": Path,
+        "metavar": "NAME.pub",
+        "help": "refuse a map that this key has not signed (build --sign)",
+    },
+    "--gravity": {
+        "metavar": "ground|level|X,Y,Z",
+        "help": "for kiss-icp: down is where the ground says, or the body's -z, or a vector in its frame, as in "
+        "--gravity=-0.1,0,-9.8 (ground)",
+    },
+}
+"""Options that several commands have, in the words of argparse."""
 
 
-def add_topics(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--cloud-topic`` and ``--odometry-topic`` of a ROS recording."""
-    parser.add_argument("--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics")
-    parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
+def add_shared(parser: argparse._ActionsContainer, *names: str) -> None:
+    """Declare some of :data:`SHARED`."""
+    for name in names:
+        parser.add_argument(name, **SHARED[name])
 
 
 def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/127.0.0.1:7447") -> None:
@@ -164,26 +216,6 @@ def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/1
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="endpoint to wait for others on")
     network.add_argument("--zenoh-config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, ...")
     network.add_argument("--base", default="coview", metavar="KEY", help="first part of the keys (coview)")
-
-
-def add_preset(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--preset``, the convention of zenoh keys."""
-    parser.add_argument("--preset", default="native", help="keys: native, ros2dds, rmw_zenoh or keelson (native)")
-
-
-def add_progress(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--progress``."""
-    parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def add_quiet(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--quiet``."""
-    parser.add_argument("--quiet", action="store_true", help="log errors only")
 
 
 def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> None:
@@ -196,13 +228,7 @@ def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> No
 
 
 def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:
-    """Refuse an encoding that no codec has; None is always right.
-
-    Raises:
-        ConfigError: ``name`` is not among the ``known``.
-    """
-    from coview_stream.errors import ConfigError
-
+    """Refuse an encoding that no codec has (ConfigError); None is always right."""
     if name is not None and name not in known:
         raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
 
@@ -227,7 +253,6 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
     Raises:
         ConfigError: it is no such text, or ``within`` is given without it, or is no distance.
     """
-    from coview_stream.errors import ConfigError
     from coview_stream.geometry.validation import MAX_COORDINATE
     from coview_stream.localization.search.hints import MIN_WITHIN, PlaceGuess
 
@@ -252,13 +277,7 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
 
 
 def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float | None = None) -> dict[str, PlaceGuess]:
-    """Return the guesses of ``NAME=X,Y[,YAW]`` by robot.
-
-    Raises:
-        ConfigError: a text is not a guess, or names an unknown robot.
-    """
-    from coview_stream.errors import ConfigError
-
+    """Return the guesses of ``NAME=X,Y[,YAW]`` by robot; ConfigError for no guess, or an unknown robot."""
     out: dict[str, PlaceGuess] = {}
     known = list(robots)
     if not (texts := list(texts)):
@@ -275,44 +294,9 @@ def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float |
     return out
 
 
-def add_registration(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--registration``."""
-    parser.add_argument(
-        "--registration",
-        choices=("trimmed-icp", "gicp"),
-        default="trimmed-icp",
-        help="of scans to the map while tracking; gicp is slower, extra gicp (trimmed-icp)",
-    )
-
-
-def add_reloc(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--reloc``."""
-    parser.add_argument(
-        "--reloc",
-        choices=("auto", "coview", "learned"),
-        default="auto",
-        help="place recognition: co-view descriptors, learned features, or both where the map has them (auto)",
-    )
-
-
-def add_risk(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--risk``."""
-    parser.add_argument(
-        "--risk",
-        default=1e-4,
-        metavar="P",
-        help="probability of a wrong place below which a pose is given, 1e-6 to 0.5 (1e-4)",
-    )
-
-
 def acceptance_config(risk: str | float) -> AcceptanceConfig:
-    """Return what makes a fix, by ``--risk`` as it was given.
-
-    Raises:
-        ConfigError: it is no number from 1e-6 to below a half.
-    """
+    """Return the limits of a fix by ``--risk``; ConfigError if it is no number from 1e-6 to below a half."""
     from coview_stream.config.localizer import LEAST_RISK, AcceptanceConfig
-    from coview_stream.errors import ConfigError
 
     try:
         value = float(risk)
@@ -324,13 +308,7 @@ def acceptance_config(risk: str | float) -> AcceptanceConfig:
 
 
 def check_picture(option: str, path: Path | None) -> None:
-    """Refuse a picture that is a directory or in one that is not there; None is always right.
-
-    Raises:
-        ConfigError: it is.
-    """
-    from coview_stream.errors import ConfigError
-
+    """Refuse a picture that is a directory, or in one that is not there (ConfigError); None is always right."""
     if path is None:
         return
     if path.is_dir():
@@ -339,53 +317,20 @@ def check_picture(option: str, path: Path | None) -> None:
         raise ConfigError(f"{option} {path}: {path.parent} is no directory; make it first")
 
 
-def add_mount(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--mount``."""
-    parser.add_argument(
-        "--mount",
-        metavar="R,P,Y[,X,Y,Z]",
-        help="pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down",
-    )
-
-
 def mount_of(args: argparse.Namespace) -> Mount:
-    """Return ``--mount``.
-
-    Raises:
-        ConfigError: it is not three or six numbers in range.
-    """
+    """Return ``--mount``; ConfigError if it is not three or six numbers in range."""
     from coview_stream.config.mount import Mount, parse_mount
 
     return Mount() if args.mount is None else parse_mount(args.mount)
 
 
-def add_verify_key(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--verify-key``."""
-    parser.add_argument(
-        "--verify-key", type=Path, metavar="NAME.pub", help="refuse a map that this key has not signed (build --sign)"
-    )
-
-
-def add_gravity(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--gravity``."""
-    parser.add_argument(
-        "--gravity",
-        metavar="ground|level|X,Y,Z",
-        help="for kiss-icp: down is where the ground says, or the body's -z, or a vector in its frame, as in "
-        "--gravity=-0.1,0,-9.8 (ground)",
-    )
-
-
 def lidar_config(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:
     """Return how odometry is made of the clouds; None if ``odometry`` is not kiss-icp.
 
-    ``max_speed`` is the robot's, metres per second.
-
-    Raises:
-        ConfigError: ``gravity`` is no direction, or comes with other odometry.
+    ``max_speed`` is the robot's, metres per second. Raises ConfigError where ``gravity`` is no direction, or comes with
+    other odometry.
     """
     from coview_stream.config.odometry import LidarOdometryConfig, parse_gravity
-    from coview_stream.errors import ConfigError
 
     if odometry != KISS_ICP:
         if gravity is not None:
@@ -405,49 +350,27 @@ def add_state(parser: argparse.ArgumentParser) -> None:
 
 
 def state_folder(args: argparse.Namespace) -> Path | None:
-    """Return the folder of the last poses; None for nowhere.
+    """Return the folder of the last poses after a trial write, and log it; None for nowhere.
+
+    A wrong ``--state`` is refused at the start, not while driving. A default folder that is missing or cannot be
+    written is logged only: a service without a home has to run, and a disk may be mounted later.
 
     Raises:
-        ConfigError: ``--state`` is empty.
+        InputError: ``--state`` names a directory that cannot be written. ConfigError: it is empty.
     """
-    import logging
-
-    from coview_stream.errors import ConfigError
-    from coview_stream.stream.node.last_place import default_folder
+    from coview_stream.stream.node.last_place import default_folder, try_out
 
     if args.no_state:
         return None
-    if args.state is not None:
-        if not args.state:
-            raise ConfigError("--state '': name a directory, or leave it out, or use --no-state")
-        return Path(args.state)
-    try:
-        return default_folder()
-    except ConfigError as error:  # a service without a home has to run all the same
-        logging.getLogger("coview_stream.node").warning("%s", error)
-        return None
-
-
-def writable_state_folder(args: argparse.Namespace) -> Path | None:
-    """Return :func:`state_folder` after a trial write, and log it: better refused at the start than while driving.
-
-    A default folder that cannot be written is logged only: the disk may be mounted later.
-
-    Raises:
-        InputError: ``--state`` names a directory that cannot be written.
-        ConfigError: ``--state`` is empty.
-    """
-    import logging
-
-    from coview_stream.errors import InputError
-    from coview_stream.stream.node.last_place import try_out
-
+    if args.state == "":
+        raise ConfigError("--state '': name a directory, or leave it out, or use --no-state")
     log = logging.getLogger("coview_stream.node")
-    folder = state_folder(args)
-    if folder is None:
-        return None
     try:
+        folder = default_folder() if args.state is None else Path(args.state)
         try_out(folder)
+    except ConfigError as error:
+        log.warning("%s", error)
+        return None
     except OSError as error:
         text = f"{folder}: the last poses cannot be kept here ({error.strerror or error})"
         if args.state is not None:

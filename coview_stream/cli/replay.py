@@ -5,16 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from coview_stream.cli.options import (
-    KISS_ICP,
-    add_mount,
-    add_network,
-    add_preset,
-    add_progress,
-    add_run_path,
-    add_topics,
-    mount_of,
-)
+from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_of
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
@@ -25,10 +16,10 @@ _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odo
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by ReplayConfig."""
-    add_run_path(parser)
+    add_shared(parser, "run_path")
     parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
     add_network(parser)
-    add_preset(parser)
+    add_shared(parser, "--preset")
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)")
     parser.add_argument("--loop", action="store_true", help="start over until interrupted; stamps go on")
@@ -43,10 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|none",
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
-    add_mount(parser)
-    add_topics(parser)
+    add_shared(parser, "--mount", "--cloud-topic", "--odometry-topic")
     parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)")
-    add_progress(parser)
+    add_shared(parser, "--progress")
     parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 
 

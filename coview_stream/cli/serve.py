@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
+import logging
+import os
+import socket
+import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,17 +21,11 @@ from coview_stream.cli.options import (
     ROBOT,
     acceptance_config,
     add_fields,
-    add_gravity,
     add_initial,
-    add_mount,
     add_network,
-    add_preset,
-    add_quiet,
-    add_registration,
-    add_reloc,
-    add_risk,
+    add_shared,
     add_state,
-    add_verify_key,
+    blaming_file,
     check_codec,
     fill_from_file,
     hide_rare,
@@ -34,7 +33,7 @@ from coview_stream.cli.options import (
     initial_guesses,
     lidar_config,
     mount_of,
-    writable_state_folder,
+    state_folder,
 )
 from coview_stream.cli.view import add_view
 from coview_stream.config.node import METRICS_ADDRESS, NodeConfig
@@ -80,20 +79,8 @@ _TWICE = {
 
 _RARE = (
     *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
-    *(
-        "pose_encoding",
-        "geo",
-        "gravity",
-        "no_deskew",
-        "registration",
-        "reloc",
-        "log_json",
-        "around",
-        "foxglove",
-        "record",
-        "rerun",
-        *_LIMITS,
-    ),
+    *("pose_encoding", "geo", "gravity", "no_deskew", "registration", "reloc", "log_json", "around", "foxglove"),
+    *("record", "rerun", *_LIMITS),
 )
 """Options that are left to --help-all."""
 
@@ -107,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="node.toml", help="settings; options given here replace them")
     add_network(parser, "--listen tcp/127.0.0.1:7447")
     keys = parser.add_argument_group("keys and encodings")
-    add_preset(parser)
+    add_shared(parser, "--preset")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument(
         "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
@@ -125,16 +112,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry", choices=(ROBOT, KISS_ICP), help="from the robot, or computed from its clouds (robot)"
     )
-    add_gravity(parser)
+    add_shared(parser, "--gravity")
     limits = parser.add_argument_group("rates and limits")
     add_fields(limits, NodeConfig, _LIMITS)
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
-    add_mount(parser)
+    add_shared(parser, "--mount")
     add_initial(parser, of_robots=True)
-    add_registration(parser)
-    add_reloc(parser)
-    add_risk(parser)
-    add_verify_key(parser)
+    add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operate.md)")
     operation.add_argument(
@@ -151,7 +135,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_view(operation)
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
-    add_quiet(operation)
+    add_shared(operation, "--quiet")
     parser.formatter_class = functools.partial(argparse.HelpFormatter, max_help_position=20)
     parser.usage = "%(prog)s SITE --robot NAME [options]"
     parser.set_defaults(**dict.fromkeys(_DEFAULTS))  # None: not given, --config decides
@@ -160,16 +144,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
+    from coview_stream.cli.process import start_logging, stop_on_signals
+    from coview_stream.cli.view import open_sinks
     from coview_stream.stream.node.engine_process import start_children
 
     tables = settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)
-    try:
-        return _run(args, tables, children)
-    finally:
+    with contextlib.ExitStack() as closing, blaming_file(args):
         for child in children.values():
-            child.close()
+            closing.callback(child.close)
+        start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
+        options = serve_options(args, tables)
+        hangups: list[int] = []
+        with contextlib.ExitStack() as views:
+            sinks = open_sinks(args)
+            for sink in sinks:  # a feed that was never opened does not close them
+                views.callback(sink.close)
+            with stop_on_signals(lambda: hangups.append(1)) as stop:
+                ended = _serve(options, stop, children, hangups, sinks)
+        if not ended:  # a regular exit would wait for the thread that is stuck in the network
+            logging.shutdown()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
+    return 0
 
 
 def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
@@ -179,6 +178,7 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
         ConfigError: the file has a mistake, or map or robots are missing in both.
     """
     tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
+    args.from_file = set()
     if args.config is not None:
         declared = argparse.ArgumentParser()
         add_arguments(declared)
@@ -202,9 +202,6 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -> ServeOptions:
     """Return the node's options from complete arguments and the tables of ``--config``, see :func:`settings`."""
-    import os
-    import socket
-
     from coview_stream.basemap.signature import read_verify_key
     from coview_stream.config import LocalizerConfig
     from coview_stream.config.odometry import LidarOdometryConfig
@@ -271,28 +268,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node_keys=node_keys(args.base, args.node_name or default_node),
         metrics=args.metrics,
     )
-    return replace(options, state=writable_state_folder(args))  # last, for it logs the folder
-
-
-def _run(args: argparse.Namespace, tables: dict[str, dict[str, Any]], children: dict[str, EngineChild]) -> int:
-    import logging
-
-    from coview_stream.cli.process import start_logging, stop_on_signals
-    from coview_stream.cli.view import open_sinks
-
-    start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
-    options = serve_options(args, tables)
-    sinks = open_sinks(args)
-    hangups: list[int] = []
-    try:
-        with stop_on_signals(lambda: hangups.append(1)) as stop:
-            ended = _serve(options, stop, children, hangups, sinks)
-    finally:
-        for sink in sinks:  # a feed that was never opened has not closed them
-            sink.close()
-    if not ended:
-        _exit_now()
-    return 0
+    return replace(options, state=state_folder(args))  # last, for it logs the folder
 
 
 def _serve(
@@ -345,15 +321,3 @@ def _serve(
         feed.close()
     opening.join(_MAX_SHUTDOWN)
     return not opening.is_alive() and all(node.close(end - stop.now()) for node in opened)
-
-
-def _exit_now() -> None:
-    """End the process; a regular exit would wait for the thread that is stuck in the network."""
-    import logging
-    import os
-    import sys
-
-    logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0)

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from coview_stream.cli.options import add_network, add_quiet
+from coview_stream.cli.options import add_network, add_shared
 from coview_stream.errors import ConfigError
 
 MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"  # as stream.maps.fetch_map has it; --help imports nothing
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directories", nargs="+", type=Path, metavar="SITE/", help="that `build -o SITE/` made")
     parser.add_argument("--name", help="of the site in its keys (the directory's name)")
     add_network(parser, f"--listen {MAP_SERVER_ENDPOINT}")
-    add_quiet(parser)
+    add_shared(parser, "--quiet")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from coview_stream.cli.options import add_progress, add_world
+from coview_stream.cli.options import add_shared, add_world
 from coview_stream.errors import ConfigError, InputError, require_library
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="record survey, scans, truth and odometry for Foxglove or rerun as well (extra: foxglove)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a world simulated there before")
-    add_progress(parser)
+    add_shared(parser, "--progress")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from coview_stream.stream.transport.keys import RobotKeys
     from coview_stream.stream.transport.transport import Transport
     from coview_stream.viewers.scene import Sink
-    from coview_stream.viewers.session_feed import SessionFeed
+    from coview_stream.viewers.session_feed import SessionFeed, Topic
 
 _WEB = "127.0.0.1:8642"
 _FOXGLOVE = "127.0.0.1:8765"
@@ -84,26 +84,19 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
 
 
 def feed_of_watch(
-    args: argparse.Namespace, transport: Transport, sinks: Sequence[Sink], view: MapView | None
+    args: argparse.Namespace, transport: Transport, sinks: Sequence[Sink], view: MapView | None, topics: Sequence[Topic]
 ) -> SessionFeed | None:
-    """Return a running feed of the robots that ``watch`` was asked for; None where nothing takes it in."""
+    """Return a running feed of the topics that ``watch`` shows; None where nothing takes it in."""
     if not sinks:
         return None
-    from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.viewers.session_feed import SessionFeed, asked_of_node, topics_of_base, topics_of_robots
+    from coview_stream.viewers.session_feed import SessionFeed, asked_of_node
 
-    topics = topics_of_base(args.base)
-    if args.robot:
-        topics = topics_of_robots([robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)])
     source = None if view is not None else asked_of_node(transport, args.base)
     return _running(SessionFeed(transport, topics, view, source, clouds=not args.no_clouds), sinks)
 
 
 def feed_of_node(node: Node, keys: Sequence[RobotKeys], mount: Mount, sinks: Sequence[Sink]) -> SessionFeed | None:
-    """Return a running feed of a node in this process; None where nothing takes it in.
-
-    It reads what the node reads and publishes on the node's own session, of which nothing waits for it.
-    """
+    """Return a running feed of a node in this process, on the node's own session; None where nothing takes it in."""
     if not sinks:
         return None
     from coview_stream.viewers.session_feed import SessionFeed, read_from_files, topics_of_robots
@@ -118,17 +111,3 @@ def _running(feed: SessionFeed, sinks: Sequence[Sink]) -> SessionFeed:
         feed.add(sink)
     feed.start()
     return feed
-
-
-def map_of_watch(path: Path | None) -> MapView | None:
-    """Return the view of a map file; None for none.
-
-    Raises:
-        MapError: it cannot be read.
-    """
-    if path is None:
-        return None
-    from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.summary import MapView
-
-    return MapView.of(BaseMap.load(path, check=False))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import shutil
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import local_map
-from coview_stream.cli.options import add_json, add_network, add_preset
+from coview_stream.cli.options import add_network, add_shared
 from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
 
@@ -36,8 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)")
     add_network(parser)
-    add_preset(parser)
-    add_json(parser)
+    add_shared(parser, "--preset", "--json")
     add_view(parser)
     parser.add_argument("--map", metavar="SITE", help="the map to show, path or address (the node is asked for one)")
     parser.add_argument("--no-clouds", action="store_true", help="show no scans: clouds are most of the traffic")
@@ -46,24 +45,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.summary import MapView
     from coview_stream.cli.process import stop_on_signals
-    from coview_stream.cli.view import feed_of_watch, map_of_watch, open_sinks
+    from coview_stream.cli.view import feed_of_watch, open_sinks
     from coview_stream.stream.client.fleet_table import FleetTable
     from coview_stream.stream.transport.zenoh_transport import open_client
 
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
     topics = _topics(args)
-    view, sinks, feed = (
-        map_of_watch(None if args.map is None else local_map(args.map, base=args.base).path),
-        open_sinks(args),
-        None,
-    )
+    view = None
+    if args.map is not None:
+        view = MapView.of(BaseMap.load(local_map(args.map, base=args.base).path, check=False))
+    sinks, feed = open_sinks(args), None
     transport = open_client(args.connect, args.listen, args.zenoh_config)
     try:
         with stop_on_signals() as stop:
-            feed = feed_of_watch(args, transport, sinks, view)
-            watch = _Watch(args, FleetTable(), topics, transport)
+            feed = feed_of_watch(args, transport, sinks, view, topics)
+            watch = _Watch(args, FleetTable(), [t for t in topics if t.kind in ("pose", "status")], transport)
             watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     finally:
         if feed is not None:
@@ -73,17 +73,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _topics(args: argparse.Namespace) -> list[Topic]:
-    """Return the topics of poses and statuses."""
     from coview_stream.stream.transport.keys import robot_keys
     from coview_stream.viewers.session_feed import topics_of_base, topics_of_robots
 
     if args.robot:
-        topics = topics_of_robots([robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)])
-    elif args.preset != "native":
+        return topics_of_robots([robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)])
+    if args.preset != "native":
         raise ConfigError(f"--preset {args.preset} has no key for all robots' poses: name them with --robot")
-    else:
-        topics = topics_of_base(args.base)
-    return [topic for topic in topics if topic.kind in ("pose", "status")]
+    return topics_of_base(args.base)
 
 
 class _Watch:
@@ -99,7 +96,7 @@ class _Watch:
         self._lines_drawn = 0  # of the table
         self._unreadable_keys: set[str] = set()
         for topic in topics:
-            transport.subscribe(topic.key, self._receiver(topic), "all")
+            transport.subscribe(topic.key, functools.partial(self._receive, topic), "all")
 
     def run(self, stop: Stop, end: float | None) -> None:
         """Show samples until told to stop, or until ``end`` on the steady clock."""
@@ -121,13 +118,22 @@ class _Watch:
         if self._queue.dropped:
             print(f"{self._queue.dropped} messages were not shown: the output is too slow", file=sys.stderr)
 
-    def _receiver(self, topic: Topic) -> Callable[[Sample], None]:
-        return lambda sample: self._queue.put((time.monotonic(), topic, sample))
+    def _receive(self, topic: Topic, sample: Sample) -> None:
+        self._queue.put((time.monotonic(), topic, sample))
 
     def _show(self, arrived: float, topic: Topic, sample: Sample) -> None:
-        read = self._pose if topic.kind == "pose" else self._status
+        from coview_stream.messages import decode_pose
+        from coview_stream.messages.json_messages import pose_record, read_status
+
+        robot = topic.robot or sample.key.split("/")[topic.depth]
         try:
-            record = read(arrived, topic, sample)
+            if topic.kind == "pose":
+                pose = replace(decode_pose(sample, hint=topic.hint), robot=robot)
+                self._fleet.add_pose(pose, arrived)
+                record = pose_record(pose, sample)
+            else:
+                record = read_status(sample)
+                self._fleet.add_status(robot, record, arrived)
         except MessageError as error:
             if sample.key not in self._unreadable_keys:  # once per key: it would come ten times a second
                 self._unreadable_keys.add(sample.key)
@@ -135,24 +141,6 @@ class _Watch:
             return
         if self._args.json:
             print(json.dumps({"key": sample.key, **record}), flush=True)
-
-    def _pose(self, arrived: float, topic: Topic, sample: Sample) -> dict[str, Any]:
-        from coview_stream.messages import decode_pose
-        from coview_stream.messages.json_messages import pose_record
-
-        pose = replace(decode_pose(sample, hint=topic.hint), robot=self._robot(topic, sample))
-        self._fleet.add_pose(pose, arrived)
-        return pose_record(pose, sample)
-
-    def _status(self, arrived: float, topic: Topic, sample: Sample) -> dict[str, Any]:
-        from coview_stream.messages.json_messages import read_status
-
-        status = read_status(sample)
-        self._fleet.add_status(self._robot(topic, sample), status, arrived)
-        return status
-
-    def _robot(self, topic: Topic, sample: Sample) -> str:
-        return topic.robot or sample.key.split("/")[topic.depth]
 
     def _draw(self, now: float) -> None:
         if not self._terminal:

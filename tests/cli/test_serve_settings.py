@@ -87,6 +87,23 @@ def test_mistakes_are_named(text, message, world_file, tmp_path):
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "given", "message"),
+    [
+        ('risk = "low"\n', [], "{path}: risk low: give the probability"),
+        ("risk = 0.7\n", ["--risk", "low"], "--risk low: give the probability"),
+        ('pose-key = "a/*"\n', [], "{path}: pose-key 'a/*' has a wildcard"),
+        ("coast = -3\n", [], "{path}: dead_reckoning_timeout is -3.0"),
+        ('listen = "nonsense"\n', [], "{path}: listen 'nonsense' is not <protocol>/<address>"),
+    ],
+)
+def test_a_refused_value_of_the_file_is_reported_with_file_and_key(text, given, message, world_file, tmp_path, capsys):
+    path = tmp_path / "node.toml"
+    path.write_text(text)
+    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", "--config", str(path), *given]) == 2
+    assert capsys.readouterr().err.startswith(f"coview-stream: error: {message.format(path=path)}")
+
+
 def test_help_fits_a_screen_and_help_all_has_the_rest(capsys):
     assert main(["serve", "--help"]) == 0
     short = capsys.readouterr().out

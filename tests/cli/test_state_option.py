@@ -5,29 +5,26 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.cli import main, serve
-from coview_stream.cli import options as state
+from coview_stream.cli import main, options, serve
 from coview_stream.stream.node.serve import NetworkOptions, ServeOptions, open_node
 from coview_stream.stream.transport.keys import robot_keys
 
 
-def folder(*args, find=state.state_folder):
+def folder(*args):
     parser = argparse.ArgumentParser()
     serve.add_arguments(parser)
-    return find(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+    return options.state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
 
 
 def test_state_folder_defaults_to_user_state_directory(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert folder() == tmp_path / "coview-stream"
-    assert folder("--state", "here/there") == Path("here/there")
     assert folder("--no-state") is None
     assert not list(tmp_path.iterdir())
+    assert folder() == tmp_path / "coview-stream"
 
 
 def test_state_and_no_state_together_are_refused(capsys):
@@ -36,26 +33,22 @@ def test_state_and_no_state_together_are_refused(capsys):
     assert "not allowed with" in capsys.readouterr().err
 
 
-def test_without_home_directory_no_pose_is_saved(monkeypatch, caplog):
+def test_without_home_directory_no_pose_is_saved(monkeypatch, caplog, tmp_path):
     for name in ("XDG_STATE_HOME", "LOCALAPPDATA", "HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setitem(sys.modules, "pwd", None)
     assert folder() is None
     assert "--state DIR" in caplog.text
-    assert folder("--state", "/var/lib/coview") == Path("/var/lib/coview")
-
-
-def ready(*args):
-    return folder(*args, find=state.writable_state_folder)
+    assert folder("--state", str(tmp_path / "there")) == tmp_path / "there"
 
 
 def test_state_directory_is_created_tested_and_logged(tmp_path, caplog):
     caplog.set_level("INFO")
     place = tmp_path / "new" / "place"
-    assert ready("--state", str(place)) == place
+    assert folder("--state", str(place)) == place
     assert list(place.iterdir()) == []
     assert [r.getMessage() for r in caplog.records] == [f"the last poses are kept in {place}"]
-    assert ready("--no-state") is None
+    assert folder("--no-state") is None
 
 
 def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, capsys):
@@ -75,7 +68,7 @@ def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, capsys):
 def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    assert ready() == tmp_path / "file" / "coview-stream"
+    assert folder() == tmp_path / "file" / "coview-stream"
     (line,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert "cannot be kept" in line
     assert "--state DIR or --no-state" in line
