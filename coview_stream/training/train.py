@@ -16,8 +16,7 @@ from coview_stream.descriptors.birds_eye_view import Image
 from coview_stream.descriptors.network import Features
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.localization.search.learned.correlation import correlate, downsample
-from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.correlation import FeatureIndex, correlate, downsample, rotate_images
 from coview_stream.training.recipe import Recipe, TrainingConfig
 from coview_stream.training.sensors import TRAINED_DIRT
 from coview_stream.training.worlds import WorldViews, read_world, write_dataset
@@ -240,7 +239,9 @@ def search_queries(
         index = FeatureIndex(features, world.corner, _CELL)
         for k in range(len(world.queries))[:max_queries]:
             query = ground(world.queries[k])
-            volume = correlate(*downsample(query.local, weights(query.sigma)), index, yaws)
+            local, weight = downsample(query.local, weights(query.sigma))
+            turned = rotate_images(np.concatenate([local, weight[None]]), yaws[: HEADINGS // 2])
+            volume = correlate(turned, index, opposite=True)
             places, scores = best_places(volume, yaws, world.corner)
             results.append(
                 SearchedQuery(number, str(world.sensor[k]), float(world.travelled[k]), places, world.poses[k], scores)

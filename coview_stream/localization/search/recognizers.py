@@ -32,10 +32,6 @@ class PlaceRecognizer(Protocol):
         """Forget all votes."""
         ...
 
-    def __len__(self) -> int:
-        """Return how many keyframes have voted."""
-        ...
-
 
 @dataclass(frozen=True)
 class SearchIndex:
@@ -106,7 +102,3 @@ class CoViewRecognizer:
     def clear(self) -> None:
         """Forget all votes."""
         self.consensus.clear()
-
-    def __len__(self) -> int:
-        """Return how many keyframes have voted."""
-        return len(self.consensus)

@@ -162,10 +162,10 @@ def test_request_of_another_epoch_or_an_acceptance_starts_anew(search, never_sur
     never_sure.update(next(run_of(world_drive, 1)))
     name_instead(never_sure)
     assert len(never_sure.update(next(run_of(world_drive, 1, epoch=Epoch(1, 0)))).rivals) == 0
-    assert len(never_sure.coview) == 1
+    assert len(never_sure.coview.consensus) == 1
     frames = run_of(world_drive, 2)
     assert search.update(next(frames)).accepted is not None
-    assert len(search.coview) == 0
+    assert len(search.coview.consensus) == 0
     name_instead(search)
     assert len(search.update(next(frames)).rivals) == 0
 

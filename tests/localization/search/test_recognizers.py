@@ -145,7 +145,7 @@ def test_too_few_points_cast_no_vote(learned_map, world_drive):
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
     fix = localizer.step(world_drive.clouds[0][:40], world_drive.T_odom_body[0], 0.0)
     assert fix.evidence.reason == "too few points to search with"
-    assert len(localizer.search.learned) == 0
+    assert len(localizer.search.learned.consensus) == 0
 
 
 def test_search_request_holds_only_needed_clouds(world_map, learned_map, world_drive):

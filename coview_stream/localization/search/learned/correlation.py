@@ -1,172 +1,201 @@
-"""Dense correlation of a query with a map at every cell and heading, by FFT in blocks."""
+"""Dense correlation of a query's features with a map's at every cell and heading, by FFT in overlapping blocks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy import fft
 
-from coview_stream.geometry.arrays import Complexes, Floats, Floats32, Ints, Reals
-from coview_stream.localization.search.learned.feature_index import FeatureIndex, half_spectra
+from coview_stream.geometry.arrays import Bools, Complexes, Floats, Floats32, Ints, Reals
 
 MIN_COVERAGE = 0.6
 """Least share of a query's weight on surveyed cells: there the scatter has grown by 1.3."""
 
+_BLOCK = 96  # cells: fast to transform, and two thirds of it are valid
+_MARGIN = 16  # cells of 2 m from the middle of a 64 m query to its edge
+_MAX_BYTES = 512 << 20  # memory for the spectra
 _BATCH_BYTES = 32 << 20  # of the products that are transformed back together
 _EPSILON = 1e-6  # a smaller weight counts as zero
 
 
-def correlate(
-    query: Floats32,
-    weight: Floats32,
-    index: FeatureIndex,
-    yaws: npt.ArrayLike,
-    blocks: Ints | None = None,
-    min_coverage: float | None = MIN_COVERAGE,
-) -> Floats32:
-    """Return the mean inner products of a query's features with the map's, at all cells and headings.
+class FeatureIndex:
+    """Features of a map on a coarse grid, in overlapping blocks, for correlation by overlap-save.
+
+    The valid part of a block is ``block - 2 margin`` cells on a side. The spectra of all blocks are kept if they fit
+    into ``max_bytes`` (75 MB per km2 with 32 dimensions on cells of 2 m), else computed for every query.
+    """
+
+    def __init__(
+        self,
+        features: Reals,
+        corner: npt.ArrayLike,
+        cell: float = 2.0,
+        *,
+        surveyed: Bools | None = None,
+        block: int = _BLOCK,
+        margin: int = _MARGIN,
+        max_bytes: int = _MAX_BYTES,
+    ) -> None:
+        """Cut the map and transform its blocks.
+
+        Args:
+            features: (C, H, W), row along y, column along x; float16 or float32, memory-mapped or not.
+            corner: (2,) x and y of the lower corner of cell (0, 0), metres.
+            cell: edge of a cell, metres.
+            surveyed: (H, W) cells with map points (default: those with a non-zero feature).
+            block: cells of a block's edge, margins included.
+            margin: cells from the middle of a query to its edge, at most.
+            max_bytes: limit for keeping the spectra.
+        """
+        self.dimensions, self.height, self.width = features.shape
+        self.surveyed = (features != 0).any(axis=0) if surveyed is None else surveyed
+        self.corner = np.asarray(corner, dtype=np.float64)
+        self.cell, self.block, self.margin = cell, block, margin
+        self.valid = block - 2 * margin
+        """Edge of the valid part of a block, cells."""
+        self.blocks_down = math.ceil(self.height / self.valid)
+        self.blocks_across = math.ceil(self.width / self.valid)
+        self._features = features
+        everything = np.arange(len(self))
+        fits = block * (block // 2 + 1) * self.dimensions * len(self) * 8 <= max_bytes
+        self._spectra = self._block_spectra(everything) if fits else None
+        self._gapless = np.array([bool(self._cut(self.surveyed, k).all()) for k in everything])
+
+    def __len__(self) -> int:
+        """Return the number of blocks."""
+        return int(self.blocks_down * self.blocks_across)
+
+    def spectra(self, blocks: Ints) -> Complexes:
+        """Return half spectra (bins, len(blocks), C); bins are rows of the block times half its columns."""
+        if self._spectra is None:
+            return self._block_spectra(blocks)
+        return self._spectra if len(blocks) == len(self) else self._spectra[:, blocks]
+
+    def surveyed_spectra(self, blocks: Ints) -> Complexes:
+        """Return half spectra (bins, len(blocks), 1) of the mask of surveyed cells."""
+        cut = np.stack([self._cut(self.surveyed, k) for k in blocks], axis=-1).astype(np.float32)
+        return _half_spectra(cut, self.block)[..., None]
+
+    def gapless(self, blocks: Ints) -> Bools:
+        """Mask the blocks whose cells have all been surveyed, margin included."""
+        return self._gapless[blocks]
+
+    def cells_of(self, block: int | np.integer) -> tuple[slice, slice]:
+        """Return the map's rows and columns in the valid part of a block."""
+        down, across = divmod(int(block), self.blocks_across)
+        row, column = down * self.valid, across * self.valid
+        return slice(row, min(row + self.valid, self.height)), slice(column, min(column + self.valid, self.width))
+
+    def blocks_near(self, xy: npt.ArrayLike, radius: float) -> Ints:
+        """Find the blocks whose valid part has a cell centre within ``radius`` metres of any position (N, 2)."""
+        cells = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.corner) / self.cell - 0.5
+        near = []
+        for block in range(len(self)):
+            rows, cols = self.cells_of(block)
+            low, high = np.array([cols.start, rows.start]), np.array([cols.stop - 1, rows.stop - 1])
+            gap = np.maximum(np.maximum(low - cells, cells - high), 0.0)
+            if (np.hypot(gap[:, 0], gap[:, 1]) * self.cell <= radius).any():
+                near.append(block)
+        return np.array(near, dtype=np.int64)
+
+    def _block_spectra(self, blocks: Ints) -> Complexes:
+        out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.dimensions), dtype=np.complex64)
+        for k, block in enumerate(blocks):  # one by one: intermediate arrays stay small
+            cut = np.ascontiguousarray(self._cut(self._features, block).transpose(1, 2, 0))
+            out[:, k] = _half_spectra(cut, self.block)
+        return out
+
+    def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> Floats32:
+        """Cut the cells (..., block, block) of a block from an image (..., H, W); 0 beyond the map."""
+        rows, cols = self.cells_of(block)
+        row, column = rows.start - self.margin, cols.start - self.margin
+        out = np.zeros((*image.shape[:-2], self.block, self.block), dtype=np.float32)
+        bottom, right = min(row + self.block, self.height), min(column + self.block, self.width)
+        first, second = max(row, 0), max(column, 0)
+        out[..., first - row : bottom - row, second - column : right - column] = image[..., first:bottom, second:right]
+        return out
+
+
+def correlate(images: Floats32, index: FeatureIndex, opposite: bool, blocks: Ints | None = None) -> Floats32:
+    """Return the mean inner products of a rotated query's features with the map's, at all cells and headings.
 
     The mean is over surveyed cells: unsurveyed ones would count as dissimilar, and the right place at the map's edge
     would lose to a wrong one inside. A mean of few cells scatters more and would favour the rim, so a place with less
-    than ``min_coverage`` of the weight on surveyed cells has no score: -inf, not 0, as wrong places may score below 0.
-    To add up several queries, replace -inf by their median.
+    than :data:`MIN_COVERAGE` of the weight on surveyed cells has no score: -inf, not 0, as wrong places may score
+    below 0.
 
     Args:
-        query: (C, h, h), h even, features times weights (see :func:`downsample`); row along y, column along x of the
-            query's frame, the robot between the four cells in the middle.
-        weight: (h, h) not negative; cells more than h / 2 from the middle are left out.
+        images: (h + 1, h + 1, K, C + 1), features times weights and the weight, as of :func:`rotate_images`.
         index: of the same cells and dimensions, with a margin of at least h / 2.
-        yaws: (K,) headings of the query's frame in the map, radians.
+        opposite: also compare the images at the opposite headings.
         blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
-        min_coverage: smallest share of the weight on surveyed cells; None divides by all the weight.
 
     Returns:
-        (K, H, W); -inf without a score. The memory's order is (H, W, K): headings of a cell lie together.
-
-    Raises:
-        ValueError: query and map do not fit, or no cell has a weight.
-    """
-    headings = np.asarray(yaws, dtype=np.float64)
-    _check(query, weight, index, headings)
-    size = len(headings) // 2
-    in_pairs = len(headings) == 2 * size and np.allclose(
-        np.exp(1j * headings[:size]), -np.exp(1j * headings[size:]), atol=1e-9
-    )
-    images = rotate_images(np.concatenate([query, weight[None]]), headings[:size] if in_pairs else headings)
-    return correlate_turned(images, index, in_pairs, blocks, min_coverage)
-
-
-def correlate_turned(
-    images: Floats32,
-    index: FeatureIndex,
-    opposite: bool,
-    blocks: Ints | None = None,
-    min_coverage: float | None = MIN_COVERAGE,
-) -> Floats32:
-    """Correlate a rotated query as :func:`correlate` does.
-
-    Args:
-        images: (h + 1, h + 1, K, C + 1), the query at K headings; the weight comes last.
-        index: as for :func:`correlate`.
-        opposite: whether the images are also compared at the opposite headings.
-        blocks: as for :func:`correlate`.
-        min_coverage: as for :func:`correlate`.
-
-    Returns:
-        (K, H, W), or (2 K, H, W): the opposite headings come last.
+        (K, H, W), or (2 K, H, W): the opposite headings come last; -inf without a score. The memory's order is
+        (H, W, K): headings of a cell lie together.
 
     Raises:
         ValueError: no cell has a weight.
     """
-    transforms = _query_spectra(images, index, opposite)
-    headings = len(transforms) * images.shape[2]
-    chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
-    scores = np.full((index.height, index.width, headings), -np.inf, dtype=np.float32)
-    per_block = 8 * len(transforms[0].spectra) * headings
-    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
-        if len(group):
-            for transform, part in zip(transforms, np.split(scores, len(transforms), axis=2), strict=True):
-                _score(part, group, index, transform, min_coverage)
-    return np.asarray(scores.transpose(2, 0, 1))
-
-
-@dataclass(frozen=True)
-class _QuerySpectra:
-    """Spectra (bins, K, C + 1) of a query, and the first row and column of the valid part of the product."""
-
-    spectra: Complexes
-    first: int
-
-
-def _query_spectra(
-    images: Floats32, index: FeatureIndex, opposite: bool
-) -> tuple[_QuerySpectra] | tuple[_QuerySpectra, _QuerySpectra]:
-    """Return the query's spectra at its headings, divided by the sum of the weights; the weight's comes last."""
-    half = images.shape[0] // 2
+    half, turns = images.shape[0] // 2, images.shape[2]
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
-    spectra = half_spectra(images * (1.0 / total)[:, None], index.block)
-    before = _QuerySpectra(np.conjugate(spectra), index.margin - half)
-    # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
-    return (before, _QuerySpectra(spectra, index.margin + half)) if opposite else (before,)
+    spectra = _half_spectra(images * (1.0 / total)[:, None], index.block)
+    # with the first row and column of the valid part of the product; a correlation with an image rotated by 180
+    # degrees is a convolution: the same spectra, not conjugate
+    queries = [(np.conjugate(spectra), index.margin - half), (spectra, index.margin + half)][: 1 + opposite]
+    headings = len(queries) * turns
+    chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
+    scores = np.full((index.height, index.width, headings), -np.inf, dtype=np.float32)
+    per_block = 8 * len(spectra) * headings
+    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
+        if len(group):
+            for (query, first), part in zip(queries, np.split(scores, len(queries), axis=2), strict=True):
+                _score(part, group, index, query, first)
+    return np.asarray(scores.transpose(2, 0, 1))
 
 
-def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats) -> None:
-    if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
-        raise ValueError(f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit")
-    if len(query) != index.dimensions:
-        raise ValueError(f"the query has {len(query)} dimensions, the map {index.dimensions}")
-    if query.shape[1] > 2 * index.margin:
-        raise ValueError(f"the query has {query.shape[1]} cells a side, the map allows for {2 * index.margin}")
-
-
-def _score(
-    scores: Floats32, group: Ints, index: FeatureIndex, query: _QuerySpectra, min_coverage: float | None
-) -> None:
-    """Fill in the scores (H, W, K) of the valid parts of some blocks."""
-    spectra = query.spectra
-    mean = _inverse(np.matmul(index.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), index, query)
-    if min_coverage is not None:
-        gaps = np.flatnonzero(~index.gapless(group))
-        if len(gaps):
-            share = _inverse(index.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], index, query)
-            # a share equal to the minimum must not depend on how the transforms round
-            enough = share >= max(min_coverage - 1e-5, _EPSILON)
-            mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _EPSILON), -np.inf)
+def _score(scores: Floats32, group: Ints, index: FeatureIndex, query: Complexes, first: int) -> None:
+    """Fill in the scores (H, W, K) of the valid parts of some blocks, by a query's spectra (bins, K, C + 1)."""
+    mean = _inverse(np.matmul(index.spectra(group), query[..., :-1].transpose(0, 2, 1)), index, first)
+    gaps = np.flatnonzero(~index.gapless(group))
+    if len(gaps):
+        share = _inverse(index.surveyed_spectra(group[gaps]) * query[:, None, :, -1], index, first)
+        # a share equal to the minimum must not depend on how the transforms round
+        enough = share >= MIN_COVERAGE - 1e-5
+        mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _EPSILON), -np.inf)
     for k, block in enumerate(group):
         rows, cols = index.cells_of(block)
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _inverse(product: Complexes, index: FeatureIndex, query: _QuerySpectra) -> Floats32:
-    """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
-    from scipy import fft
+def _half_spectra(images: Floats32, size: int) -> Complexes:
+    """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
+    whole = fft.fft(fft.rfft(images, size, axis=1), size, axis=0, overwrite_x=True)
+    return np.asarray(whole.reshape(-1, *images.shape[2:]))
 
-    size, last = index.block, query.first + index.valid
+
+def _inverse(product: Complexes, index: FeatureIndex, first: int) -> Floats32:
+    """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
+    size, last = index.block, first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
-    rows = fft.ifft(grid, axis=0, overwrite_x=True)[query.first : last]
-    return np.asarray(fft.irfft(rows, size, axis=1)[:, query.first : last])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True)[first:last]
+    return np.asarray(fft.irfft(rows, size, axis=1)[:, first:last])
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
     """Average ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and the weights.
 
     Returns:
-        (C, H / ratio, W / ratio), (H / ratio, W / ratio): the input of :func:`correlate`.
-
-    Raises:
-        ValueError: the ratio does not divide the sides, or the weights have another shape.
+        (C, H / ratio, W / ratio), (H / ratio, W / ratio).
     """
     dimensions, height, width = local.shape
-    if height % ratio or width % ratio:
-        raise ValueError(f"{height} x {width} cells cannot be taken together {ratio} by {ratio}")
     if weight is None:
         weight = np.ones((height, width), dtype=np.float32)
-    if weight.shape != (height, width):
-        raise ValueError(f"weights {weight.shape} for {height} x {width} cells")
     parts = (height // ratio, ratio, width // ratio, ratio)
     weighted = (local * weight).reshape(dimensions, *parts).mean(axis=(2, 4), dtype=np.float32)
     return np.asarray(weighted), np.asarray(weight.reshape(parts).mean(axis=(1, 3), dtype=np.float32))
@@ -182,15 +211,10 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
 
     Returns:
         (h + 1, h + 1, K, C): at [h/2 + v, h/2 + u, k] the bilinear value at R(-yaw_k) (u, v) from the middle.
-
-    Raises:
-        ValueError: the images are not square, or have an odd number of cells.
     """
-    dimensions, size, width = images.shape
-    if size != width or size % 2:
-        raise ValueError(f"a query of {size} x {width} cells: it has to be square, its sides even")
+    dimensions, size, _ = images.shape
     padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, dimensions)
-    corners, shares = _corners(size, tuple(np.asarray(yaws, dtype=np.float64).tolist()))
+    corners, shares = _corners(size, tuple(yaws.tolist()))
     out = padded.take(corners[0], axis=0) * shares[0]
     for corner, share in zip(corners[1:], shares[1:], strict=True):
         out += padded.take(corner, axis=0) * share

@@ -19,8 +19,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import Circle, Points, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
-from coview_stream.localization.search.learned.correlation import correlate_turned
-from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.correlation import correlate
 from coview_stream.localization.search.learned.rasters import (
     FeatureRasters,
     FeatureVote,
@@ -30,9 +29,7 @@ from coview_stream.localization.search.learned.rasters import (
 )
 from coview_stream.localization.search.request import SearchRequest
 
-_SIZE = 64.0
-"""Metres along the edge of a query's image."""
-
+_SIZE = 64.0  # metres along the edge of a query's image
 _ROUNDING = 1e-6  # cells
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other
 _NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are compared finely: least number, share of all
@@ -41,7 +38,7 @@ _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its co
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """Features of a query: the ground network's output around ``centre``.
+    """The ground network's output around a robot.
 
     Attributes:
         features: of an image with ``centre`` in its middle, along the axes of the odometry frame.
@@ -52,11 +49,6 @@ class QueryFeatures:
     features: Features
     weight: Floats32
     centre: Floats
-
-    @property
-    def corner(self) -> Floats:
-        """(2,) lower corner of the image, metres from the centre."""
-        return np.full(2, -0.5 * _SIZE)
 
     @property
     def place(self) -> Floats32:
@@ -73,7 +65,7 @@ class FeatureMatcher:
     """
 
     def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
-        """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+        """Search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
 
         Raises:
             MapError: the features were made by other weights than the installed ones.
@@ -95,11 +87,6 @@ class FeatureMatcher:
         """The map's features in their principal dimensions, fine and coarse."""
         return FeatureRasters.of(self.features, self.config.cell, round(0.5 * _SIZE / self.config.cell))
 
-    @property
-    def index(self) -> FeatureIndex:
-        """The map's features on coarse cells, with their spectra."""
-        return self.rasters.coarse
-
     @cached_property
     def cells(self) -> StationCells:
         """Fine cells of the stations' blocks; a block smaller than a cell has the cell of its station."""
@@ -113,17 +100,18 @@ class FeatureMatcher:
     @cached_property
     def _by_coarse_cell(self) -> tuple[Ints, Ints]:
         """Stations in the order of their coarse cells, and the first row of every cell (cells + 1,)."""
-        xy = (self.stations[:, :2].astype(np.float64) - self.index.corner) / self.index.cell
+        index = self.rasters.coarse
+        xy = (self.stations[:, :2].astype(np.float64) - index.corner) / index.cell
         column, row = np.floor(xy).astype(np.int64).T
-        inside = (column >= 0) & (column < self.index.width) & (row >= 0) & (row < self.index.height)
-        cell = np.where(inside, row * self.index.width + column, -1)
+        inside = (column >= 0) & (column < index.width) & (row >= 0) & (row < index.height)
+        cell = np.where(inside, row * index.width + column, -1)
         order = np.argsort(cell, kind="stable")
-        return order, np.searchsorted(cell[order], np.arange(self.index.height * self.index.width + 1))
+        return order, np.searchsorted(cell[order], np.arange(index.height * index.width + 1))
 
     @cached_property
     def _feature_blocks(self) -> Ints:
         """Blocks of the index that have any features."""
-        return self.index.blocks_near(self.features.tile_centres, _TILE_RADIUS)
+        return self.rasters.coarse.blocks_near(self.features.tile_centres, _TILE_RADIUS)
 
     @property
     def dense(self) -> bool:
@@ -139,7 +127,7 @@ class FeatureMatcher:
         import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
 
         warm_up("height_columns", "window_products")
-        _ = self.network, self._feature_blocks if self.dense else self.index, self.cells, self._by_coarse_cell
+        _ = self.network, self._feature_blocks if self.dense else self.rasters, self.cells, self._by_coarse_cell
 
     def encode(self, points: Points, centre: Floats) -> QueryFeatures:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,) on the ground below the robot.
@@ -149,10 +137,9 @@ class FeatureMatcher:
         """
         size = round(_SIZE / CELL)
         features = self.network(birds_eye_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
-        axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
+        axis = (np.arange(len(features.sigma)) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
         inside = np.hypot(axis[:, None], axis[None]) <= self.config.reach
-        weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
-        return QueryFeatures(features, weight, centre)
+        return QueryFeatures(features, np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32), centre)
 
     def vote(self, query: QueryFeatures, near: npt.ArrayLike = (), area: Circle | None = None) -> FeatureVote:
         """Return a query's vote; shift n means yaw -2 pi n / S.
@@ -163,14 +150,11 @@ class FeatureMatcher:
         ratio = round(self.config.cell / LOCAL_CELL)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
         turned = turn_query(query.features.local, query.weight, self.rasters, ratio, yaws)
-        if not self.dense:
-            blocks = self._similar_blocks(query, near, area)
-        elif area is None:
-            blocks = self._feature_blocks
-        else:
-            inside = self.index.blocks_near((area.x, area.y), area.radius)
-            blocks = np.intersect1d(self._feature_blocks, inside)
-        coarse = correlate_turned(turned.coarse, self.index, True, blocks)
+        index = self.rasters.coarse
+        blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near, area)
+        if self.dense and area is not None:
+            blocks = np.intersect1d(blocks, index.blocks_near((area.x, area.y), area.radius))
+        coarse = correlate(turned.coarse, index, opposite=True, blocks=blocks)
         candidates, groups = self._named(coarse, turned)
         if area is not None:
             within = area.holds(self.stations[candidates[0]])
@@ -215,7 +199,7 @@ class FeatureMatcher:
         chosen = tiles_at[np.argsort(-best, kind="stable")[: self.config.shortlist]]
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
         middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])
-        return self.index.blocks_near(middles, _TILE_RADIUS)
+        return self.rasters.coarse.blocks_near(middles, _TILE_RADIUS)
 
 
 class LearnedRecognizer:
@@ -224,8 +208,7 @@ class LearnedRecognizer:
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: FeatureMatcher) -> None:
         self.config = config
         self.learned = learned
-        peaks = replace(config.consensus, peaks=config.learned.peaks)
-        self.consensus = Consensus(base_map.station_grid, peaks)
+        self.consensus = Consensus(base_map.station_grid, replace(config.consensus, peaks=config.learned.peaks))
 
     def vote(self, request: SearchRequest) -> None:
         """Compare the ground network's features around the robot with the map's."""
@@ -238,30 +221,18 @@ class LearnedRecognizer:
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on all storeys below and above them: from above these look alike."""
+        grid = self.consensus.grid
         places: dict[tuple[int | None, int | None], Hypothesis] = {}
         for peak in self.consensus.hypotheses():
-            for place in self._storeys(replace(peak, learned=True)):
-                places.setdefault((place.station, place.shift), place)
-        return list(places.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
-
-    def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
-        """Return a peak, and its copies at the stations above and below."""
-        grid = self.consensus.grid
-        storeys = [] if peak.station is None else grid.storeys(peak.station)
-        if len(storeys) < 2:
-            return [peak]
-        out = [peak]
-        for station in storeys:
-            if station != peak.station:
+            assert peak.station is not None  # the consensus names stations
+            places.setdefault((peak.station, peak.shift), replace(peak, learned=True))
+            for station in grid.storeys(peak.station):
                 T = peak.T_map_odom.copy()
                 T[2, 3] += float(grid.stations[station, 2] - grid.stations[peak.station, 2])
-                out.append(replace(peak, T_map_odom=T, station=station))
-        return out
+                place = replace(peak, T_map_odom=T, station=station, learned=True)
+                places.setdefault((place.station, place.shift), place)
+        return list(places.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def clear(self) -> None:
         """Forget all votes."""
         self.consensus.clear()
-
-    def __len__(self) -> int:
-        """Return how many keyframes have voted."""
-        return len(self.consensus)

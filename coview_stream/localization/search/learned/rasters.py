@@ -16,8 +16,7 @@ from coview_kernels import WindowImages, WindowRaster, window_products
 from coview_stream.descriptors.feature_map import FeatureMap
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.consensus import Request
-from coview_stream.localization.search.learned.correlation import MIN_COVERAGE, downsample, rotate_images
-from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.correlation import MIN_COVERAGE, FeatureIndex, downsample, rotate_images
 
 WEIGHT = 7
 """Dimension, of the eight of a cell, that holds the query's weight, and whether the map has the cell."""
@@ -53,9 +52,7 @@ class FeatureVote:
     """Vote of one query by its learned features.
 
     Attributes:
-        centre: (3,) as :attr:`Vote.centre`.
-        images: the query at all headings.
-        named: candidate stations and shifts (K,).
+        centre: (3,) the ground below the robot, odometry frame, metres.
     """
 
     def __init__(
@@ -70,7 +67,7 @@ class FeatureVote:
         """Compare with a map.
 
         Args:
-            centre: (3,) the ground below the robot, odometry frame, metres.
+            centre: see the attribute.
             raster: the map's features and mask of cells, its margin half an image.
             cells: of the stations.
             images: the query's features and weight at all shifts.
@@ -78,22 +75,29 @@ class FeatureVote:
             groups: (N,) group numbers; only the best of a group stays a candidate.
         """
         self.centre = centre
-        self.images = images
+        self._images = images
         self._raster = raster
         self._cells = cells
         self._half = images.side // 2
         self._total = np.maximum(images.images[..., WEIGHT].sum(axis=(1, 2), dtype=np.int64), 1) * 127.0
-        self._median, self._deviation = self._standard()
-        self.named = self._best_of(candidates, groups)
+        # median and robust standard deviation of the scores, from stations and shifts spread evenly
+        number = np.arange(min(_SAMPLE, len(cells) * self.sectors))
+        sample = self.scores(number * len(cells) // max(len(number), 1), number * _STRIDE % self.sectors)
+        sample = sample[np.isfinite(sample)]
+        self._median, self._deviation = np.float32(0.0), np.float32(1.0)
+        if len(sample):
+            self._median = np.median(sample)
+            self._deviation = np.float32(1.4826 * np.median(np.abs(sample - self._median)) + 1e-6)
+        self._named = self._best_of(candidates, groups)
 
     @property
     def sectors(self) -> int:
         """Number of shifts S."""
-        return len(self.images)
+        return len(self._images)
 
     def candidates(self) -> tuple[Ints, Ints]:
-        """Return the named stations and shifts (K,)."""
-        return self.named
+        """Return the named stations and shifts (K,), best first."""
+        return self._named
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return z-scores (K,); 0 where nothing was compared."""
@@ -104,7 +108,7 @@ class FeatureVote:
         return z_scores
 
     def at_all(self, requests: Sequence[Request[FeatureVote]]) -> list[Floats32]:
-        """Return the results of :meth:`at`, one per request."""
+        """Return :meth:`at` of each request."""
         return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
     def scores(self, stations: Ints, shifts: Ints) -> Floats32:
@@ -121,22 +125,11 @@ class FeatureVote:
 
     def _products(self, cells: Ints, shifts: Ints) -> Floats32:
         """Return the scores (K,) of raster cells (K, 2) at shifts (K,)."""
-        sums = window_products(self._raster, self.images, cells - self._half, shifts)
+        sums = window_products(self._raster, self._images, cells - self._half, shifts)
         weight = sums[:, WEIGHT].astype(np.float32)
         enough = weight >= MIN_COVERAGE * self._total[shifts]
         mean = sums[:, :WEIGHT].sum(axis=1) / np.maximum(weight, 1.0)
         return np.where(enough, mean, -np.inf).astype(np.float32)
-
-    def _standard(self) -> tuple[np.float32, np.float32]:
-        """Return median and robust standard deviation of the scores, from stations and shifts spread evenly."""
-        count = min(_SAMPLE, len(self._cells) * self.sectors)
-        number = np.arange(count)
-        scores = self.scores(number * len(self._cells) // max(count, 1), number * _STRIDE % self.sectors)
-        scores = scores[np.isfinite(scores)]
-        if not len(scores):
-            return np.float32(0.0), np.float32(1.0)
-        median = np.median(scores)
-        return median, np.float32(1.4826 * np.median(np.abs(scores - median)) + 1e-6)
 
     def _best_of(self, candidates: tuple[Ints, Ints], groups: Ints) -> tuple[Ints, Ints]:
         """Return the best distinct stations and shifts, one per group, best first."""

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from coview_stream.localization.search.learned.correlation import correlate, downsample, rotate_images
-from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.correlation import (
+    MIN_COVERAGE,
+    FeatureIndex,
+    correlate,
+    downsample,
+    rotate_images,
+)
 
 YAWS = np.arange(12) * (np.pi / 6)
 
@@ -27,6 +32,11 @@ def seen_at(known, row, col, yaw, size):
     return np.stack([ndimage.map_coordinates(channel, where, order=1) for channel in known]).astype(np.float32)
 
 
+def scores_of(query, weight, index, yaws, blocks=None):
+    """Scores (K, H, W) of a query (C, h, h) and its weights, which are multiplied already."""
+    return correlate(rotate_images(np.concatenate([query, weight[None]]), np.asarray(yaws)), index, False, blocks)
+
+
 def disk(size):
     at = np.arange(size) - (size - 1) / 2
     return (np.hypot(at[:, None], at[None]) <= size / 2).astype(np.float32)
@@ -43,7 +53,7 @@ def bilinear(image, row, col):
     return total
 
 
-def by_loops(query, weight, known, surveyed, yaws, covered):
+def by_loops(query, weight, known, surveyed, yaws):
     """The definition, in float64: the query's grid is turned, laid on every cell, multiplied and summed."""
     _, height, width = known.shape
     half = len(weight) // 2
@@ -64,37 +74,33 @@ def by_loops(query, weight, known, surveyed, yaws, covered):
                     if 0 <= r + v < height and 0 <= col + u < width:
                         value += float(np.dot(q, known[:, r + v, col + u]))
                         share += w * surveyed[r + v, col + u]
-                if covered is None:
-                    out[k, r, col] = value / total
-                elif share / total >= covered:
+                if share / total >= MIN_COVERAGE:
                     out[k, r, col] = value / share
     return out
 
 
-@pytest.mark.parametrize("covered", [None, 0.6, 0.3])
 @pytest.mark.parametrize("max_bytes", [0, 1 << 30])
-@pytest.mark.parametrize(
-    "headings", [(0.0, 0.3, 2.0, -1.2), (0.4, 1.7, 0.4 - np.pi, 1.7 + np.pi)], ids=["any", "opposite"]
-)
-def test_correlation_equals_direct_sums(covered, max_bytes, headings):
+@pytest.mark.parametrize("opposite", [False, True])
+def test_correlation_equals_direct_sums(max_bytes, opposite):
     rng = np.random.default_rng(1)
     known = features(rng, 3, 11, 17)
     known[:, :5, :9] = 0.0
     surveyed = (known != 0).any(axis=0)
     local, weights = features(rng, 3, 12, 12), rng.uniform(0.1, 1.0, (12, 12)).astype(np.float32)
     query, weight = downsample(local, weights)
-    yaws = np.asarray(headings)
+    yaws = np.array([0.0, 0.3, 2.0, -1.2])
     made = FeatureIndex(known, (0.0, 0.0), block=15, margin=4, max_bytes=max_bytes)
     assert len(made) == 2 * 3
-    assert (made.nbytes > 0) == (max_bytes > 0)
-    ours = correlate(query, weight, made, yaws, min_coverage=covered)
-    expected = by_loops(query, weight, known, surveyed, yaws, covered)
-    assert ours.shape == expected.shape == (4, 11, 17)
+    ours = correlate(rotate_images(np.concatenate([query, weight[None]]), yaws), made, opposite)
+    if opposite:
+        yaws = np.concatenate([yaws, yaws + np.pi])
+    expected = by_loops(query, weight, known, surveyed, yaws)
+    assert ours.shape == expected.shape == (len(yaws), 11, 17)
     assert ours.dtype == np.float32
     scored = np.isfinite(expected)
     np.testing.assert_array_equal(np.isfinite(ours), scored)
     assert scored.any()
-    assert scored.all() == (covered is None)
+    assert not scored.all()
     np.testing.assert_allclose(ours[scored], expected[scored], atol=1e-4)
 
 
@@ -105,17 +111,17 @@ def test_planted_place_is_found_with_its_heading(row, col, k):
     query = seen_at(known, row, col, YAWS[k], 32)
     query += rng.normal(0, 0.2, query.shape).astype(np.float32)
     weight = disk(32)
-    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
+    scores = scores_of(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
     assert np.unravel_index(scores.argmax(), scores.shape) == (k, row, col)
 
 
 def test_correlation_on_half_precision_map_smaller_than_query():
     rng = np.random.default_rng(3)
-    known = features(rng, 8, 20, 9).astype(np.float16)
-    query = seen_at(known.astype(np.float32), 11, 4, YAWS[2], 32)
+    known = features(rng, 8, 28, 26).astype(np.float16)
+    query = seen_at(known.astype(np.float32), 15, 12, YAWS[2], 32)
     weight = disk(32)
-    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS, min_coverage=0.1)
-    assert np.unravel_index(scores.argmax(), scores.shape) == (2, 11, 4)
+    scores = scores_of(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
+    assert np.unravel_index(scores.argmax(), scores.shape) == (2, 15, 12)
 
 
 def test_map_edge_does_not_bias_scores():
@@ -125,17 +131,14 @@ def test_map_edge_does_not_bias_scores():
     weight = disk(32)
     coarse = FeatureIndex(known, (0, 0))
     inside, edge = (
-        correlate(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col] for col in (50, 5)
+        scores_of(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col] for col in (50, 5)
     )
     assert edge == pytest.approx(inside, rel=0.05)
     query = seen_at(known, 50, 5, 0.0, 32) * weight
-    scores = correlate(query, weight, coarse, [0.0])[0]
+    scores = scores_of(query, weight, coarse, [0.0])[0]
     assert np.isneginf(scores[50, 0])  # 54 % lie on the map
     assert np.isneginf(scores[0, 0])
     assert np.isfinite(scores[5:95, 16:84]).all()
-    punished = correlate(query, weight, coarse, [0.0], min_coverage=None)[0]
-    assert np.isfinite(punished).all()
-    assert punished[50, 5] < 0.8 * inside
 
 
 def centre_of(coarse, row, col):
@@ -148,18 +151,18 @@ def test_requested_blocks_score_as_in_full_correlation():
     known, corner = features(rng, 4, 150, 90), (100.0, -50.0)
     coarse = FeatureIndex(known, corner, block=64)
     query, weight = features(rng, 4, 32, 32) * disk(32), disk(32)
-    whole = correlate(query, weight, coarse, YAWS[:3])
+    whole = scores_of(query, weight, coarse, YAWS[:3])
     place = centre_of(coarse, 70, 33)
     near = coarse.blocks_near([place], 20.0)
     assert 0 < len(near) < len(coarse)
-    part = correlate(query, weight, coarse, YAWS[:3], near)
+    part = scores_of(query, weight, coarse, YAWS[:3], near)
     rows, cols = np.indices(known.shape[1:])
     within = np.hypot(*(centre_of(coarse, rows, cols) - place).transpose(2, 0, 1)) <= 20.0
     assert np.isfinite(part[:, within]).all()
     scored = np.isfinite(part)
     assert scored.sum() < np.isfinite(whole).sum()
     np.testing.assert_allclose(part[scored], whole[scored], atol=1e-6)
-    assert np.isneginf(correlate(query, weight, coarse, YAWS[:3], coarse.blocks_near([(0, 5000)], 9.0))).all()
+    assert np.isneginf(scores_of(query, weight, coarse, YAWS[:3], coarse.blocks_near([(0, 5000)], 9.0))).all()
 
 
 def test_each_block_covers_only_its_own_cells():
@@ -192,21 +195,7 @@ def test_downsampled_cells_are_weighted_means():
     np.testing.assert_allclose(downsample(local)[0][0, 1, 1], np.mean([10, 11, 14, 15]))
 
 
-def test_mismatched_shapes_are_refused():
-    coarse = FeatureIndex(np.ones((2, 40, 40), np.float32), (0, 0))
-    query, weight = np.ones((2, 32, 32), np.float32), np.ones((32, 32), np.float32)
-    for wrong in (
-        lambda: correlate(query, weight[1:], coarse, [0.0]),
-        lambda: correlate(query, 0 * weight, coarse, [0.0]),
-        lambda: correlate(query[:1], weight, coarse, [0.0]),
-        lambda: correlate(query, weight, coarse, []),
-        lambda: correlate(np.ones((2, 34, 34), np.float32), np.ones((34, 34), np.float32), coarse, [0.0]),
-        lambda: correlate(query[:, 1:, 1:], weight[1:, 1:], coarse, [0.0]),
-        lambda: FeatureIndex(np.ones((2, 0, 4), np.float32), (0, 0)),
-        lambda: FeatureIndex(np.ones((2, 4, 4), np.float32), (0, 0), block=32),
-        lambda: FeatureIndex(np.ones((2, 4, 4), np.float32), (0, 0), surveyed=np.ones((3, 4), bool)),
-        lambda: downsample(np.ones((1, 5, 4), np.float32)),
-        lambda: downsample(np.ones((1, 4, 4), np.float32), np.ones((2, 2), np.float32)),
-    ):
-        with pytest.raises(ValueError, match=r"."):
-            wrong()
+def test_query_without_weight_is_refused():
+    query, weight = np.ones((2, 32, 32), np.float32), np.zeros((32, 32), np.float32)
+    with pytest.raises(ValueError, match="no cell of the query has a weight"):
+        scores_of(query, weight, FeatureIndex(np.ones((2, 40, 40), np.float32), (0, 0)), [0.0])
