@@ -61,7 +61,7 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
 """State of the engine that follows on an event; where a pair is missing, the event changes nothing.
 
 LOST stays LOST while the map is searched again: only an accepted place ends it. A node loses a place for more reasons,
-by :func:`coview_stream.stream.node.robot_state.session_state`.
+by :class:`coview_stream.stream.node.robot_state.RobotState`.
 """
 
 

@@ -34,7 +34,7 @@ def test_state_and_no_state_together_are_refused(capsys):
 
 
 def test_without_home_directory_no_pose_is_saved(monkeypatch, caplog, tmp_path):
-    for name in ("XDG_STATE_HOME", "LOCALAPPDATA", "HOME"):
+    for name in ("XDG_STATE_HOME", "HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setitem(sys.modules, "pwd", None)
     assert folder() is None

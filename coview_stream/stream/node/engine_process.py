@@ -1,23 +1,27 @@
 """Engine in a process of its own, which is started again when it dies, and killed when it hangs.
 
-Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
-thing that keeps the pose clock of this one steady.
+Native code (registration, BLAS, tree building) may hold the interpreter lock for long; only a process of its own keeps
+the node's pose clock steady. Its command is ``python -m coview_stream.stream.node.engine_process FD KIND``.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import socket
 import subprocess
+import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CoViewError
@@ -51,40 +55,25 @@ class CancelledError(Exception):
     """The engine is no longer waited for."""
 
 
-class Opening(NamedTuple):
-    """Message that names the map that a child has to open.
-
-    Attributes:
-        map_path: the map's file.
-        sha256: of the map.
-        config: of the localizers and searches; None for the defaults.
-        trust: demands that the map is signed; None takes any.
-    """
-
-    map_path: str
-    sha256: str
-    config: LocalizerConfig | None = None
-    trust: Trust | None = None
+# ---- the parent's side
 
 
 class EngineChild:
-    """A process of :mod:`coview_stream.stream.node.worker`, which may be started before map and robots are known.
+    """The child process, which may be started before map and robots are known.
 
-    It imports its libraries and loads its kernels first, which takes most of its start, and only then waits for its
-    :class:`Opening`: meanwhile the parent reads options, checks the map and opens the network. It is a new interpreter,
-    not a fork, which deadlocks once zenoh is open, nor a spawn, which would import the host's main module.
+    It imports its libraries and loads its kernels, which takes most of its start, and then waits for the arguments of
+    :func:`~coview_stream.stream.node.engines.open_engine`: meanwhile the parent reads options, checks the map and opens
+    the network. It is a new interpreter: a fork deadlocks once zenoh is open, a spawn imports the host's main module.
 
     Args:
         kind: ``track``, ``search`` or ``odometry``.
-        nice: added to its niceness; None for that of its kind.
     """
 
-    def __init__(self, kind: str, nice: int | None = None) -> None:
+    def __init__(self, kind: str) -> None:
         ours, theirs = socket.socketpair()
-        nice = NICE[kind] if nice is None else nice
         with theirs:
             self.process = subprocess.Popen(
-                python_command("coview_stream.stream.node.worker", str(theirs.fileno()), kind, str(nice)),
+                python_command("coview_stream.stream.node.engine_process", str(theirs.fileno()), kind),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=engine_environment(kind),
@@ -119,10 +108,10 @@ def engine_environment(kind: str) -> dict[str, str]:
 
 
 class EngineRunner(Protocol):
-    """Runs an engine's jobs one at a time. Raises RejectedError, FailedError or DiedError."""
+    """Runs an engine's jobs one at a time."""
 
     def run(self, job: Job) -> Result:
-        """Do one job and wait for it."""
+        """Do one job and wait for it; RejectedError, FailedError or DiedError."""
         ...
 
     @property
@@ -158,7 +147,6 @@ class EngineProcess:
         config: of the localizers and searches; None for the defaults.
         trust: demands that the map is signed; None takes any.
         child: the first child, started before; None starts one.
-        nice: added to the child's niceness; None for that of its kind.
         job_timeout: seconds after which a job counts as hung.
         open_timeout: seconds after which opening the map, or preparing for the first job, does.
     """
@@ -172,15 +160,13 @@ class EngineProcess:
         *,
         trust: Trust | None = None,
         child: EngineChild | None = None,
-        nice: int | None = None,
         job_timeout: float = 30.0,
         open_timeout: float = 120.0,
     ) -> None:
         self.kind = kind
-        self.opening = Opening(map_path, sha256, config, trust)
-        self.nice = nice
         self.job_timeout = job_timeout
         self.open_timeout = open_timeout
+        self._opening = map_path, sha256, config, trust
         self._prestarted = child
         self._closed = False
         self._lock = threading.Lock()
@@ -206,11 +192,11 @@ class EngineProcess:
         with self._lock:
             if self._closed:
                 raise DiedError(f"the {self.kind} engine has been closed")
-            child, self._prestarted = self._prestarted or EngineChild(self.kind, self.nice), None
+            child, self._prestarted = self._prestarted or EngineChild(self.kind), None
             self._child = child
             self._awaited = ["ready", "prepared"]
             with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
-                child.pipe.send(self.opening)
+                child.pipe.send(self._opening)
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.
@@ -286,12 +272,9 @@ class EngineProcess:
         try:
             while self._awaited and child.pipe.poll():
                 self._await(self._awaited[0])
-        except CoViewError as error:
+        except (CoViewError, OSError) as error:  # the latter: closed by another thread meanwhile
             self._end()
-            raise DiedError(str(error)) from error
-        except OSError as error:  # closed by another thread meanwhile
-            self._end()
-            raise DiedError(f"the {self.kind} engine died") from error
+            raise DiedError(str(error) if isinstance(error, CoViewError) else f"the {self.kind} engine died") from error
         if (code := child.process.poll()) is not None:
             self._end()
             cause = f"by signal {-code}" if code < 0 else f"exit code {code}"
@@ -303,11 +286,14 @@ class EngineProcess:
         A stopped one would hold up the jobs until the time limit of one, and robots with them.
         """
         self.end_hung_job()
-        child = self._child
-        running = child is not None and child.process.returncode is None
-        stopped = child.process.pid if child is not None and running and _is_stopped(child.process.pid) else None
-        if child is not None and stopped is not None and stopped == self._stopped:
-            child.process.kill()
+        child, stopped = self._child, None
+        if child is not None and child.process.returncode is None:
+            with contextlib.suppress(OSError):  # there is no /proc; a process that a debugger holds is not "T"
+                stat = Path(f"/proc/{child.process.pid}/stat").read_text(errors="replace")
+                if stat.rpartition(")")[2].split()[:1] == ["T"]:
+                    stopped = child.process.pid
+            if stopped is not None and stopped == self._stopped:
+                child.process.kill()
         self._stopped = stopped
 
     def end_hung_job(self) -> None:
@@ -332,12 +318,15 @@ class EngineProcess:
             child.close()
 
 
-def _is_stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal; False where there is no ``/proc``. One that a debugger holds is not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[:1] == ["T"]
-    except OSError:
-        return False
+def unwrap(kind: str, value: Any) -> Result:
+    """Return the result or raise the error of :func:`attempt`."""
+    if kind == "done":
+        result: Result = value
+        return result
+    raise (RejectedError if kind == "rejected" else FailedError)(str(value))
+
+
+# ---- the child's side
 
 
 def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
@@ -352,9 +341,66 @@ def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
         return "failed", traceback.format_exc(limit=-6)
 
 
-def unwrap(kind: str, value: Any) -> Result:
-    """Return the result or raise the error of :func:`attempt`."""
-    if kind == "done":
-        result: Result = value
-        return result
-    raise (RejectedError if kind == "rejected" else FailedError)(str(value))
+def work(pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None = None) -> int:
+    """Load the kernels, open the engine, then answer jobs until the parent closes the pipe; return the exit code.
+
+    Kernels of later jobs are loaded one by one while no job waits: a job that comes meanwhile waits a quarter of a
+    second at most with the cache, some seconds on the first run ever.
+
+    Args:
+        pipe: to the parent.
+        kind: of the engine.
+        open_engine: in place of :func:`~coview_stream.stream.node.engines.open_engine`.
+    """
+    _set_group_nice(NICE[kind])
+    from coview_kernels import warm_up
+    from coview_stream.stream.node import engines
+
+    for name in engines.KINDS[kind].kernels:
+        if pipe.poll():  # the node waits for its engines, or soon a robot for its search: no more standing back
+            _set_group_nice(0)
+        warm_up(name)
+    steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in engines.KINDS[kind].later_kernels)
+
+    def use_pause() -> None:
+        while steps and not pipe.poll():
+            with contextlib.suppress(CoViewError):  # the job that needs it will say so
+                steps.popleft()()
+
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
+        use_pause()
+        opening = pipe.recv()
+        _set_group_nice(0)
+        try:
+            engine = (open_engine or engines.open_engine)(kind, *opening)
+            pipe.send(("ready", None))
+            engine.prepare()
+        except CoViewError as error:
+            pipe.send(("error", str(error)))
+            return 1
+        if not gc.isenabled():
+            gc.freeze()  # nearly all objects of the start stay: to look through them again would cost every job
+            gc.enable()
+        pipe.send(("prepared", None))
+        _set_group_nice(NICE[kind])
+        steps.append(engine.prepare_later)
+        while True:
+            use_pause()
+            pipe.send(attempt(engine, pipe.recv()))
+    return 0
+
+
+def _set_group_nice(nice: int) -> None:
+    """Set the niceness of this process's session, where Linux groups tasks by session.
+
+    There the process's own niceness only counts among the processes of one session, which this one has for itself.
+    """
+    with contextlib.suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(nice))
+
+
+if __name__ == "__main__":
+    gc.disable()  # nearly all objects of the start stay: a tenth of the time
+    with contextlib.suppress(OSError):
+        os.nice(NICE[sys.argv[2]])
+    sys.exit(work(Connection(int(sys.argv[1])), sys.argv[2]))

@@ -17,7 +17,6 @@ from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last_line
 from coview_stream.stream.node.inputs import OdometryJob, OdometryResult, PairedFrame
-from coview_stream.stream.node.last_place import PlaceHints
 
 # of searches
 _PATIENCE = 1.5  # seconds after which a waiting keyframe comes before all that have waited less
@@ -148,6 +147,76 @@ class RoundRobin:
         """Count the turn that robot ``k`` has now."""
         self._turns += 1
         self._last_turn[k] = self._turns
+
+
+class PlaceHints:
+    """Hints for the engine: the last place and somebody's guess, each once in every odometry epoch.
+
+    The session holds the lock.
+
+    Attributes:
+        forgotten: number of times that a client has asked to forget the place.
+        T_map_body: (4, 4) of the last place, whether the engine has it or not; None for none.
+        calibration: of the sensor and odometry there; goes with the pose, as a prior.
+        guess: the newest one, until the place is known.
+        pending_guess: the same, until a frame has taken it to the engine.
+    """
+
+    def __init__(self) -> None:
+        self.forgotten = 0
+        self.guess: PlaceGuess | None = None
+        self.pending_guess: PlaceGuess | None = None
+        self.drop()
+
+    def drop(self) -> None:
+        """Never offer this pose again; only a new one."""
+        self.T_map_body: Pose | None = None
+        self.calibration: Calibration | None = None
+        self._pending = False
+
+    @property
+    def pending(self) -> Pose | None:
+        """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
+        return self.T_map_body if self._pending else None
+
+    def offer(self, T_map_body: Pose, calibration: Calibration | None) -> None:
+        """Take over a pose from before this session, which the engine does not know."""
+        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, True
+
+    def offer_guess(self, guess: PlaceGuess | None) -> None:
+        """Take over a guess in place of the one before."""
+        self.guess = self.pending_guess = guess
+
+    def verified(self, T_map_body: Pose, calibration: Calibration | None) -> None:
+        """Take over a pose that the engine itself has verified."""
+        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, False
+        self.guess = None
+
+    def begin_epoch(self) -> None:
+        """Offer all again: the engine forgets everything with an odometry frame, but the robot stands where it stood.
+
+        A guess loses its circle, for it is not known how far the robot has come.
+        """
+        self._pending = self.T_map_body is not None
+        self.offer_guess(without_circle(self.guess))
+
+    def delivered(self, hint: Pose | None, guess: PlaceGuess | None) -> None:
+        """Offer no more the pose and the guess that went with a frame."""
+        if hint is self.T_map_body:
+            self._pending = False
+        if guess is self.pending_guess:
+            self.pending_guess = None
+
+    def forget(self) -> None:
+        """Drop everything because a client asks; the file for the next start is to go as well."""
+        self.drop()
+        self.offer_guess(None)
+        self.forgotten += 1
+
+
+def without_circle(guess: PlaceGuess | None) -> PlaceGuess | None:
+    """Return a guess that holds anywhere, not only in a circle."""
+    return None if guess is None else replace(guess, within=None)
 
 
 class QueuedFrame(NamedTuple):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import Trust
@@ -32,44 +32,38 @@ from coview_stream.stream.node.inputs import OdometryJob, OdometryResult
 _CROPS = 24  # of the map with their search grids, shared by all robots
 
 
-class Engine(Protocol):
-    """Works through jobs one at a time; an exception concerns the job's robot only."""
+class Engine(ABC):
+    """Works through jobs one at a time; an exception concerns the job's robot only.
 
+    Attributes:
+        kernels: that its first jobs launch, to be compiled before them.
+        later_kernels: that only later jobs launch, to be compiled between jobs.
+    """
+
+    kernels: tuple[str, ...] = ()
+    later_kernels: tuple[str, ...] = ()
+
+    @abstractmethod
     def run(self, job: Job) -> Result:
         """Do one job."""
-        ...
 
+    @abstractmethod
     def forget(self, robot: str) -> None:
         """Forget a robot."""
-        ...
 
-    @property
-    def kernels(self) -> tuple[str, ...]:
-        """Kernels that its first jobs launch, to be compiled before them."""
-        ...
+    def prepare(self) -> None:  # noqa: B027
+        """Prepare for the first job."""
 
-    @property
-    def later_kernels(self) -> tuple[str, ...]:
-        """Kernels that only later jobs launch, to be compiled between jobs."""
-        ...
-
-    def prepare(self) -> None:
-        """Prepare for the first job; called before it."""
-        ...
-
-    def prepare_later(self) -> None:
-        """Prepare for later jobs; called between jobs."""
-        ...
+    def prepare_later(self) -> None:  # noqa: B027
+        """Prepare for later jobs, in the first pause."""
 
 
-class TrackEngine:
+class TrackEngine(Engine):
     """Localizers of all robots: deskewing, keyframes, registration around a known place."""
 
     kernels = ("transform_unique", "nearest", "align_planes")
     # of robots that have a place to be tracked from, which takes a search longer than it does to load them
-    later_kernels: tuple[str, ...] = (
-        "crop_points", "field_scores",
-    )  # fmt: skip
+    later_kernels = ("crop_points", "field_scores")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -112,9 +106,6 @@ class TrackEngine:
         """Drop a robot's localizer."""
         self._robots.pop(robot, None)
 
-    def prepare(self) -> None:
-        """Do nothing: the map is cropped where robots are."""
-
     def prepare_later(self) -> None:
         """Import the library of the graph of poses, and load the field that a slip of odometry is judged by."""
         PoseGraph(self.config.graph)
@@ -133,11 +124,10 @@ class TrackEngine:
         return localizer
 
 
-class SearchEngine:
+class SearchEngine(Engine):
     """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = GlobalSearch.KERNELS
-    later_kernels: tuple[str, ...] = ()
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -164,11 +154,8 @@ class SearchEngine:
         """Prepare the stations' index, the learned features and the field for the first query."""
         GlobalSearch(self.base_map, self.config, self._local_maps, self._index).prepare()
 
-    def prepare_later(self) -> None:
-        """Do nothing: all jobs are alike."""
 
-
-class OdometryEngine:
+class OdometryEngine(Engine):
     """One :class:`LidarOdometry` per robot.
 
     Args:
@@ -177,9 +164,6 @@ class OdometryEngine:
     Raises:
         DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
     """
-
-    kernels: tuple[str, ...] = ()
-    later_kernels: tuple[str, ...] = ()
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration
@@ -209,12 +193,6 @@ class OdometryEngine:
         self._robots.pop(robot, None)
         self._trajectories.pop(robot, None)
 
-    def prepare(self) -> None:
-        """Do nothing: local maps grow with the frames."""
-
-    def prepare_later(self) -> None:
-        """Do nothing."""
-
     def _lidar(self, job: OdometryJob) -> LidarOdometry:
         """Return the robot's lidar odometry, which begins again with a new epoch."""
         epoch, lidar = self._robots.get(job.robot, (None, None))
@@ -226,21 +204,17 @@ class OdometryEngine:
         return lidar
 
 
-def kernels_of(kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return first and later kernels of the engine ``track``, ``search`` or ``odometry``, which need not be open."""
-    if kind == "odometry":
-        return (), ()
-    engine = TrackEngine if kind == "track" else SearchEngine
-    return engine.kernels, engine.later_kernels
+KINDS: dict[str, type[Engine]] = {"odometry": OdometryEngine, "track": TrackEngine, "search": SearchEngine}
+"""Engines by their names."""
 
 
 def open_engine(
     kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None, trust: Trust | None = None
 ) -> Engine:
-    """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map, which the node has checked.
+    """Make one of :data:`KINDS`; ``track`` and ``search`` load the map, which the node has checked.
 
-    The file that the node has checked may have been changed meanwhile: its hash has to be ``sha256`` and, with
-    ``trust``, it is verified again, unless it is the very file, untouched.
+    The file may have been changed meanwhile: its hash has to be ``sha256`` and, with ``trust``, it is verified again,
+    unless it is the very file, untouched.
 
     Raises:
         MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no

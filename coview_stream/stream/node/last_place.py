@@ -1,6 +1,6 @@
-"""Last place of a robot: its file, its message to another node, and the hints that the engine gets of it.
+"""Last place of a robot: its file, its message to another node, and guesses of people.
 
-Every place from before is a hypothesis: the engine verifies it like any other
+Every such place is a hypothesis: the engine verifies it like any other
 (:meth:`coview_stream.localization.localizer.Localizer.hint_pose`).
 """
 
@@ -14,10 +14,9 @@ import logging
 import math
 import os
 import stat
-import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -49,7 +48,7 @@ class LastPlace:
     """Place of a robot on a map. A file has its ``T_map_body``; a message between nodes its ``T_map_odom``.
 
     Attributes:
-        map_sha256: of the base map, 64 hexadecimal digits; of a site that of its state, common to all parts of it.
+        map_sha256: of the base map, 64 hexadecimal digits; of a site that of its state.
         stamp_ns: sensor time of ``T_map_body``, nanoseconds.
         T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
         T_map_odom: (4, 4) map <- odometry; the robot's odometry goes on when its node changes.
@@ -81,10 +80,10 @@ class LastPlace:
 
 
 def save(folder: Path, robot: str, place: LastPlace) -> Path:
-    """Write a robot's place and return the file; the previous one stays whole until then.
+    """Write a robot's place and return the file; OSError if the directory cannot be made or written.
 
-    Raises:
-        OSError: the directory cannot be made or written.
+    Only the owner may read the file. A robot's day usually ends with a power cut: the bytes are on the disk before the
+    file gets its name, and :func:`remove_parts` deletes the remains of a cut at the next start.
     """
     path = file_of(folder, robot, place.map_sha256)
     document = {
@@ -98,31 +97,49 @@ def save(folder: Path, robot: str, place: LastPlace) -> Path:
     if place.calibration is not None:
         document["calibration"] = asdict(place.calibration)  # radians and metres
     _make(folder)
-    _write_whole(path, json.dumps(document, indent=1).encode())
+    handle, name = tempfile.mkstemp(dir=folder, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(json.dumps(document, indent=1).encode())
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)  # a link in its place is replaced, not followed
+    finally:
+        part.unlink(missing_ok=True)
     return path
 
 
 def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
-    """Read the file of a robot on a map.
+    """Read the file of a robot on a map; None if there is none.
 
-    Returns:
-        None if there is none, and, after a warning that names the file, if it cannot be used: it is damaged, of another
-        version, or not of this robot and map.
+    None as well, after a warning that names the file, for one that is damaged, of another version, robot or map.
     """
     path = file_of(folder, robot, map_sha256)
     try:
         with _open_regular(path) as file:
-            owner, place = _parsed(file.read(_MAX_BYTES + 1))
-        if (owner, place.map_sha256) != (robot, map_sha256):
+            data = file.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            raise ValueError(f"longer than {_MAX_BYTES} bytes")
+        document: Any = json.loads(data.decode("utf-8"))
+        if not isinstance(document, dict) or document.get("format") != _FORMAT:
+            raise ValueError("it is something else")
+        if document.get("version") != VERSION:
+            raise ValueError(f"version {document.get('version')!r:.20}, this release reads {VERSION}")
+        if (str(document["robot"]), str(document["map_sha256"])) != (robot, map_sha256):
             raise ValueError("it is of another robot or map")
+        return LastPlace(
+            map_sha256,
+            stamp_ns=int(document["stamp_ns"]),
+            T_map_body=_read_pose(document, "T_map_body"),
+            calibration=_read_calibration(document.get("calibration")),
+        )
     except FileNotFoundError:
         return None
     except OSError as error:
         log.warning("%s: the last pose cannot be read (%s); searching without", path, error.strerror or error)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         log.warning("%s: is no last pose to be used (%s); searching without", path, error)
-    else:
-        return place
     return None
 
 
@@ -160,41 +177,20 @@ def default_folder() -> Path:
     Raises:
         ConfigError: the user has no home directory.
     """
-    if sys.platform == "win32":
-        folder, below_home = os.environ.get("LOCALAPPDATA", ""), "AppData/Local"
-    else:
-        folder, below_home = os.environ.get("XDG_STATE_HOME", ""), ".local/state"
-    try:
-        # the specification says that a relative one is to be ignored
-        root = Path(folder) if folder and Path(folder).is_absolute() else Path.home() / below_home
-    except RuntimeError as error:
-        raise ConfigError(
-            f"cannot tell where to keep the last poses ({error}); use --state DIR or --no-state"
-        ) from error
-    return root / "coview-stream"
+    folder = Path(os.environ.get("XDG_STATE_HOME", ""))
+    if not folder.is_absolute():  # the specification says that a relative one is to be ignored
+        try:
+            folder = Path.home() / ".local/state"
+        except RuntimeError as error:
+            raise ConfigError(
+                f"cannot tell where to keep the last poses ({error}); use --state DIR or --no-state"
+            ) from error
+    return folder / "coview-stream"
 
 
 def _make(folder: Path) -> None:
     """Make a directory that only its owner may enter; an existing one keeps its mode."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write a file that only its owner may read: under a name that nobody can foresee, then renamed.
-
-    A robot's day usually ends with a power cut: the bytes are on the disk before the name changes. The remains of a cut
-    are for :func:`remove_parts`, at the next start.
-    """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)  # a link in its place is replaced, not followed
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _open_regular(path: Path) -> BinaryIO:
@@ -205,24 +201,6 @@ def _open_regular(path: Path) -> BinaryIO:
         file.close()
         raise OSError("it is no file")
     return file
-
-
-def _parsed(data: bytes) -> tuple[str, LastPlace]:
-    """Return robot and place of a file; ValueError, TypeError, KeyError, OverflowError or RecursionError for none."""
-    if len(data) > _MAX_BYTES:
-        raise ValueError(f"longer than {_MAX_BYTES} bytes")
-    document: Any = json.loads(data.decode("utf-8"))
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
-        raise ValueError("it is something else")
-    if document.get("version") != VERSION:
-        raise ValueError(f"version {document.get('version')!r:.20}, this release reads {VERSION}")
-    place = LastPlace(
-        map_sha256=str(document["map_sha256"]),
-        stamp_ns=int(document["stamp_ns"]),
-        T_map_body=_read_pose(document, "T_map_body"),
-        calibration=_read_calibration(document.get("calibration")),
-    )
-    return str(document["robot"]), place
 
 
 def _read_pose(document: Any, name: str) -> Pose:
@@ -309,76 +287,3 @@ def decode_guess(sample: Sample) -> PlaceGuess:
         "distance": min(max(_SIGMAS * spread, 3.0), MAX_DISTANCE), "angle": min(max(_SIGMAS * turn, 0.3), math.pi),
         "map": None if pose.frame_id in ("", "map") else pose.frame_id,
     })  # fmt: skip
-
-
-# ---- hints for the engine
-
-
-class PlaceHints:
-    """Hints for the engine: the last place and somebody's guess, each once in every odometry epoch.
-
-    The session holds the lock.
-
-    Attributes:
-        forgotten: number of times that a client has asked to forget the place.
-        T_map_body: (4, 4) of the last place, whether the engine has it or not; None for none.
-        calibration: of the sensor and odometry there; goes with the pose, as a prior.
-        guess: the newest one, until the place is known.
-        pending_guess: the same, until a frame has taken it to the engine.
-    """
-
-    def __init__(self) -> None:
-        self.forgotten = 0
-        self.guess: PlaceGuess | None = None
-        self.pending_guess: PlaceGuess | None = None
-        self.drop()
-
-    def drop(self) -> None:
-        """Never offer this pose again; only a new one."""
-        self.T_map_body: Pose | None = None
-        self.calibration: Calibration | None = None
-        self._pending = False
-
-    @property
-    def pending(self) -> Pose | None:
-        """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
-        return self.T_map_body if self._pending else None
-
-    def offer(self, T_map_body: Pose, calibration: Calibration | None) -> None:
-        """Take over a pose from before this session, which the engine does not know."""
-        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, True
-
-    def offer_guess(self, guess: PlaceGuess | None) -> None:
-        """Take over a guess in place of the one before."""
-        self.guess = self.pending_guess = guess
-
-    def verified(self, T_map_body: Pose, calibration: Calibration | None) -> None:
-        """Take over a pose that the engine itself has verified."""
-        self.T_map_body, self.calibration, self._pending = T_map_body, calibration, False
-        self.guess = None
-
-    def begin_epoch(self) -> None:
-        """Offer all again: the engine forgets everything with an odometry frame, but the robot stands where it stood.
-
-        A guess loses its circle, for it is not known how far the robot has come.
-        """
-        self._pending = self.T_map_body is not None
-        self.offer_guess(without_circle(self.guess))
-
-    def delivered(self, hint: Pose | None, guess: PlaceGuess | None) -> None:
-        """Offer no more the pose and the guess that went with a frame."""
-        if hint is self.T_map_body:
-            self._pending = False
-        if guess is self.pending_guess:
-            self.pending_guess = None
-
-    def forget(self) -> None:
-        """Drop everything because a client asks; the file for the next start is to go as well."""
-        self.drop()
-        self.offer_guess(None)
-        self.forgotten += 1
-
-
-def without_circle(guess: PlaceGuess | None) -> PlaceGuess | None:
-    """Return a guess that holds anywhere, not only in a circle."""
-    return None if guess is None else replace(guess, within=None)

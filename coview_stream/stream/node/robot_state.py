@@ -18,29 +18,10 @@ from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.node.engine_queue import QueuedFrame
-from coview_stream.stream.node.last_place import PlaceHints
+from coview_stream.stream.node.engine_queue import PlaceHints, QueuedFrame
 
 _NS = 1_000_000_000
 _MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all
-
-
-def session_state(engine: State | None, lost: bool, unverified: bool) -> State:
-    """Return the state of a robot: the engine's, but for a lost place and a pause of odometry.
-
-    A place is lost while odometry or usable frames stay away, and with every new odometry epoch. Only a fix in TRACKING
-    ends that: after silence the place is still there and a verified frame suffices, in a new epoch it is searched for.
-
-    Args:
-        engine: state of the tracking engine in this odometry epoch; None before its first frame.
-        lost: the place was lost, and no fix has restored it yet.
-        unverified: after a pause of odometry, no frame has verified the place yet.
-    """
-    if lost:
-        return State.LOST
-    if engine is State.TRACKING and unverified:
-        return State.DOUBTED
-    return engine or State.SEARCHING
 
 
 class RobotState:
@@ -59,7 +40,7 @@ class RobotState:
         self.calibration: Calibration | None = None
         self._hints = hints
         self._counters = counters
-        self._lost = False
+        self._lost = False  # and no fix has restored the place yet
         self._loss_reason = ""
         self._restart_reason = ""
         self._forget_epoch()
@@ -74,9 +55,15 @@ class RobotState:
 
     @property
     def state(self) -> State:
-        """State of the robot; there is a pose while it is TRACKING."""
-        engine = None if self._fix is None else self._fix.state
-        return session_state(engine, self._lost, self.requires_verification)
+        """The engine's state, but for a lost place and a pause of odometry; there is a pose while it is TRACKING.
+
+        A place is lost while odometry or usable frames stay away, and with every new odometry epoch. Only a fix in
+        TRACKING ends that: after silence a verified frame suffices, in a new epoch the place is searched for.
+        """
+        if self._lost:
+            return State.LOST
+        engine = State.SEARCHING if self._fix is None else self._fix.state
+        return State.DOUBTED if engine is State.TRACKING and self.requires_verification else engine
 
     @property
     def evidence(self) -> KeyframeEvidence | None:

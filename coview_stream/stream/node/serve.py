@@ -38,13 +38,7 @@ log = logging.getLogger("coview_stream.node")
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """How a node reaches the network.
-
-    Attributes:
-        connect: endpoints to connect to.
-        listen: endpoints to listen on.
-        zenoh_config: a zenoh JSON5 file, or None.
-    """
+    """Endpoints to connect to and to listen on, and a zenoh JSON5 file."""
 
     connect: Sequence[str] = ()
     listen: Sequence[str] = ()
@@ -59,7 +53,7 @@ class CodecOptions:
         cloud: of all clouds, in place of their own encoding; None believes them.
         odometry: likewise.
         pose: of the poses; None is the preset's.
-        geo: of the poses as places on Earth; None: none are published.
+        geo: of the poses as places on Earth; None publishes none.
     """
 
     cloud: str | None = None
@@ -79,11 +73,11 @@ class ServeOptions:
         codecs: encodings of messages.
         node: rates and limits.
         localizer: configuration of the engines.
-        lidar: how odometry is computed of the clouds; None if the robots send theirs.
+        lidar: how odometry is computed from the clouds; None if the robots send theirs.
         state: directory of the robots' last places; None for none.
         guesses: of the places of robots, by name: tried, never trusted.
         mirrors: of the sites elsewhere that the map is made of, whose changes are followed.
-        verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
+        verify_key: public key that the map has to be signed with, also after a reload; None for any map.
         fleet: prefix of the keys of the fleet of nodes that share the robots; None: this node serves them all.
         node_keys: of the node's own; None for none.
         metrics: ``HOST:PORT`` of health and metrics over HTTP; None for none.
@@ -123,7 +117,7 @@ def open_node(
         options: of ``serve``.
         cancelled: asked now and then; True gives up.
         children: from :func:`start_children`, if the engines have been started already.
-        notifier: tells systemd; the caller tells by it that the service ends.
+        notifier: of systemd; the caller reports by it that the service ends.
 
     Raises:
         MapError: the map is unusable. TransportError: no network.
@@ -158,8 +152,7 @@ def open_node(
         for name, engine in engines.items():
             if name != "search":  # the search engine may become ready later
                 engine.wait_ready(cancelled)
-        if cancelled():
-            raise CancelledError("the node is no longer wanted")
+        _give_up_if(cancelled)
         node.start(_services(options, node, notifier))
     except BaseException as error:
         _close(engines, children)
@@ -236,7 +229,7 @@ def start_engines(
 
     Args:
         options: of the node.
-        children: processes that become the engines.
+        children: processes that become the engines; the caller closes them after an error.
         base_map: the map, if it has been loaded and verified already.
 
     Raises:
@@ -257,12 +250,8 @@ def start_engines(
         kind: EngineProcess(kind, str(path), base_map.sha256, config, trust=trust, child=child)
         for kind, child in children.items()
     }
-    try:
-        for engine in engines.values():
-            engine.start()
-    except BaseException:
-        _close(engines, children)
-        raise
+    for engine in engines.values():
+        engine.start()
     return base_map, engines
 
 
@@ -280,8 +269,7 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     from coview_stream.stream.maps.fetch_map import prepare_map
 
     prepare_map(options.map_path, cancelled)
-    if cancelled():
-        raise CancelledError("the node is no longer wanted")
+    _give_up_if(cancelled)
     base_map = load_map(options.map_path, options.verify_key)
     if base_map.sha256 == served:
         return None
@@ -291,8 +279,7 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
         _, engines = start_engines(options, children, base_map)
         for engine in engines.values():
             engine.wait_prepared(cancelled)
-        if cancelled():
-            raise CancelledError("the node is no longer wanted")
+        _give_up_if(cancelled)
         return _opened(options, base_map, engines)
     except BaseException:
         _close(engines, children)
@@ -318,6 +305,11 @@ def _opened(options: ServeOptions, base_map: BaseMap, engines: Mapping[str, Engi
         for keys in options.keys
     ]
     return OpenedMap(base_map.sha256, engines, sessions, base_map.path or options.map_path)
+
+
+def _give_up_if(cancelled: Callable[[], bool]) -> None:
+    if cancelled():
+        raise CancelledError("the node is no longer wanted")
 
 
 def _close(engines: Mapping[str, EngineProcess], children: Mapping[str, EngineChild]) -> None:

@@ -18,9 +18,18 @@ from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.node.counters import Counters, ErrorLog
-from coview_stream.stream.node.engine_queue import EngineQueue, FrameJob, FrameResult, Job, Result, SearchJob
+from coview_stream.stream.node.engine_queue import (
+    EngineQueue,
+    FrameJob,
+    FrameResult,
+    Job,
+    PlaceHints,
+    Result,
+    SearchJob,
+    without_circle,
+)
 from coview_stream.stream.node.inputs import Break, Inputs, LidarInputs, OdometryJob, OdometryResult
-from coview_stream.stream.node.last_place import LastPlace, PlaceHints, without_circle
+from coview_stream.stream.node.last_place import LastPlace
 from coview_stream.stream.node.robot_state import RobotState, StateHistory
 from coview_stream.stream.transport.keys import RobotKeys
 
@@ -28,11 +37,16 @@ from coview_stream.stream.transport.keys import RobotKeys
 class Session:
     """A robot's inputs, its queue to the engines and its state, behind one lock.
 
-    Attributes:
-        keys: of its messages.
+    Args:
+        keys: of the robot's messages.
         map_sha256: of the map.
-        site_sha256: of the map; of a site that of its state, common to all parts of it.
+        config: rates and limits.
+        codecs: of clouds and odometry, in place of the messages' own encodings.
         parts: the maps of which the map is joined; None of one map.
+        lidar: how odometry is computed from the clouds; None if the robot sends it.
+        site_sha256: of the state of a site, common to all parts of it; None: the map is a single file.
+
+    Attributes:
         lock: held while several of the following are read together.
         counters: of its messages.
         errors: of its input, for people.
@@ -42,14 +56,6 @@ class Session:
         robot_state: its state and the correction of its odometry.
         hints: places that the engine is to try.
     """
-
-    counters: Counters
-    errors: ErrorLog
-    history: StateHistory
-    inputs: Inputs
-    queue: EngineQueue
-    robot_state: RobotState
-    hints: PlaceHints
 
     def __init__(
         self,
@@ -61,17 +67,6 @@ class Session:
         lidar: LidarOdometryConfig | None = None,
         site_sha256: str | None = None,
     ) -> None:
-        """Begin without any message.
-
-        Args:
-            keys: of the robot's messages.
-            map_sha256: of the map.
-            config: rates and limits.
-            codecs: of clouds and odometry, in place of the messages' own encodings.
-            parts: the maps of which the map is joined; None of one map.
-            lidar: how odometry is computed of the clouds; None if the robot sends it.
-            site_sha256: of the state of the site that the map is of; None: of a single file.
-        """
         self.keys = keys
         self.map_sha256, self.site_sha256 = map_sha256, site_sha256 or map_sha256
         self.config = config or NodeConfig()
@@ -91,9 +86,9 @@ class Session:
         except MessageError as error:
             with self.lock:
                 self.inputs.count_undecodable(error, sample.key)
-            return
-        with self.lock:
-            self._proceed(self.inputs.add_cloud(message, now), now)
+        else:
+            with self.lock:
+                self._proceed(self.inputs.add_cloud(message, now), now)
 
     def on_odometry(self, sample: Sample, now: float) -> None:
         """Take in an odometry sample. Never raises for the sample's content."""
@@ -102,10 +97,10 @@ class Session:
         except MessageError as error:
             with self.lock:
                 self.inputs.count_undecodable(error, sample.key, "odometry_")
-            return
-        with self.lock:
-            self._proceed(self.inputs.add_odometry(message, now), now)
-            self._record_state()
+        else:
+            with self.lock:
+                self._proceed(self.inputs.add_odometry(message, now), now)
+                self._record_state()
 
     def _proceed(self, interruption: Break | None, now: float) -> None:
         """Verify the place, or search again, where odometry was interrupted; queue the frames that have odometry."""
@@ -128,11 +123,11 @@ class Session:
                 return
             odometry, processed_at = self.inputs.odometry, self.queue.processed_at
             newest_ns = odometry.newest.stamp_ns if odometry.newest else 0
-            max_unprocessed = self.config.dead_reckoning_timeout
+            timeout = self.config.dead_reckoning_timeout
             if now - odometry.arrived > self.config.odometry_timeout:
                 self.robot_state.on_silence(self.inputs.silence_reason(now), newest_ns)
-            elif processed_at is not None and now - processed_at > max_unprocessed:
-                self.robot_state.on_silence(f"no usable frame for {max_unprocessed:g} s", newest_ns)
+            elif processed_at is not None and now - processed_at > timeout:
+                self.robot_state.on_silence(f"no usable frame for {timeout:g} s", newest_ns)
             self._record_state()
 
     def restart_search(self, reason: str, forget: bool = False) -> None:
@@ -158,15 +153,16 @@ class Session:
             if forget:
                 self.hints.forget()
             else:
-                self.hints = PlaceHints()
+                self.hints: PlaceHints = PlaceHints()
             self._epoch += 1
             self._now = float("-inf")  # local time of the newest tick
             self.counters, self.errors, self.history = Counters(), ErrorLog(), StateHistory()
             given = (self.keys, self.config, self._codecs, self.counters, self.errors)
-            lidar = self._lidar
-            self.inputs = Inputs(*given) if lidar is None else LidarInputs(*given, lidar=lidar, epoch=self._epoch)
+            self.inputs: Inputs = (
+                Inputs(*given) if self._lidar is None else LidarInputs(*given, self._lidar, self._epoch)
+            )
             self.queue = EngineQueue(self.keys.robot, self._epoch, self.counters, self.errors)
-            self.robot_state = RobotState(self.keys.robot, self.map_sha256, self.counters, self.hints)
+            self.robot_state: RobotState = RobotState(self.keys.robot, self.map_sha256, self.counters, self.hints)
 
     def offer(self, place: LastPlace) -> bool:
         """Hand the engine a place from before as a hypothesis; no effect once the place is known or was forgotten.

@@ -6,7 +6,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,10 +74,8 @@ class Reporter:
             self.changed.set()
 
     def _has_changed(self, session: Session) -> bool:
-        return self._news(session) != self._reported.get(session.keys.robot)
-
-    def _news(self, session: Session) -> tuple[str, bool]:
-        return session.state()[0].reported, session.keys.robot in self.served
+        robot = session.keys.robot
+        return (session.state()[0].reported, robot in self.served) != self._reported.get(robot)
 
     def run(self, rate: float, stopping: threading.Event) -> None:
         """Publish at ``rate``, and changes at once, until ``stopping``; set ``changed`` as well, to end."""
@@ -95,7 +93,10 @@ class Reporter:
         """Publish the status of every robot, or of those whose state has changed."""
         if all_robots:
             with self._errors.catch("connection"):
-                self._check_connection(now)
+                self._connection.update(self._transport.connection())
+                if not (self._connection.connection.routers or self._connection.connection.peers):
+                    for session in self._sessions:
+                        session.inputs.disconnected_at = now
         for session in self._sessions:
             robot = session.keys.robot
             with self._errors.catch(f"{robot}: status"):
@@ -110,17 +111,11 @@ class Reporter:
             with self._errors.catch(f"{session.keys.robot}: status"):
                 self._publish_status(session, now, closing=True)
 
-    def _check_connection(self, now: float) -> None:
-        self._connection.update(self._transport.connection())
-        if not (self._connection.connection.routers or self._connection.connection.peers):
-            for session in self._sessions:
-                session.inputs.disconnected_at = now
-
     def _publish_status(self, session: Session, now: float, closing: bool = False) -> None:
         robot = session.keys.robot
         state, reason = session.state()
         before, _ = self._reported.get(robot, ("", False))
-        self._reported[robot] = self._news(session)  # published or not: it is not tried again at once
+        self._reported[robot] = state.reported, robot in self.served  # even if it fails: not tried again at once
         if state.reported != before and not closing:
             name = map_name(session)
             log.info("%s: %s%s (%s)", robot, state.reported, "" if name is None else f" on {name}", reason)
@@ -210,8 +205,7 @@ def encode_status(document: dict[str, Any]) -> bytes:
     if len(text) <= MAX_STATUS:
         return text
     short: dict[str, Any] = json.loads(text)
-    for name, shorten in _STEPS:
-        shorten(short)
+    for name in _shorten(short):
         short["shortened"] = list(dict.fromkeys([*short.get("shortened", ()), name]))
         text = _encode(short)
         if len(text) <= MAX_STATUS:
@@ -223,55 +217,35 @@ def _encode(document: dict[str, Any]) -> bytes:
     return json.dumps(document, separators=(",", ":"), ensure_ascii=True).encode()
 
 
-def _connection(document: dict[str, Any]) -> None:
-    connection = document["connection"]
-    for name in ("routers", "peers"):
-        connection[name] = connection[name][:2]
-
-
-def _evidence_of_transitions(document: dict[str, Any]) -> None:
-    for transition in document["transitions"]:
-        transition["evidence"] = None
-        transition["reason"] = _cut(transition["reason"], _SHORT_TEXT)
-
-
-def _errors(document: dict[str, Any]) -> None:
-    document["errors"] = [_cut(text, _SHORT_TEXT) for text in document["errors"][-3:]]
-
-
-def _transitions(document: dict[str, Any]) -> None:
-    document["transitions"] = document["transitions"][-1:]
-
-
-def _texts(document: dict[str, Any]) -> None:
-    document["reason"] = _cut(document["reason"], _TEXT)
-    if document.get("evidence"):
-        document["evidence"]["reason"] = _cut(document["evidence"]["reason"], _SHORT_TEXT)
-    if document.get("calibration"):
-        says = document["calibration"].get("says") or []
-        document["calibration"]["says"] = [_cut(text, _SHORT_TEXT) for text in says[:3]]
-
-
 _ESSENTIAL = (
     "robot", "stamp_ns", "state", "reason", "version", "map_sha256", "last_frame_ns", "pose", "node", "shortened",
 )  # fmt: skip
 
 
-def _all_but_the_state(document: dict[str, Any]) -> None:
-    """Leave only the essentials: names and texts of hundreds of characters are all that can lead here."""
-    for name in document.keys() - set(_ESSENTIAL):
+def _shorten(document: dict[str, Any]) -> Iterator[str]:
+    """Shorten one part of a status after the other in place, and yield its name."""
+    connection, transitions = document["connection"], document["transitions"]
+    for name in ("routers", "peers"):
+        connection[name] = connection[name][:2]
+    yield "connection"
+    for transition in transitions:
+        transition["evidence"] = None
+        transition["reason"] = _cut(transition["reason"], _SHORT_TEXT)
+    yield "transitions"
+    document["errors"] = [_cut(text, _SHORT_TEXT) for text in document["errors"][-3:]]
+    yield "errors"
+    document["transitions"] = transitions[-1:]
+    yield "transitions"
+    document["reason"] = _cut(document["reason"], _TEXT)
+    if document["evidence"]:
+        document["evidence"]["reason"] = _cut(document["evidence"]["reason"], _SHORT_TEXT)
+    if document["calibration"]:
+        document["calibration"]["says"] = [_cut(text, _SHORT_TEXT) for text in document["calibration"]["says"][:3]]
+    yield "reason"
+    for name in document.keys() - set(_ESSENTIAL):  # names and texts of hundreds of characters alone lead here
         del document[name]
     document["reason"] = _cut(document["reason"], _SHORT_TEXT)
-
-
-_STEPS: tuple[tuple[str, Callable[[dict[str, Any]], None]], ...] = (
-    ("connection", _connection),
-    ("transitions", _evidence_of_transitions),
-    ("errors", _errors),
-    ("transitions", _transitions),
-    ("reason", _texts),
-    ("all but the state", _all_but_the_state),
-)
+    yield "all but the state"
 
 
 def _cut(text: str, length: int) -> str:
@@ -297,14 +271,12 @@ class ConnectionMonitor:
     def update(self, connection: Connection) -> None:
         """Take in the connection as it is now, and log its changes."""
         before, self.connection = self.connection, connection
-        self._update_routers(set(before.routers), set(connection.routers))
         for zid in sorted(set(connection.peers) - set(before.peers)):
             log.info("peer %s is connected", zid)
         for zid in sorted(set(before.peers) - set(connection.peers)):
             log.info("peer %s is gone", zid)
-
-    def _update_routers(self, before: set[str], now: set[str]) -> None:
-        gone, come = before - now, now - before
+        now = set(connection.routers)
+        gone, come = set(before.routers) - now, now - set(before.routers)
         self._missing |= gone
         if come and self._missing:
             self.reconnects += 1

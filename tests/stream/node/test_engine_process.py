@@ -18,16 +18,14 @@ from fake_robot import tracking
 from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.errors import CloudError, CoViewError, DependencyError
+from coview_stream.errors import CloudError, CoViewError
 from coview_stream.localization.state import State
-from coview_stream.stream.node import worker
 from coview_stream.stream.node.engine_process import (
     CancelledError,
     DiedError,
     EngineChild,
     EngineProcess,
     FailedError,
-    Opening,
     RejectedError,
     engine_environment,
 )
@@ -287,7 +285,8 @@ class Program:
             start = (
                 f"import os, time, multiprocessing.connection as mc; fd = {theirs.fileno()}; pipe = mc.Connection(fd)"
             )
-            self.process = subprocess.Popen([sys.executable, "-c", f"{start}\n{program}"], pass_fds=[theirs.fileno()])
+            command = [sys.executable, "-c", f"{start}\n{program}"]
+            self.process = subprocess.Popen(command, pass_fds=[theirs.fileno()], start_new_session=True)
         self.pipe = Connection(ours.detach())
 
     close = EngineChild.close
@@ -371,35 +370,32 @@ def test_threads_that_the_user_asks_for_are_given(monkeypatch):
     assert engine_environment("search")["OPENBLAS_NUM_THREADS"] == "1"
 
 
-class LackingEngine(Engine):
-    """An engine without a library that only its jobs need."""
-
-    def __init__(self):
-        super().__init__(DependencyError("no gtsam"))
-        self.asked = threading.Event()
-
+LACKING = """
+from coview_stream.errors import DependencyError
+from coview_stream.stream.node.engine_process import work
+class Engine:
+    prepared = ""
     def prepare(self):
-        """Do nothing."""
-
+        pass
     def prepare_later(self):
-        self.asked.set()
-        raise self.error
+        self.prepared = ", also later"
+        raise DependencyError("no gtsam")
+    def run(self, job):
+        raise DependencyError("no gtsam" + self.prepared)
+work(pipe, "odometry", lambda *args: Engine())
+"""
 
 
-def test_library_that_is_missing_is_the_jobs_error(monkeypatch):
-    engine = LackingEngine()
-    monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *args: engine)
-    monkeypatch.setattr(worker, "_set_group_nice", lambda nice: None)
-    ours, theirs = socket.socketpair()
-    with Connection(ours.detach()) as pipe:
-        child = threading.Thread(target=worker.main, args=([str(theirs.detach()), "odometry", "0"],), daemon=True)
-        child.start()
-        pipe.send(Opening("map", "hash"))
-        assert pipe.recv() == ("ready", None)
-        assert pipe.recv() == ("prepared", None)
-        assert engine.asked.wait(10.0)
-        pipe.send(job())
-        assert pipe.poll(10.0)
-        assert pipe.recv() == ("rejected", "no gtsam")
-    child.join(10.0)
-    assert not child.is_alive()
+@pytest.mark.slow
+def test_library_that_is_missing_is_the_jobs_error():
+    process = EngineProcess("odometry", "map", "hash", child=Program(LACKING))
+
+    def error():
+        with pytest.raises(RejectedError, match="no gtsam") as caught:
+            process.run(job())
+        return str(caught.value)
+
+    try:
+        until(lambda: error() == "no gtsam, also later", 20.0)
+    finally:
+        process.close()

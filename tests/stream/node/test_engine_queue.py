@@ -12,9 +12,8 @@ from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages.types import CloudMessage
 from coview_stream.stream.node.counters import Counters, ErrorLog
-from coview_stream.stream.node.engine_queue import EngineQueue, RoundRobin, SearchDemand, search_order
+from coview_stream.stream.node.engine_queue import EngineQueue, PlaceHints, RoundRobin, SearchDemand, search_order
 from coview_stream.stream.node.inputs import PairedFrame
-from coview_stream.stream.node.last_place import PlaceHints
 
 EPOCH = 4  # after resets: the first of this queue
 NOW = 1000.0
