@@ -1,4 +1,4 @@
-"""Health of a node for its operators: a document over zenoh and HTTP, and metrics for Prometheus."""
+"""Health of a node for its operators: a document over zenoh and HTTP, metrics for Prometheus, notices to systemd."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +30,11 @@ _INTERVAL = 1.0  # seconds between two documents
 
 
 class NodeHealth:
-    """Health and metrics of a node.
+    """Health of a node.
 
     It is *live* as long as its pose clock ticks and none of its threads has ended: otherwise it has to be started
-    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, and it is connected
-    if it was told to connect.
-
-    Args:
-        node: the node.
-        needs_connection: whether it was told to connect to a router or peer.
-        follower: of the map's sources elsewhere; None of a map that is here.
+    again. It is *ready* when a robot's messages would be used now: its engines have opened the map and, if it
+    ``needs_connection``, it is connected. ``follower`` is of the map's sources elsewhere, if any.
     """
 
     def __init__(self, node: Node, needs_connection: bool = False, follower: MapFollower | None = None) -> None:
@@ -139,56 +134,45 @@ def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> Http
 
 def prometheus_text(document: Mapping[str, Any]) -> str:
     """Return a document of :class:`NodeHealth` in Prometheus' text format, version 0.0.4."""
-    return "".join(f"{line}\n" for line in _lines(document))
+    lines: list[str] = []
 
+    def add(name: str, kind: str, text: str, samples: Iterable[tuple[Mapping[str, str], float | None]]) -> None:
+        lines.extend((f"# HELP coview_{name} {text}.", f"# TYPE coview_{name} {kind}"))
+        for labels, value in samples:
+            escaped = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
+            inner = ",".join(f'{key}="{label.translate(escaped)}"' for key, label in labels.items())
+            if value is not None:
+                lines.append(f"coview_{name}{{{inner}}} {value}" if inner else f"coview_{name} {value}")
 
-def _lines(document: Mapping[str, Any]) -> Iterator[str]:
-    engines, robots = document["engines"], document["robots"]
+    engines = [({"engine": name}, engine) for name, engine in document["engines"].items()]
+    robots = [({"robot": name}, robot) for name, robot in document["robots"].items()]
     memory = [({"process": "node"}, document["memory_bytes"])]
-    memory += [({"process": name}, engine["memory_bytes"]) for name, engine in engines.items()]
+    memory += [({"process": labels["engine"]}, engine["memory_bytes"]) for labels, engine in engines]
     info = {"version": document["version"], "map_sha256": document["map"]["sha256"]}
-    yield from _metric("info", "gauge", "Version and map", [(info, 1)])
-    yield from _metric("live", "gauge", "Whether the node works", [({}, int(document["live"]["ok"]))])
-    yield from _metric("ready", "gauge", "Whether the node can serve now", [({}, int(document["ready"]["ok"]))])
-    yield from _metric("uptime_seconds", "gauge", "Since the node started", [({}, document["uptime_s"])])
-    yield from _metric("memory_bytes", "gauge", "Resident memory", memory)
-    of_engines = [({"engine": name}, engine) for name, engine in engines.items()]
-    ready = [(labels, int(engine["ready"])) for labels, engine in of_engines]
-    yield from _metric("engine_ready", "gauge", "Whether an engine can do a job now", ready)
-    restarts = [(labels, engine["restarts"]) for labels, engine in of_engines]
-    yield from _metric("engine_restarts_total", "counter", "Starts of an engine after the first", restarts)
-    of_robots = [({"robot": name}, robot) for name, robot in robots.items()]
+    add("info", "gauge", "Version and map", [(info, 1)])
+    add("live", "gauge", "Whether the node works", [({}, int(document["live"]["ok"]))])
+    add("ready", "gauge", "Whether the node can serve now", [({}, int(document["ready"]["ok"]))])
+    add("uptime_seconds", "gauge", "Since the node started", [({}, document["uptime_s"])])
+    add("memory_bytes", "gauge", "Resident memory", memory)
+    ready = [(labels, int(engine["ready"])) for labels, engine in engines]
+    add("engine_ready", "gauge", "Whether an engine can do a job now", ready)
+    restarts = [(labels, engine["restarts"]) for labels, engine in engines]
+    add("engine_restarts_total", "counter", "Starts of an engine after the first", restarts)
     names = sorted({state.reported for state in State})
-    states = [(labels | {"state": name}, int(robot["state"] == name)) for labels, robot in of_robots for name in names]
-    yield from _metric("robot_state", "gauge", "1 for the state that a robot is in", states)
-    rates = [(labels, robot["pose_rate_hz"]) for labels, robot in of_robots]
-    yield from _metric("pose_rate_hertz", "gauge", "Poses per second", rates)
+    states = [(labels | {"state": name}, int(robot["state"] == name)) for labels, robot in robots for name in names]
+    add("robot_state", "gauge", "1 for the state that a robot is in", states)
+    add("pose_rate_hertz", "gauge", "Poses per second", [(labels, robot["pose_rate_hz"]) for labels, robot in robots])
     latencies = [
         (labels | {"quantile": f"0.{name[1:]}"}, None if value is None else value / 1e3)
-        for labels, robot in of_robots
+        for labels, robot in robots
         for name, value in robot["latency_ms"].items()
     ]
-    yield from _metric("latency_seconds", "gauge", "From a cloud's arrival to its fix, newest frames", latencies)
+    add("latency_seconds", "gauge", "From a cloud's arrival to its fix, newest frames", latencies)
     counted = [
-        (labels | {"event": name}, value) for labels, robot in of_robots for name, value in robot["counters"].items()
+        (labels | {"event": name}, value) for labels, robot in robots for name, value in robot["counters"].items()
     ]
-    yield from _metric("events_total", "counter", "What became of messages, and what else happened", counted)
-
-
-def _metric(
-    name: str, kind: str, text: str, samples: Iterable[tuple[Mapping[str, str], float | None]]
-) -> Iterator[str]:
-    """Yield one metric; a sample that is None is left out."""
-    yield f"# HELP coview_{name} {text}."
-    yield f"# TYPE coview_{name} {kind}"
-    for labels, value in samples:
-        if value is not None:
-            inner = ",".join(f'{key}="{_escaped(label)}"' for key, label in labels.items())
-            yield f"coview_{name}{{{inner}}} {value}" if inner else f"coview_{name} {value}"
-
-
-def _escaped(label: str) -> str:
-    return label.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    add("events_total", "counter", "What became of messages, and what else happened", counted)
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _memory(pid: int) -> int | None:
@@ -200,10 +184,7 @@ def _memory(pid: int) -> int | None:
 
 
 class Notifier:
-    """Sends notices; never waits, and never fails.
-
-    Args:
-        environment: of the process.
+    """Sends notices to systemd; never waits, and never fails.
 
     Attributes:
         watchdog_period: seconds between two signs of life, half of the limit that systemd sets; None if it wants none.
@@ -212,15 +193,10 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
-        self.watchdog_period = self._period(environment) if address else None
         self._ends = False
-
-    @staticmethod
-    def _period(environment: Mapping[str, str]) -> float | None:
         microseconds, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
-        if not microseconds.isdecimal() or int(microseconds) == 0 or (pid and pid != str(os.getpid())):
-            return None
-        return 0.5e-6 * int(microseconds)
+        fed = address and microseconds.isdecimal() and int(microseconds) and (not pid or pid == str(os.getpid()))
+        self.watchdog_period = 0.5e-6 * int(microseconds) if fed else None
 
     def send(self, *lines: str) -> None:
         """Send one notice of several lines."""

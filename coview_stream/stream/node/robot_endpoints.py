@@ -17,7 +17,6 @@ from coview_stream.basemap.summary import POINTS_ON_WIRE, MapView
 from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.errors import CoViewError, InputError
 from coview_stream.geometry.transforms import yaw_of
-from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages import encode_location, encode_pose
 from coview_stream.messages.types import Encoded, LocationMessage, PoseMessage, Sample
 from coview_stream.stream.node.last_place import decode_guess, guess_of_fields
@@ -34,13 +33,8 @@ _ROS_NODE = "coview_stream"
 class RobotEndpoints:
     """One robot's subscriptions, queryables, publishers and liveliness tokens, around its session.
 
-    Args:
-        session: of the robot.
-        transport: where everything is declared.
-        reporter: publishes the robot's status.
-        wake_engines: called with the session when there may be a job.
-        pose_format: codec of the poses; None leaves it to the robot's keys.
-        geo: publishes poses as places on Earth as well; None: does not.
+    ``wake_engines`` is called with the session when there may be a job. ``pose_format`` is the codec of the poses; None
+    leaves it to the robot's keys. ``geo`` publishes poses as places on Earth as well.
     """
 
     def __init__(
@@ -79,8 +73,6 @@ class RobotEndpoints:
             old, new = self._sessions
             new.continue_from(old)
             self._sessions = (new,)
-
-    # ---- declarations
 
     def declare(self, node_id: str, number: int) -> None:
         """Declare the outputs; ``node_id`` is of our ROS node, ``number`` of this robot there, from 1."""
@@ -122,8 +114,6 @@ class RobotEndpoints:
         for end in endings:
             end()
 
-    # ---- messages
-
     def on_cloud(self, sample: Sample) -> None:
         """Take in a cloud."""
         for session in self._sessions:
@@ -139,7 +129,9 @@ class RobotEndpoints:
     def on_initial_pose(self, sample: Sample) -> None:
         """Take in a guess of the place."""
         try:
-            self._guess(decode_guess(sample))
+            guess = decode_guess(sample)
+            for session in self._sessions:
+                session.guess_place(guess)
         except InputError as error:
             self.session.errors.add_first(f"{sample.key}: initial poses of no use", str(error))
 
@@ -157,20 +149,15 @@ class RobotEndpoints:
 
     def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/suggest``; InputError, which is replied, where it names no place."""
-        taken = self._guess(guess_of_fields(parameters))
-        note = "" if taken else "the place is known, the guess is ignored; ask rpc/relocalize first"
-        return self._answer() | {"taken": taken, "note": note}
-
-    def _guess(self, guess: PlaceGuess) -> bool:
-        taken = [session.guess_place(guess) for session in self._sessions]  # all of them
-        return any(taken)
+        guess = guess_of_fields(parameters)
+        taken = [session.guess_place(guess) for session in self._sessions]
+        note = "" if any(taken) else "the place is known, the guess is ignored; ask rpc/relocalize first"
+        return self._answer() | {"taken": any(taken), "note": note}
 
     def _answer(self) -> dict[str, Any]:
         self._reporter.changed.set()
         state, reason = self.session.state()
         return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
-
-    # ---- poses
 
     def publish_pose(self, now: float) -> None:
         """Let time pass in the session, and publish the pose if it is known."""
@@ -192,10 +179,7 @@ class RobotEndpoints:
 class GeoOutput:
     """Publication of poses as places on Earth, by the reference system of the map in force, which may change.
 
-    Args:
-        files: of the maps that the node has opened, by their hashes.
-        sha256: of the map to begin with.
-        encoding: of the messages.
+    ``files`` are those of the node's maps by their hashes, ``sha256`` is of the map to begin with.
 
     Raises:
         InputError, DependencyError: as of :class:`GeoReference`.
@@ -210,9 +194,23 @@ class GeoOutput:
 
     def publish(self, pose: PoseMessage, publisher: Publisher) -> None:
         """Publish a pose, where the map has a reference and the pose a place on Earth."""
-        geo = self.reference(pose.map_sha256, pose.frame_id)
-        if geo is not None and (message := location_of(pose, geo)) is not None:
-            publisher.put(encode_location(message, self._encoding))
+        geo, position = self.reference(pose.map_sha256, pose.frame_id), pose.T_map_body[:3, 3]
+        if geo is None:
+            return
+        latitude, longitude, height = geo.geodetic(position[None])[0].tolist()
+        if not np.isfinite([latitude, longitude, height]).all():
+            return
+        message = LocationMessage(
+            stamp_ns=pose.stamp_ns,
+            robot=pose.robot,
+            latitude=latitude,
+            longitude=longitude,
+            height=height,
+            heading=geo.heading(position, yaw_of(pose.T_map_body)),
+            covariance=geo.enu_covariance(position, pose.covariance),
+            confidence=pose.confidence,
+        )
+        publisher.put(encode_location(message, self._encoding))
 
     def reference(self, sha256: str, name: str = "") -> GeoReference | None:
         """Return the reference of a map by its hash, and of several maps by the name of the one; None for none."""
@@ -237,30 +235,10 @@ def _references(base_map: BaseMap) -> dict[str, GeoReference]:
     return {part.name: GeoReference(part.crs) for part in parts}
 
 
-def location_of(pose: PoseMessage, geo: GeoReference) -> LocationMessage | None:
-    """Return a pose as a place on Earth; None where it has none."""
-    position = pose.T_map_body[:3, 3]
-    latitude, longitude, height = geo.geodetic(position[None])[0].tolist()
-    if not np.isfinite([latitude, longitude, height]).all():
-        return None
-    return LocationMessage(
-        stamp_ns=pose.stamp_ns,
-        robot=pose.robot,
-        latitude=latitude,
-        longitude=longitude,
-        height=height,
-        heading=geo.heading(position, yaw_of(pose.T_map_body)),
-        covariance=geo.enu_covariance(position, pose.covariance),
-        confidence=pose.confidence,
-    )
-
-
 class MapViewAnswer:
     """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.summary.MapView.to_json` of the map that is served.
 
-    Args:
-        files: of the maps that the node has opened, by their hashes.
-        sha256: returns the hash of the map that is served.
+    ``files`` are those of the node's maps by their hashes, ``sha256`` returns the hash of the map that is served.
     """
 
     def __init__(self, files: Mapping[str, Path], sha256: Callable[[], str]) -> None:
@@ -269,11 +247,7 @@ class MapViewAnswer:
         self._made: tuple[str, dict[str, Any]] | None = None
 
     def __call__(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Return the view; it is made once for each map.
-
-        Raises:
-            MapError: as of :func:`~coview_stream.basemap.basemap.load_served`.
-        """
+        """Return the view, which is made once for each map; MapError if its file is of another map by now."""
         served = self._sha256()
         if self._made is None or self._made[0] != served:
             self._made = served, MapView.of(load_served(self._files, served), POINTS_ON_WIRE).to_json()
