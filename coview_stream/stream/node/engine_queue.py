@@ -1,4 +1,4 @@
-"""One robot's frames and search requests for the engines, their jobs, and the order of robots at an engine."""
+"""One robot's frames, search requests and hints for the engines, their jobs, and the order of robots at an engine."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class FrameResult:
     Attributes:
         fix: after the frame.
         request: keyframe to search for; None for none.
-        seconds: that the engine took.
+        seconds: of the engine's work.
         events: changes of the engine's state since its last answer for this robot and epoch, in order.
     """
 
@@ -111,16 +111,11 @@ class SearchDemand(NamedTuple):
 
 
 def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
-    """Return the robots of ``demands`` that want a search, in the order of their turns.
+    """Return the robots of ``demands`` that want a search, in the order of their turns at local time ``now``.
 
     A keyframe that has waited for 1.5 s comes first, the oldest before the others: no robot waits much longer, unless
-    the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been proposed comes
-    before those that are newly lost, for it needs the fewest further searches, and these before those that have been
-    searched for in vain for long.
-
-    Args:
-        demands: of each robot; None for no demand.
-        now: local time in seconds.
+    the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been proposed, which
+    needs the fewest further searches, comes before the newly lost, and these before the long lost.
     """
 
     def rank(demand: SearchDemand) -> tuple[bool, int, bool, float]:
@@ -136,23 +131,20 @@ class RoundRobin:
     """Order in which robots, numbered from 0, are served by one engine: the longest wait first."""
 
     def __init__(self, count: int) -> None:
-        self._last_turn = [0] * count
-        self._turns = 0
+        self._order = list(range(count))
 
     def order(self) -> list[int]:
         """Return the robots in the order in which they may be served now."""
-        return sorted(range(len(self._last_turn)), key=self._last_turn.__getitem__)
+        return list(self._order)
 
     def serve(self, k: int) -> None:
         """Count the turn that robot ``k`` has now."""
-        self._turns += 1
-        self._last_turn[k] = self._turns
+        self._order.remove(k)
+        self._order.append(k)
 
 
 class PlaceHints:
     """Hints for the engine: the last place and somebody's guess, each once in every odometry epoch.
-
-    The session holds the lock.
 
     Attributes:
         forgotten: number of times that a client has asked to forget the place.
@@ -198,7 +190,7 @@ class PlaceHints:
         A guess loses its circle, for it is not known how far the robot has come.
         """
         self._pending = self.T_map_body is not None
-        self.offer_guess(without_circle(self.guess))
+        self.offer_guess(None if self.guess is None else replace(self.guess, within=None))
 
     def delivered(self, hint: Pose | None, guess: PlaceGuess | None) -> None:
         """Offer no more the pose and the guess that went with a frame."""
@@ -212,11 +204,6 @@ class PlaceHints:
         self.drop()
         self.offer_guess(None)
         self.forgotten += 1
-
-
-def without_circle(guess: PlaceGuess | None) -> PlaceGuess | None:
-    """Return a guess that holds anywhere, not only in a circle."""
-    return None if guess is None else replace(guess, within=None)
 
 
 class QueuedFrame(NamedTuple):
@@ -279,18 +266,16 @@ class EngineQueue:
         self.epoch = epoch
         self._forget_epoch()
 
-    # ---- frames for the tracking engine
-
     def put_frame(self, frame: PairedFrame, now: float) -> None:
         """Make a frame the next one; a frame that waits already is dropped, and the engine is behind."""
         message, waiting = frame.message, self._frame
         self._counters.dropped += waiting is not None
         job = FrameJob(
-            robot=self.robot,
-            epoch=self.epoch,
-            stamp_ns=message.stamp_ns,
-            points=message.points,
-            T_odom_body=frame.T_odom_body,
+            self.robot,
+            self.epoch,
+            message.stamp_ns,
+            message.points,
+            frame.T_odom_body,
             times=message.times,
             segment=frame.segment,
             defer=waiting is not None,
@@ -352,8 +337,6 @@ class EngineQueue:
         # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
         self._search_result = self._search_result or job.search_result
         return True
-
-    # ---- requests for the search engine
 
     def put_search_request(self, request: SearchRequest, now: float) -> None:
         """Make a request the next one; a request that waits already is skipped, and its wait goes on."""

@@ -35,20 +35,17 @@ _MAX_BYTES = 4 << 20  # of such a message that are read
 
 def owner(robot: str, nodes: Collection[str]) -> str | None:
     """Return the node that serves a robot; None of no nodes."""
-    return max(nodes, key=lambda node: (_rank(robot, node), node), default=None)
 
+    def rank(node: str) -> tuple[bytes, str]:
+        return hashlib.blake2b(f"{robot}\n{node}".encode(), digest_size=8).digest(), node
 
-def _rank(robot: str, node: str) -> bytes:
-    return hashlib.blake2b(f"{robot}\n{node}".encode(), digest_size=8).digest()
+    return max(nodes, key=rank, default=None)
 
 
 class FleetMembers:
     """The nodes of a fleet that are alive, as the network's liveliness tokens show them. Pure.
 
-    A look that does not show this node itself tells nothing: this node is cut off.
-
-    Args:
-        node: name of this node.
+    A look that does not show ``node`` itself tells nothing: this node is cut off.
     """
 
     def __init__(self, node: str) -> None:
@@ -81,10 +78,7 @@ class Fleet:
         prefix: of the fleet's keys.
         node: name of this node, unlike all others.
         endpoints: of all robots of the fleet, by name; none of them is served yet.
-        transport: where places are told.
-
-    Attributes:
-        members: of the fleet.
+        transport: of tokens and places.
     """
 
     def __init__(self, prefix: str, node: str, endpoints: Mapping[str, RobotEndpoints], transport: Transport) -> None:
@@ -122,7 +116,10 @@ class Fleet:
             return  # cut off: nothing is known
         before = self.members.alive
         if self.members.look(tokens):
-            log.info("fleet: %s", _news(before, self.members.alive))
+            after = self.members.alive
+            changes = ((after - before, "came"), (before - after, "went"))
+            news = "; ".join(f"{', '.join(sorted(nodes))} {verb}" for nodes, verb in changes if nodes)
+            log.info("fleet: %s: %d nodes", news, len(after))
         if self.node in tokens and self._ranked != self.members.alive:
             self._ranked = self.members.alive
             self._move({robot for robot in self._endpoints if owner(robot, self._ranked) == self.node})
@@ -169,9 +166,3 @@ class Fleet:
                     self._places[name] = LastPlace.from_message(plain)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             self._errors.report(sample.key, error)
-
-
-def _news(before: frozenset[str], after: frozenset[str]) -> str:
-    come, gone = sorted(after - before), sorted(before - after)
-    parts = [f"{', '.join(names)} {verb}" for names, verb in ((come, "came"), (gone, "went")) if names]
-    return f"{'; '.join(parts)}: {len(after)} nodes"

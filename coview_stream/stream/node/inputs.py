@@ -1,8 +1,7 @@
 """Inputs of one robot: clouds and odometry, decoded and paired by their stamps.
 
-A robot that sends no odometry has its odometry computed here from its clouds (:class:`LidarInputs`). Pure logic: no
-thread, no network, no clock; the session holds the lock. Times called ``now`` are local and monotonic, in seconds;
-stamps are the robot's.
+A robot that sends no odometry has its odometry computed from its clouds (:class:`LidarInputs`). Pure logic, as the
+session, which holds the lock.
 """
 
 from __future__ import annotations
@@ -88,7 +87,7 @@ class OdometryResult:
         T_odom_body: (4, 4) odometry at its stamp.
         points: (N, 3) deskewed; None if the job had no times.
         restarted: the pose is not connected to those before it.
-        seconds: that the engine took.
+        seconds: of the engine's work.
     """
 
     T_odom_body: Pose
@@ -177,15 +176,17 @@ class FrameSync:
 
     def _span(self, message: CloudMessage) -> tuple[int, int]:
         """First and last stamp (ns) at which the frame's points were measured."""
-        if message.times is None or not self.config.deskew or not len(message.times):
+        if message.times is None or not self.config.deskew:
             return message.stamp_ns, message.stamp_ns
         times = np.nan_to_num(message.times, nan=0.0)
-        first, last = min(0.0, float(times.min())), max(0.0, float(times.max()))
+        first, last = float(times.min(initial=0.0)), float(times.max(initial=0.0))
         return message.stamp_ns + round(first * _NS), message.stamp_ns + round(last * _NS)
 
 
 class Inputs:
     """Clouds and odometry of a robot that sends both, from one reset of its session to the next.
+
+    ``codecs`` of clouds and odometry go before the messages' own encodings.
 
     Attributes:
         odometry: buffer of the newest samples.
@@ -204,7 +205,6 @@ class Inputs:
         counters: Counters,
         errors: ErrorLog,
     ) -> None:
-        """Begin without any message; ``codecs`` of clouds and odometry go before the messages' own encodings."""
         self.keys = keys
         self.config = config
         self.codecs = codecs
@@ -215,8 +215,6 @@ class Inputs:
         self._frames = FrameSync(config, self.odometry, counters)
         self._missing = MissingFrames()
         self._cloud_at = _NEVER  # local time of the newest readable cloud
-
-    # ---- messages
 
     def decode_cloud(self, sample: Sample) -> CloudMessage:
         """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
@@ -239,15 +237,15 @@ class Inputs:
             self.errors.add_first(f"{key}: {name} messages", str(error).removeprefix(f"{key}: "))
 
     def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
-        """Add a cloud, which waits for its odometry."""
-        self._count_cloud(message, now)
-        self._frames.add(message, now)
-        return None
-
-    def _count_cloud(self, message: CloudMessage, now: float) -> None:
+        """Count a cloud and queue it; return the break if it does not continue those before it."""
         self._cloud_at = now
         self.counters.received += 1
         self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
+        return self._queue(message, now)
+
+    def _queue(self, message: CloudMessage, now: float) -> Break | None:
+        self._frames.add(message, now)
+        return None
 
     def add_odometry(self, message: OdometryMessage, now: float) -> Break | None:
         """Add an odometry sample; return the break if it does not continue those before it."""
@@ -297,8 +295,6 @@ class Inputs:
         """Begin the lidar odometry again."""
         return None
 
-    # ---- reasons for people
-
     def waiting_for(self) -> str:
         """Return the missing input of a robot of which no frame has been processed."""
         keys, counters = self.keys, self.counters
@@ -337,7 +333,8 @@ class LidarInputs(Inputs):
 
     Frames go to the odometry engine in the order of their stamps; one is under way, and at most two wait. An
     :class:`OdometryBuffer` classifies the stamps: the same strays, pauses and restarted clocks, without a motion.
-    Whenever lidar odometry restarts, the search does too, for the drive in between is not known.
+    Whenever lidar odometry restarts, the search does too, for the drive in between is not known. ``epoch`` is a number
+    that no job of this robot has had before.
     """
 
     odometry_source = "kiss-icp"
@@ -352,7 +349,6 @@ class LidarInputs(Inputs):
         lidar: LidarOdometryConfig,
         epoch: int,
     ) -> None:
-        """As of :class:`Inputs`; ``epoch`` is a number that no job of this robot has had before."""
         super().__init__(keys, config, codecs, counters, errors)
         self.lidar = lidar
         self._first_epoch = self._epoch = epoch
@@ -360,22 +356,14 @@ class LidarInputs(Inputs):
         self._waiting: deque[ReceivedFrame] = deque()
         self._under_way: ReceivedFrame | None = None
 
-    def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
-        """Queue a cloud for the odometry engine."""
-        self._count_cloud(message, now)
+    def _queue(self, message: CloudMessage, now: float) -> Break | None:
         kind = self._stamps.add(OdometryMessage(message.stamp_ns, np.eye(4)), now)
-        if kind is SampleKind.DUPLICATE:
-            self.counters.duplicate += 1
+        if kind in (SampleKind.DUPLICATE, SampleKind.OUT_OF_ORDER):
+            self.counters.count("duplicate" if kind is SampleKind.DUPLICATE else "out_of_order")
             return None
-        if kind is SampleKind.OUT_OF_ORDER:
-            self.counters.out_of_order += 1
-            return None
-        if kind is SampleKind.RESTART:
-            self.counters.dropped += len(self._waiting)
-            self._waiting.clear()
-        elif len(self._waiting) == _MAX_LIDAR_WAITING:
-            self.counters.dropped += 1
+        while self._waiting and (kind is SampleKind.RESTART or len(self._waiting) == _MAX_LIDAR_WAITING):
             self._waiting.popleft()
+            self.counters.dropped += 1
         self._waiting.append(ReceivedFrame(message, now))
         if kind is not SampleKind.RESTART:
             return None

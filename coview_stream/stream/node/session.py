@@ -26,7 +26,6 @@ from coview_stream.stream.node.engine_queue import (
     PlaceHints,
     Result,
     SearchJob,
-    without_circle,
 )
 from coview_stream.stream.node.inputs import Break, Inputs, LidarInputs, OdometryJob, OdometryResult
 from coview_stream.stream.node.last_place import LastPlace
@@ -208,7 +207,9 @@ class Session:
             with self.lock:  # as other sessions of the robot, which know nothing of each other
                 self.inputs.continue_from(old.inputs)
         with self.lock:
-            self.hints.offer_guess(without_circle(guess))  # it may be on this map only
+            self.hints.offer_guess(
+                None if guess is None else replace(guess, within=None)
+            )  # the circle is the old map's
             self.hints.forgotten = forgotten
             if T_map_body is not None:
                 self.hints.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
