@@ -1,9 +1,9 @@
 """Fuzzing targets, and the process that runs them: ``python -m bench.fuzz.child NAME CORPUS FOUND SECONDS WAY SEED``.
 
-A target is a function of bytes that returns a value or raises a CoViewError. Any other exception is a finding, and
-FOUND keeps the input, once per place in the code. Memory is limited, and an input that takes too long ends the process,
-so ``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME
-(separated by commas). It imports the product late, because atheris instruments modules on import.
+A target is a function of bytes that returns a value or raises a CoViewError. Another exception is a finding, and FOUND
+gets its input, once per place in the code. Memory is limited, and an input that takes too long ends the process, so
+``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME (separated
+by commas). It imports the product late, because atheris instruments modules on import.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 
@@ -70,16 +71,12 @@ def _encoding() -> Target:
     from coview_stream.errors import CoViewError
     from coview_stream.messages.types import Sample
 
-    def run(data: bytes) -> object:
-        encoding, _, rest = data.partition(b"\n")
-        key, _, payload = rest.partition(b"\n")
+    def run(data: bytes) -> None:
+        encoding, key, payload = (*data.split(b"\n", 2), b"", b"")[:3]
         sample = Sample(key.decode("utf-8", "replace"), payload, encoding.decode("utf-8", "replace"))
         for decode in (messages.decode_cloud, messages.decode_odometry, messages.decode_pose):
-            try:
+            with contextlib.suppress(CoViewError):
                 decode(sample)
-            except CoViewError:
-                continue
-        return None
 
     return run
 
@@ -140,14 +137,11 @@ def _rpc() -> Target:
     log = logging.getLogger("coview_stream")
     log.setLevel(logging.CRITICAL)
 
-    def ignore(*_: object, **__: object) -> None:
-        """Take a reply."""
-
     def run(data: bytes) -> object:
         text = data.decode("utf-8", "replace")
         pairs = [(name, value) for name, _, value in (part.partition("=") for part in text.split(";"))]
         answers = zenoh_io.Answers(RateLimitedErrors(log))
-        query = SimpleNamespace(parameters=pairs, key_expr="k", reply=ignore, reply_err=ignore)
+        query = SimpleNamespace(parameters=pairs, key_expr="k", reply=Mock(), reply_err=Mock())
         answers.callback("k", dict, threading.Event())(query)
         answers.end()
         answers.run()
@@ -194,7 +188,7 @@ _ODD = (bytes(4), b"\xff" * 4, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\xff"
 class Watch:
     """A target and its counts: executions, accepted inputs, findings by place."""
 
-    def __init__(self, target: Any, found: Path) -> None:
+    def __init__(self, target: Target, found: Path) -> None:
         from coview_stream.errors import CoViewError
 
         self._expected, self._target, self._found = CoViewError, target, found
@@ -277,7 +271,7 @@ def main(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: 
         limit_memory()
         options = [
             f"-max_total_time={max(1, round(seconds))}", f"-timeout={LIMIT_S}", "-rss_limit_mb=0", f"-seed={seed}",
-            f"-max_len={MAX_INPUT}", f"-artifact_prefix={found}/", "-verbosity=1",
+            f"-max_len={MAX_INPUT}", f"-artifact_prefix={found}/",
         ]  # fmt: skip
         atheris.Setup([sys.argv[0], *options, str(found / "corpus"), str(corpus)], watch)
         atheris.Fuzz()

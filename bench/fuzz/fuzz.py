@@ -1,7 +1,7 @@
 """Untrusted bytes into every decoder and reader: each target in a process with limits on memory and time.
 
-Guided by coverage where atheris is installed (extra ``fuzz``), else mutations of ``tests/corpus``. The result must be a
-value or a CoViewError; everything else is a finding, and its input is kept.
+Guided by coverage where atheris is installed (extra ``fuzz``), else mutations of ``tests/corpus``. A target must return
+a value or raise a CoViewError; all else is a finding, and its input is stored.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import argparse
 import importlib.util
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from typing import Any
 
 from bench.fuzz.child import TARGETS
 from bench.harness.files import ROOT
-from bench.harness.rows import Row, table
+from bench.harness.rows import Row
 from coview_stream.errors import InputError
 
 CORPUS = ROOT / "tests" / "corpus"
@@ -33,9 +32,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     """Add time, targets and the folder of findings."""
     parser.add_argument("--seconds", type=float, default=60.0, help="for each target (%(default)g)")
     parser.add_argument("--targets", metavar="NAMES", help=f"some of {','.join(TARGETS)}")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time (%(default)d)")
     parser.add_argument("--found", type=Path, metavar="DIR", help="keeps the inputs of findings, and larger corpora")
-    parser.add_argument("--no-atheris", action="store_true", help="mutate the corpus, as where there is no atheris")
 
 
 def rows(asked: argparse.Namespace) -> Iterator[Row]:
@@ -44,32 +41,22 @@ def rows(asked: argparse.Namespace) -> Iterator[Row]:
     if unknown := [name for name in names if name not in TARGETS]:
         raise InputError(f"--targets: no target {', '.join(unknown)}; there are {', '.join(TARGETS)}")
     seconds = min(asked.seconds, 5.0) if asked.quick else asked.seconds
-    way = "atheris" if importlib.util.find_spec("atheris") and not asked.no_atheris else "mutations"
-    kept = asked.found or Path(tempfile.mkdtemp(prefix="coview-fuzz-"))
-    print(f"... by {way}; findings are kept in {kept}", file=sys.stderr)
-    with ThreadPoolExecutor(max(1, asked.jobs)) as pool:
-        outcomes = pool.map(lambda name: fuzzed(name, kept / name, seconds, way), names)
+    way = "atheris" if importlib.util.find_spec("atheris") else "mutations"
+    below = asked.found or Path(tempfile.mkdtemp(prefix="coview-fuzz-"))
+    print(f"... by {way}; inputs of findings in {below}", file=sys.stderr)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        outcomes = pool.map(lambda name: fuzzed(name, below / name, seconds, way), names)
         for name, outcome in zip(names, outcomes, strict=True):
-            holds, details = not outcome["places"] and outcome["executions"] > 0, outcome | {"seconds": seconds}
-            yield Row(f"fuzz/{name}", outcome["executions"], None, "inputs", None, "no finding", holds, "", details)
+            count, holds = outcome["executions"], not outcome["places"] and outcome["executions"] > 0
+            yield Row(f"fuzz/{name}", count, unit="inputs", target="no finding", holds=holds, details=outcome)
             for place, text in outcome["places"].items():
                 print(f"    {name}: {place}: {text}", file=sys.stderr, flush=True)
-
-
-def tables(rows: Sequence[Row], asked: argparse.Namespace) -> dict[str, str]:
-    """Lay out executions, coverage and findings."""
-    lines = []
-    for row in rows:
-        counts = [f"{row.details[key]:,}" for key in ("executions", "values", "edges")]
-        name = row.name.partition("/")[2]
-        lines.append([name, f"{row.details['seconds']:g}", *counts, "; ".join(row.details["places"]) or "none"])
-    return {"": table(["target", "seconds", "inputs", "accepted", "edges", "findings"], lines)}
 
 
 def fuzzed(name: str, found: Path, seconds: float, way: str) -> dict[str, Any]:
     """Fuzz one target, again and again where an input ends the child."""
     (found / "corpus").mkdir(parents=True, exist_ok=True)
-    outcome: dict[str, Any] = {"executions": 0, "values": 0, "edges": 0, "places": {}}
+    outcome: dict[str, Any] = {"executions": 0, "values": 0, "places": {}}
     end, attempt = time.monotonic() + seconds, 0
     while attempt == 0 or time.monotonic() < end - 1.0:
         attempt += 1
@@ -80,7 +67,6 @@ def fuzzed(name: str, found: Path, seconds: float, way: str) -> dict[str, Any]:
             outcome["executions"] += books["executions"]
             outcome["values"] += books["values"]
             outcome["places"] |= books["places"]
-        outcome["edges"] = max([outcome["edges"], *(int(count) for count in re.findall(r" cov: (\d+) ", output))])
         if code:  # keep the input that ended the child: libFuzzer's, or the one that had just begun
             lines = output.strip().splitlines() or [""]
             reason = next((line for line in lines if "ERROR" in line or "Timeout" in line), lines[-1])

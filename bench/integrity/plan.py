@@ -41,28 +41,26 @@ ALTERED: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 """Families of near copies on maps of streets, one tuple per site."""
 
-_ORDINARY: tuple[Class, str] = ("ordinary", "the site, 0-40 % changed")
-
-FAMILIES: dict[str, tuple[Class, str]] = {
-    **{f"ordinary {kind}": _ORDINARY for kinds in STREETS.values() for kind in kinds},
-    "outside, same kind": ("outside", "another site of the map's kind: every fix is false"),
-    "outside, other kind": ("outside", "a site of another kind: every fix is false"),
-    "terraces": ("near copies", "identical terraces; for half of the runs with other trees, cars and poles"),
-    "plantation": ("near copies", "equal objects on a grid; for half of the runs on another grid now"),
-    "yard": ("near copies", "container yard, every stack another: right by ground and masts"),
-    "rows": ("near copies", "equal rows of houses, one house changed or swapped with one elsewhere"),
-    "boxes": ("near copies", "24 x 40 equal boxes, driven along or across"),
-    "avenue": ("near copies", "facades, trees or walls that are the same all along"),
-    "court": ("near copies", "court of 4-fold symmetry"),
-    "storey": ("near copies", "map of another storey with the same shell: every fix is false"),
-    "mirrored": ("near copies", "the map mirrored: every fix is false"),
-    "shifted": ("near copies", "all buildings 4 m off: right by ground and trees"),
-    "old": ("near copies", "50 % of buildings, trees, cars and poles others"),
-    "scaled": ("near copies", "the map 3-5 % too large or small: right under the same scaling"),
-    "tilted": ("near copies", "the map tilted by 2-4 degrees: right where it fits"),
-    "edge": ("near copies", "10-40 m from the map's border, inside or outside"),
+FAMILIES: dict[str, Class] = {
+    **{f"ordinary {kind}": "ordinary" for kinds in STREETS.values() for kind in kinds},  # 0 to 40 % changed
+    "outside, same kind": "outside",  # another site of the map's kind: every fix is false
+    "outside, other kind": "outside",  # a site of another kind: every fix is false
+    "terraces": "near copies",  # identical terraces; for half of the runs with other trees, cars and poles
+    "plantation": "near copies",  # equal objects on a grid; for half of the runs on another grid now
+    "yard": "near copies",  # container yard, every stack another: right by ground and masts
+    "rows": "near copies",  # equal rows of houses, one house changed or swapped with one elsewhere
+    "boxes": "near copies",  # 24 x 40 equal boxes, driven along or across
+    "avenue": "near copies",  # facades, trees or walls that are the same all along
+    "court": "near copies",  # court of 4-fold symmetry
+    "storey": "near copies",  # map of another storey with the same shell: every fix is false
+    "mirrored": "near copies",  # the map mirrored: every fix is false
+    "shifted": "near copies",  # all buildings 4 m off: right by ground and trees
+    "old": "near copies",  # 50 % of buildings, trees, cars and poles others
+    "scaled": "near copies",  # the map 3-5 % too large or small: right under the same scaling
+    "tilted": "near copies",  # the map tilted by 2-4 degrees: right where it fits
+    "edge": "near copies",  # 10-40 m from the map's border, inside or outside
 }  # fmt: skip
-"""Family of runs: class and description."""
+"""Class of each family of runs."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class Run:
     @property
     def of_class(self) -> Class:
         """Class of its family."""
-        return FAMILIES[self.family][0]
+        return FAMILIES[self.family]
 
     @property
     def drive_seed(self) -> int:

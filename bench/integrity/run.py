@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
-import json
 import os
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -15,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.harness.files import fingerprint, remembered, thread_settings
+from bench.harness.files import remembered, thread_settings
 from bench.integrity.kinds import built, draw, size_of, surveyed
 from bench.integrity.plan import STATED, Run, Site
 from bench.integrity.sites import beside_border, lane, rebuilt, shifted
@@ -23,7 +20,7 @@ from coview_stream import BaseMap, Localizer
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rotation_angle
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, pose_from, rotation_angle
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.global_search import GlobalSearch
@@ -45,7 +42,6 @@ LENGTH = 60.0
 """Metres after which a run ends without a fix."""
 
 _DRIVE, _ODOMETRY, _SENSOR = range(200, 203)  # random streams
-_MIRROR_WORLD, _MIRROR_BODY = np.diag([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])
 
 
 class World(NamedTuple):
@@ -61,33 +57,21 @@ AS_MAPPED = World()
 
 def mirrored() -> World:
     """Return the mirrored world: no pose on the map is right."""
-
-    def poses(scene: Floats) -> Floats:
-        out = scene.copy()
-        out[:, :3, :3] = _MIRROR_WORLD @ scene[:, :3, :3] * _MIRROR_BODY  # two mirrors: a rotation again
-        out[:, :3, 3] = scene[:, :3, 3] @ _MIRROR_WORLD
-        return out
-
-    return World(poses, lambda points: (points * _MIRROR_BODY).astype(np.float32), right=False)
+    world = np.diag([-1.0, 1.0, 1.0, 1.0])
+    body = np.diag([1.0, -1.0, 1.0, 1.0])  # two mirrors: a rotation again
+    return World(lambda scene: world @ scene @ body, lambda points: points * np.float32([1, -1, 1]), right=False)
 
 
 def scaled(factor: float) -> World:
     """Return a world whose map is ``factor`` times too large; the scaled pose is right."""
-
-    def poses(scene: Floats) -> Floats:
-        out = scene.copy()
-        out[:, :3, 3] /= factor
-        return out
-
-    return World(poses, lambda points: points / np.float32(factor))
+    size = np.ones((4, 4))
+    size[:3, 3] = 1.0 / factor
+    return World(lambda scene: scene * size, lambda points: points / np.float32(factor))
 
 
 def tilted(angle: float, heading: float) -> World:
     """Return a world whose map is tilted by ``angle`` radians about a level axis; the tilted pose is right."""
-    axis = np.array([np.cos(heading), np.sin(heading), 0.0])
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    T = np.eye(4)
-    T[:3, :3] += np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+    T = pose_from(exp_so3(angle * np.array([np.cos(heading), np.sin(heading), 0.0])), np.zeros(3))
     return World(lambda scene: T @ scene)
 
 
@@ -184,27 +168,18 @@ def _altered(run: Run, scene: Scene) -> tuple[Scene, World]:
     return scene, AS_MAPPED
 
 
-@dataclass(frozen=True)
 class Robot:
-    """A localizer, and the search that answers its requests and shows each keyframe's leader."""
+    """A localizer on a map, and the search that answers its requests and shows the leader of a keyframe."""
 
-    localizer: Localizer
-    search: GlobalSearch
-    origin: Floats  # (3,) of the map, metres
-
-    @classmethod
-    def on(cls, base: BaseMap, risk: float | None) -> Robot:
-        """Return one on a map, with the usual integrity risk or another one."""
+    def __init__(self, base: BaseMap) -> None:
         config = LocalizerConfig()
-        if risk is not None:
-            config = replace(config, acceptance=replace(config.acceptance, risk=risk))
         maps, index = LocalMaps(base, config.registration.source_range), SearchIndex.of(base, config)
-        localizer = Localizer(base, config, maps, index)
-        localizer.prepare()
-        return cls(localizer, GlobalSearch(base, config, maps, index), base.origin)
+        self.localizer, self.origin = Localizer(base, config, maps, index), base.origin
+        self.localizer.prepare()
+        self.search = GlobalSearch(base, config, maps, index)
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Fix, Leader | None]:
-        """Do as :meth:`Localizer.step` does; return the search's leader as well, if there was a search."""
+        """Step as :meth:`Localizer.step`; return the search's leader as well, if there was a search."""
         request = self.localizer.add_frame(cloud, T_odom_body, stamp)
         leader = None
         if request is not None:
@@ -226,8 +201,8 @@ class Leader(NamedTuple):
 def first_fix(robot: Robot, drive: Drive) -> Result:
     """Follow a drive to its first fix; return outcome, last reason and stated errors.
 
-    ``stated`` has for each limit of :data:`STATED` the first keyframe below it: its error, the metres driven, and
-    whether its most probable place was right.
+    ``stated`` has for each limit of :data:`STATED` the first keyframe below it: its error, and whether its most
+    probable place was right.
     """
     robot.localizer.reset()
     said, way, stated = "", drive.driven, dict[str, Result]()
@@ -241,7 +216,7 @@ def first_fix(robot: Robot, drive: Drive) -> Result:
         truth = None if drive.truth is None else drive.truth[k]
         if leader is not None:
             right = judged(leader.T_map_body, truth)["outcome"] == "right"
-            new = {"error": leader.error, "metres": round(float(way[k]), 2), "right": right}
+            new = {"error": leader.error, "right": right}
             stated |= {f"{e:g}": new for e in STATED if leader.error < e and f"{e:g}" not in stated}
         said = fix.evidence.reason if fix.evidence is not None else said
         out |= {"state": fix.state.value, "reason": said, "metres": round(float(way[k]), 2), "frames": k + 1}
@@ -263,56 +238,11 @@ def judged(T_map_body: Pose, truth: Pose | None) -> Result:
     return {"outcome": "right" if right else "false", **errors}
 
 
-def append(file: Path, result: Result) -> None:
-    """Add a line; others may do so at the same time."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    line = json.dumps(result, allow_nan=False) + "\n"
-    with file.open("a") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        stream.write(line)
-        stream.flush()
-
-
-def read(files: Iterable[Path], code: str) -> dict[str, Result]:
-    """Return the newest result of each key that the code with this fingerprint made.
-
-    A line that a killed process has left half-written is passed over.
-    """
-    found: dict[str, Result] = {}
-    for file in files:
-        for line in file.read_text().splitlines() if file.is_file() else ():
-            try:
-                result = json.loads(line)
-            except ValueError:
-                continue
-            if code == result["code"]:
-                found[result["key"]] = result
-    return found
-
-
-SITE_CODE = ("coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/descriptors")
-"""What makes a map, besides this benchmark."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """Settings of the runs and the file of their results."""
-
-    results: Path
-    code: str  # fingerprint in every result
-    risk: float | None = None  # integrity risk; None: the product's own
-    maps: Path | None = None  # folder that keeps the maps; None: they are deleted
-
-    def key(self, run: Run) -> str:
-        """Name of a run's result."""
-        return run.key if self.risk is None else f"{run.key}@{self.risk:g}"
-
-
-def everywhere(sites: Sequence[Site], task: Task, jobs: int) -> Iterator[Result]:
-    """Yield results as they come, of ``jobs`` processes with one thread each; results are noted by then."""
-    os.environ.update(thread_settings(1))  # what is started from now on inherits it
+def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int) -> Iterator[Result]:
+    """Yield results as they come, of ``jobs`` processes with one thread each; those of a site stay ``below``."""
+    os.environ.update(thread_settings(1))  # processes that start from now on inherit it
     with ProcessPoolExecutor(max(1, min(jobs, len(sites))), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(on_site, site, task) for site in sites]
+        waiting = [pool.submit(on_site, site, below, code) for site in sites]
         try:
             for done in as_completed(waiting):
                 yield from done.result()
@@ -320,44 +250,33 @@ def everywhere(sites: Sequence[Site], task: Task, jobs: int) -> Iterator[Result]
             pool.shutdown(cancel_futures=True)
 
 
-def on_site(site: Site, task: Task) -> list[Result]:
-    """Make all runs on one map; a run that raises is recorded as ``failed`` and made again next time."""
-    begin, out = time.process_time(), list[Result]()
-    robot, reason = None, ""
+def on_site(site: Site, below: Path, code: str) -> list[Result]:
+    """Make all runs on one map unless they are there; runs of a site with a ``failed`` one are made again next time."""
+    file = below / f"{site[0].kind}-{site[0].seed}.json"
+
+    def make() -> dict[str, Any]:
+        robot = Robot(map_of(site[0]))
+        return {"runs": [{"key": run.key, "class": run.of_class, **asdict(run), **made(run, robot)} for run in site]}
+
     try:
-        robot = Robot.on(map_of(site[0], task.maps), task.risk)
-    except Exception as error:  # whatever it is, the other sites go on
-        reason = f"{type(error).__name__}: {error}"
-    share = round((time.process_time() - begin) / len(site), 2)
-    for run in site:
-        begin = time.process_time()
-        result: Result = {"outcome": "failed", "reason": reason}
-        try:
-            if robot is not None:
-                result = _one(run, robot)
-        except Exception as error:  # likewise
-            result["reason"] = f"{type(error).__name__}: {error}"
-        result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), **result}
-        result |= {"asked_risk": task.risk, "site_s": share, "cost_s": round(time.process_time() - begin, 2)}
-        append(task.results, result)
-        out.append(result)
-    return out
+        results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]
+    except Exception as error:  # the other sites go on
+        failed = {"outcome": "failed", "reason": f"{type(error).__name__}: {error}"}
+        return [{"key": run.key, "class": run.of_class, **asdict(run), **failed} for run in site]
+    if any(result["outcome"] == "failed" for result in results):
+        file.unlink()
+    return results
 
 
-def _one(run: Run, robot: Robot) -> Result:
-    drive = drive_of(run)
-    return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(robot, drive)
+def made(run: Run, robot: Robot) -> Result:
+    """Make one run."""
+    try:
+        drive = drive_of(run)
+        return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(robot, drive)
+    except Exception as error:  # the other runs go on
+        return {"outcome": "failed", "reason": f"{type(error).__name__}: {error}"}
 
 
-def map_of(run: Run, kept: Path | None = None) -> BaseMap:
-    """Return the map that a run is made on, built now unless it is ``kept`` in a folder."""
-
-    def build() -> BaseMap:
-        return built(surveyed(draw(run.kind, run.seed, size_of(run.kind), 0.0), run.seed))  # changes come later
-
-    if kept is None:
-        return build()
-    file = kept / f"{run.kind}-{run.seed}.coview"
-    spec = {"site": [run.kind, run.seed], "code": fingerprint(*SITE_CODE, "bench/integrity")}
-    remembered(file.with_suffix(".json"), spec, lambda: build().save(file))
-    return BaseMap.load(file)
+def map_of(run: Run) -> BaseMap:
+    """Build the map that a run is made on; changes come later."""
+    return built(surveyed(draw(run.kind, run.seed, size_of(run.kind), 0.0), run.seed))

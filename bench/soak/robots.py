@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from bench.harness import worlds
 from bench.harness.files import fingerprint, remembered
 from bench.integrity.kinds import built, draw, size_of, surveyed
-from bench.integrity.run import SITE_CODE, through
+from bench.integrity.run import through
 from bench.stream.processes import EPOCH_NS, Drive, RobotPlan, open_session, stamp_of
 from bench.stream.scores import Posed, errors
 from coview_stream.clouds import read_tum, write_cloud, write_tum
@@ -24,6 +24,8 @@ from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.sim import SimulationConfig
 
 LENGTH, SENSOR = 60.0, "vlp16"  # metres and lidar of a drive through a deceptive site
+
+_SITE_CODE = (*(f"coview_stream/{part}" for part in ("sim", "basemap", "clouds", "descriptors")), "bench/integrity")
 
 KINDS = ("town", "boxes", "yard")
 """Sites of the robots, in turns; all containers of ``yard`` were moved since the survey."""
@@ -46,10 +48,7 @@ def prepare(below: Path, kind: str, seed: int, quick: bool) -> Site:
         world = worlds.prepare(below, config)
         return Site(kind, world, worlds.map_of(below, config), deceptive=False)
     world = below / f"soak-{kind}-{seed}"
-    spec = {
-        "site": [kind, seed, LENGTH, SENSOR],
-        "code": fingerprint(*SITE_CODE, "bench/integrity", "bench/soak/robots.py"),
-    }
+    spec = {"site": [kind, seed, LENGTH, SENSOR], "code": fingerprint(*_SITE_CODE, "bench/soak/robots.py")}
     remembered(world / "made.json", spec, lambda: _make(world, kind, seed))
     return Site(kind, world, world / "site.coview", deceptive=True)
 

@@ -1,9 +1,9 @@
 """Robots that drive for hours with a fault every minute: false poses, stuck states, time to recover, leaks.
 
 A router, a node per site (``coview-stream serve``) and robots that replay simulated drives without end. Every fault
-comes once before any comes again. In a town the robots have to be localized again within 60 s of a fault. In two
-deceptive sites (a yard of equal boxes, and a yard whose containers were all moved) no pose is right. An interrupted
-soak prints its rows. Needs the extra ``bench``.
+comes once before any comes again. In a town the robots have to be localized again within 60 s of a fault. On two
+deceptive sites (a yard of equal boxes, and one whose containers were all moved) no pose is right. Needs the extra
+``bench``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import itertools
 import math
 import sys
 import time
-import traceback
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,7 +22,7 @@ import numpy as np
 from bench.harness.files import folder
 from bench.harness.rows import Row, judged, table
 from bench.soak.robots import KINDS, Robot, prepare
-from bench.soak.stage import ENDS_PROCESSES, FAULTS, Node, Stage, slope
+from bench.soak.stage import ENDS_PROCESSES, FAULTS, SoakNode, Stage, slope
 from coview_stream.errors import InputError
 
 STUCK = 60.0  # seconds without a pose after a fault, while frames arrive
@@ -44,12 +43,9 @@ class Event:
     unfed: list[str] = field(default_factory=list)  # robots whose frames did not reach the router
     false: int = 0
     crashes: int = 0
-    skipped: str = ""  # an error of the benchmark
 
     def text(self) -> str:
         """Describe the fault's outcome."""
-        if self.skipped:
-            return f"skipped: {self.skipped}"
         back = [f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in self.recoveries.items()]
         marks = [f"{self.false} FALSE"] * bool(self.false) + [f"{self.crashes} CRASHES"] * bool(self.crashes)
         return "; ".join([*(back or ["no robot to localize"]), *marks])
@@ -127,35 +123,22 @@ def recovered(stage: Stage, robots: Sequence[Robot], since: float, seconds: floa
 def play(stage: Stage, wanted: Sequence[Robot], name: str, start: float, every: float) -> Event:
     """Make one fault; wait until all robots have recovered and the next fault is due."""
     begin, event = time.monotonic(), Event(name, time.monotonic() - start)
-    false, crashes = _false(stage), _crashes(stage)
-    try:
-        whole = FAULTS[name](stage)
-    except Exception as error:  # the benchmark's own error; the soak goes on
-        traceback.print_exc()
-        event.skipped = f"{type(error).__name__}: {error}"
-    else:
-        recovered(stage, wanted, whole, STUCK)
-        now = time.monotonic()
-        for robot in wanted:
-            event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
-            if robot.recovered is None:
-                (event.stuck if robot.fed(now) else event.unfed).append(robot.name)
+    false, crashes = stage.count()
+    whole = FAULTS[name](stage)
+    recovered(stage, wanted, whole, STUCK)
+    for robot in wanted:
+        event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
+        if robot.recovered is None:
+            (event.stuck if robot.fed(time.monotonic()) else event.unfed).append(robot.name)
     for node in stage.nodes:
         node.revive()
     if event.stuck or event.unfed:  # counted; the next fault needs working robots
         stage.rescue()
         recovered(stage, wanted, time.monotonic(), STUCK)
     stage.wait(max(5.0 if every >= 30 else 1.0, begin + every - time.monotonic()))
-    event.false, event.crashes = _false(stage) - false, _crashes(stage) - crashes
+    now_false, now_crashes = stage.count()
+    event.false, event.crashes = now_false - false, now_crashes - crashes
     return event
-
-
-def _false(stage: Stage) -> int:
-    return sum(len(robot.false) + robot.unreadable for robot in stage.robots)
-
-
-def _crashes(stage: Stage) -> int:
-    return sum(len(node.crashes) for node in stage.nodes)
 
 
 def figures(robot: Robot, hours: float) -> Iterator[Row]:
@@ -173,19 +156,16 @@ def figures(robot: Robot, hours: float) -> Iterator[Row]:
 
 def survived(events: Sequence[Event]) -> Iterator[Row]:
     """Yield the faults, and the robots that did not recover."""
-    played = [event for event in events if not event.skipped]
-    times = [seconds for event in played for seconds in event.recoveries.values() if seconds is not None]
-    stuck, unfed = (sum(len(getattr(event, name)) for event in played) for name in ("stuck", "unfed"))
-    yield Row("soak/faults", len(played), text=f"{len(played)} of {len({event.fault for event in played})} kinds")
+    times = [seconds for event in events for seconds in event.recoveries.values() if seconds is not None]
+    stuck, unfed = (sum(len(getattr(event, name)) for event in events) for name in ("stuck", "unfed"))
+    yield Row("soak/faults", len(events), text=f"{len(events)} of {len({event.fault for event in events})} kinds")
     if times:
         yield Row("soak/back after, median / worst s", text=f"{np.median(times):.1f} / {max(times):.1f}")
     yield judged("soak/stuck for 60 s while frames came", f"{stuck} of {len(times) + stuck}", "0", stuck == 0, stuck)
     yield Row("soak/robots of the bench that did not reach the router again", float(unfed))
-    if skipped := sorted({f"{event.fault} ({event.skipped})" for event in events if event.skipped}):
-        yield Row("soak/skipped", text="; ".join(skipped))
 
 
-def processes(nodes: Sequence[Node], hours: float) -> Iterator[Row]:
+def processes(nodes: Sequence[SoakNode], hours: float) -> Iterator[Row]:
     """Yield crashes, and the growth of memory and descriptors of all nodes' processes."""
     crashes = [f"{node.site.name}: {crash}" for node in nodes for crash in node.crashes]
     text = "; ".join(crashes) or "0"
@@ -215,7 +195,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     events = [row.details for row in rows if "recoveries" in row.details]
     body = []
     for name in sorted({event["fault"] for event in events}):
-        played = [event for event in events if event["fault"] == name and not event["skipped"]]
+        played = [event for event in events if event["fault"] == name]
         times = [s for event in played for s in event["recoveries"].values() if s is not None]
         lost = sum(len(event["stuck"]) + len(event["unfed"]) + event["crashes"] > 0 for event in played)
         spent = [f"{np.median(times):.1f}", f"{max(times):.1f}"] if times else ["-", "-"]

@@ -10,28 +10,24 @@ import contextlib
 import functools
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 from random import Random
-from subprocess import STDOUT
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
 
-from bench.harness.files import ROOT, environment
+from bench.harness.node import GRACE, MAIN, SEARCH, TRACK, Node
 from bench.soak.link import forward
 from bench.soak.robots import REOPEN, Manner, Robot, Site, Watch, drive_on
 from bench.stream.processes import Helper, free_port, route, vandalise
 
-MAIN, TRACK, SEARCH = "main", "track", "search"
-_KINDS = (TRACK, SEARCH, "odometry")
-_SAMPLED, _STEP, _GRACE = 10.0, 0.1, 10.0  # seconds: between samples of memory; of waiting; from SIGTERM to SIGKILL
+_SAMPLED, _STEP = 10.0, 0.1  # seconds: between samples of memory; of waiting
 _MOST = 1000  # samples per process in a slope
 
 
@@ -43,27 +39,15 @@ class Sampled(NamedTuple):
     descriptors: int
 
 
-@dataclass
-class Node:
-    """``coview-stream serve`` as a process; ``map`` is a copy that faults may damage."""
+class SoakNode(Node):
+    """A node with samples of its processes and its crashes; it serves a copy of the map, which faults may damage."""
 
-    site: Site
-    robots: Sequence[str]
-    endpoint: str
-    map: Path
-    state: Path
-    log: Path
-    samples: dict[tuple[str, int], list[Sampled]] = field(default_factory=dict)
-    crashes: list[str] = field(default_factory=list)
-
-    def start(self) -> None:
-        """Start the node; do not wait for it."""
-        command = [
-            sys.executable, "-P", "-m", "coview_stream", "serve", str(self.map), "--state", str(self.state),
-            "--robot", *self.robots, "--connect", self.endpoint,
-        ]  # fmt: skip
-        with self.log.open("ab") as log:
-            self.process = psutil.Popen(command, stdout=log, stderr=STDOUT, env=environment(), cwd=ROOT)
+    def __init__(self, site: Site, robots: Sequence[str], endpoint: str, place: Path, log: Path) -> None:
+        place.mkdir()
+        self.site, self.map = site, Path(shutil.copy(site.map, place / "site.coview"))
+        self.samples: dict[tuple[str, int], list[Sampled]] = {}
+        self.crashes: list[str] = []
+        super().__init__(self.map, log, "--state", str(place), "--robot", *robots, "--connect", endpoint)
 
     def revive(self) -> None:
         """Count a crash and start the node again if it ended by itself."""
@@ -71,54 +55,22 @@ class Node:
             self.crashes.append(f"exit code {self.process.poll()}")
             self.start()
 
-    def family(self) -> dict[str, psutil.Process]:
-        """Return the living processes by part."""
-        parts: dict[str, psutil.Process] = {}
-        with contextlib.suppress(psutil.Error):
-            if self.process.poll() is None:
-                parts[MAIN] = self.process
-            for child in self.process.children(recursive=True):
-                with contextlib.suppress(psutil.Error):
-                    if child.status() != psutil.STATUS_ZOMBIE:
-                        words = child.cmdline()
-                        parts[next((kind for kind in _KINDS if kind in words), "other")] = child
-        return parts
-
-    def send(self, part: str, number: int) -> psutil.Process | None:
-        """Send a signal to a process of the node; return the process, or None if there is none."""
-        process = self.family().get(part)
-        if process is not None:
-            with contextlib.suppress(psutil.Error):
-                process.send_signal(number)
-        return process
-
     def sample(self) -> None:
         """Record memory and descriptors of all processes."""
         at = time.monotonic()
-        for part, process in self.family().items():
+        for part, process in self.family():
             with contextlib.suppress(psutil.Error, OSError):
                 lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
                 memory = sum(int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "VmSwap:")))
                 row = Sampled(at, memory * 1024 / 1e6, process.num_fds())
                 self.samples.setdefault((part, process.pid), []).append(row)
 
-    def end(self, number: int = signal.SIGTERM) -> float:
-        """End the node by a signal; return the seconds until it ended, infinite if it had to be killed."""
-        family, begin = list(self.family().values()), time.monotonic()
-        with contextlib.suppress(psutil.Error):
-            self.process.send_signal(number)
-        try:
-            self.process.wait(_GRACE)
-            seconds = time.monotonic() - begin
-        except psutil.TimeoutExpired:
-            seconds = float("inf")
-        left = psutil.wait_procs([member for member in family if member.pid != self.process.pid], timeout=_GRACE)[1]
-        for process in [*left, self.process]:
-            with contextlib.suppress(psutil.Error):
-                process.kill()
+    def end(self, number: int = signal.SIGTERM) -> tuple[float, int]:
+        """End the node, see :meth:`Node.end`; engines that outlive it are a crash."""
+        seconds, left = super().end(number)
         if left:
-            self.crashes.append(f"{len(left)} engines outlived their node by {_GRACE:.0f} s")
-        return seconds
+            self.crashes.append(f"{left} engines outlived their node by {GRACE:.0f} s")
+        return seconds, left
 
 
 def slope(rows: Sequence[Sequence[Sampled]], figure: str, warm: float, apart: float = 300.0) -> float | None:
@@ -131,13 +83,12 @@ def slope(rows: Sequence[Sequence[Sampled]], figure: str, warm: float, apart: fl
     for samples in rows:
         counted = [sample for sample in samples if sample.at - samples[0].at >= warm]
         counted = counted[:: 1 + len(counted) // _MOST]
-        at = np.array([sample.at for sample in counted])
-        value = np.array([float(getattr(sample, figure)) for sample in counted])
+        at, value = (np.array([getattr(sample, name) for sample in counted], float) for name in ("at", figure))
         i, j = np.triu_indices(len(counted), 1)
-        far = at[j] - at[i] >= apart if len(counted) else np.zeros(0, bool)
-        i, j = i[far], j[far]
-        slopes.append((value[j] - value[i]) / (at[j] - at[i]) * 3600)
-        weights.append(at[j] - at[i])
+        time_apart, change = at[j] - at[i], value[j] - value[i]
+        far = time_apart >= apart
+        slopes.append(change[far] / time_apart[far] * 3600)
+        weights.append(time_apart[far])
     change, weight = np.concatenate(slopes), np.concatenate(weights)
     if not len(change):
         return None
@@ -171,21 +122,15 @@ class Stage:
         self.robots = [Robot(f"r{k + 1}", site) for k, site in enumerate(sites)]
         self.watch = Watch(self.here, self.robots)
         log.mkdir(parents=True, exist_ok=True)
-        self.nodes = [self._node(site, over["nodes"], log / f"{site.name}.log") for site in dict.fromkeys(sites)]
+        self.nodes = []
+        for site in dict.fromkeys(sites):
+            names = [robot.name for robot in self.robots if robot.site == site]
+            place = self.folder / site.name
+            self.nodes.append(SoakNode(site, names, over["nodes"], place, log / f"{site.name}.log"))
         self.senders = {
             robot.name: self.helper(drive_on, over["robots"], robot.site.world, robot.name) for robot in self.robots
         }
         self.manner = Manner()
-
-    def _node(self, site: Site, endpoint: str, log: Path) -> Node:
-        names = [robot.name for robot in self.robots if robot.site == site]
-        own = self.folder / site.name
-        own.mkdir()
-        copy = Path(shutil.copy(site.map, own / "site.coview"))
-        log.unlink(missing_ok=True)
-        node = Node(site, names, endpoint, copy, own, log)
-        node.start()
-        return node
 
     def helper(self, work: Any, *args: Any) -> Actor:
         """Start a process that ends with the stage."""
@@ -216,6 +161,11 @@ class Stage:
         for sender in self.senders.values():
             sender.send(REOPEN)
 
+    def count(self) -> tuple[int, int]:
+        """Return the false or unreadable poses and the crashes so far."""
+        false = sum(len(robot.false) + robot.unreadable for robot in self.robots)
+        return false, sum(len(node.crashes) for node in self.nodes)
+
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait and watch; end early on a condition, and return it."""
         end = time.monotonic() + seconds
@@ -232,12 +182,10 @@ class Stage:
 
     def close(self) -> list[float]:
         """End everything; return the seconds from SIGTERM to the end of each node."""
-        seconds = []
-        for node in self.nodes:
+        for process in (process for node in self.nodes for _, process in node.family()):
             with contextlib.suppress(psutil.Error):
-                for process in node.family().values():
-                    process.send_signal(signal.SIGCONT)
-            seconds.append(node.end())
+                process.send_signal(signal.SIGCONT)
+        seconds = [node.end()[0] for node in self.nodes]
         with contextlib.suppress(Exception):
             self.watch.session.close()
         for helper in self._helpers:
@@ -280,7 +228,7 @@ def freeze(stage: Stage, part: str, seconds: float = 10.0) -> float:
 def restart(stage: Stage) -> float:
     """End every node with SIGTERM and start it again."""
     for node in stage.nodes:
-        seconds = node.end()
+        seconds, _ = node.end()
         if seconds > 2.0:
             node.crashes.append(f"ended {seconds:.1f} s after SIGTERM")
         node.start()
@@ -303,11 +251,6 @@ def jump(stage: Stage) -> float:
     """Move the odometry frame."""
     x, y = stage.rng.uniform(-40, 40), stage.rng.uniform(-40, 40)
     return badly(stage, 0.0, shift=(x, y, stage.rng.uniform(-pi, pi)))
-
-
-def clock(stage: Stage, seconds: float) -> float:
-    """Step the sensor clocks."""
-    return badly(stage, 0.0, offset=stage.manner.offset + seconds)
 
 
 def flood(stage: Stage, seconds: float) -> float:
@@ -367,8 +310,8 @@ FAULTS: dict[str, Callable[[Stage], float]] = {
     "odometry frozen for 8 s": _P(badly, seconds=8.0, frozen=True),
     "stamps in ms for 8 s": _P(badly, seconds=8.0, unit_ns=1_000_000),
     "stamps frozen for 5 s": _P(badly, seconds=5.0, stopped=True),
-    "sensor clock steps 1 h ahead": _P(clock, seconds=3600.0),
-    "sensor clock steps 10 min back": _P(clock, seconds=-600.0),
+    "sensor clock steps 1 h ahead": lambda stage: badly(stage, 0.0, offset=stage.manner.offset + 3600.0),
+    "sensor clock steps 10 min back": lambda stage: badly(stage, 0.0, offset=stage.manner.offset - 600.0),
     "100 frames a second for 8 s": _P(badly, seconds=8.0, cloud_period=0.01),
     "flood of rubbish for 10 s": _P(flood, seconds=10.0),
     "link cut for 5 s": _P(link, mode="cut", seconds=5.0),

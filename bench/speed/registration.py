@@ -64,7 +64,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     small_gicp()  # before the world is made
     found = list(places(11 if asked.quick else 31))
     warm_up()
-    peers, threads = {}, runtime.workers()
+    peers: Peers = {}
+    threads = runtime.workers()
     for target in {id(place.target): place.target for place in found}.values():
         peers |= {(w, id(target)): SmallGicp(target.points, w, 0.05, near, threads) for w, near in WAYS.items()}
         nearest(target.grid, target.points[:1], 1.0)  # sorts the tile

@@ -1,23 +1,21 @@
-import json
 import math
-from argparse import ArgumentParser
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from bench.harness.rows import upper
-from bench.integrity import integrity
-from bench.integrity.integrity import Tally, class_table, classes, false_list, family_table, plain, reliability_table
+from bench.integrity import run
+from bench.integrity.integrity import Tally, chosen, classes, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, plan
-from bench.integrity.run import append, judged, mirrored, read, scaled, tilted
+from bench.integrity.run import judged, mirrored, scaled, tilted
+from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 
 def result(key, outcome, **more):
     said = {"key": key, "code": "a", "kind": "village", "seed": 1, "class": "ordinary", "family": "ordinary village"}
-    return said | {"outcome": outcome, "state": "SEARCHING", "metres": 4.0} | more
+    return said | {"outcome": outcome, "state": "SEARCHING", "metres": 4.0, "stated": {}} | more
 
 
 @pytest.mark.parametrize(
@@ -60,17 +58,6 @@ def test_every_fix_is_false_where_no_pose_is_right():
     assert judged(np.eye(4), None) == {"outcome": "false"}
 
 
-def test_results_are_found_again_by_key_and_code_the_newest_of_each(tmp_path):
-    files = [tmp_path / "a.jsonl", tmp_path / "b.jsonl"]
-    append(files[0], result("one", "failed"))
-    append(files[0], result("one", "right"))
-    append(files[1], result("two", "none", code="b"))
-    with files[1].open("a") as stream:
-        stream.write(json.dumps(result("three", "none"))[:30])  # as a killed process leaves it
-    assert {key: each["outcome"] for key, each in read(files, "a").items()} == {"one": "right"}
-    assert set(read([*files, tmp_path / "none.jsonl"], "b")) == {"two"}
-
-
 def test_failed_runs_and_those_without_a_way_do_not_count():
     runs = [result("1", "right"), result("2", "failed"), result("3", "no way"), result("4", "none", reason="x")]
     tally = Tally.of(runs)
@@ -78,14 +65,9 @@ def test_failed_runs_and_those_without_a_way_do_not_count():
     assert tally.found == 0.5
 
 
-def test_ends_without_a_fix_are_told_apart_by_state_and_commonest_reason():
-    ends = [("AMBIGUOUS", "two places fit: 1 in 12"), ("AMBIGUOUS", "two places fit: 1 in 9"), ("SEARCHING", "nothing")]
-    tally = Tally.of(result(str(k), "none", state=state, reason=said) for k, (state, said) in enumerate(ends))
-    assert (tally.ambiguous, tally.searching, tally.reason) == (2, 1, "two places fit: N in N (2)")
-
-
-def test_numbers_are_left_out_of_reasons():
-    assert plain("wrong 1 in 77,000, 0.3 of it") == "wrong N in N, N of it"
+def test_runs_without_a_fix_are_counted_by_their_last_state():
+    tally = Tally.of(result(str(k), "none", state=state) for k, state in enumerate(("AMBIGUOUS", "LOST", "SEARCHING")))
+    assert (tally.ambiguous, tally.searching) == (1, 2)
 
 
 def test_shifted_buildings_are_counted_with_the_rest_and_without():
@@ -94,17 +76,7 @@ def test_shifted_buildings_are_counted_with_the_rest_and_without():
     assert {name: (t.runs, t.false) for name, t in found.items()} == {
         "all": (2, 1), "near copies": (1, 1), "ordinary": (1, 0), "all but shifted buildings": (1, 0)
     }  # fmt: skip
-    assert "shifted" in family_table(runs)
     assert "all but shifted buildings" not in classes(runs[:1])
-
-
-def test_false_first_fixes_are_listed_one_by_one():
-    off = {"error_m": 55.0, "error_deg": 1.0, "risk": 3e-5, "sensor": "os64"}
-    runs = [result("a", "false", **off), result("b", "right", **off), result("c", "false", risk=0.0, sensor="os64")]
-    assert false_list(runs).splitlines() == [
-        "- a (os64): after 4 m, 55.0 m, 1.0 degrees off; stated 3.0e-05",
-        "- c (os64): after 4 m, no pose is right; stated 0.0e+00",
-    ]
 
 
 def test_a_site_with_two_false_runs_counts_once():
@@ -112,9 +84,6 @@ def test_a_site_with_two_false_runs_counts_once():
     tally = Tally.of(runs)
     assert (tally.false, tally.sites_false, tally.sites) == (2, 1, 20)
     assert tally.site_bound == upper(1, 20) > tally.bound == upper(2, 40)
-    cells = [cell.strip() for cell in class_table(runs).splitlines()[2].split("|")]
-    assert cells[1:4] == ["all", "40", "20"]
-    assert cells[8:10] == ["1", "21.61 %"]
 
 
 def test_reliability_counts_each_run_once_where_it_first_states_an_error():
@@ -176,53 +145,20 @@ def test_the_survey_is_the_same_whatever_changes_later():
         assert before.now.solid.vertices.shape != after.now.solid.vertices.shape or kind == "rows"
 
 
-@pytest.fixture
-def asked(tmp_path, monkeypatch):
-    monkeypatch.setenv("COVIEW_BENCH", str(tmp_path))
-
-    def parsed(*words):
-        parser = ArgumentParser()
-        parser.add_argument("--quick", action="store_true")
-        integrity.options(parser)
-        return parser.parse_args(["--quick", *words])
-
-    return parsed
+def test_a_site_without_a_map_costs_its_runs_and_is_made_again(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(run, "map_of", lambda case: calls.append(case) or 1 / 0)
+    site = plan("reported", 2)[0]
+    for _ in range(2):
+        results = run.on_site(site, tmp_path, "a")
+        assert [each["reason"].partition(":")[0] for each in results] == ["ZeroDivisionError"] * 2
+        assert Tally.of(results).runs == 0
+    assert calls == [site[0]] * 2
 
 
-@pytest.fixture
-def made(monkeypatch):
-    """Keys of the runs that were made; those of the family "old" fail."""
-    keys = []
-
-    def everywhere(sites, task, jobs):
-        for run in (run for site in sites for run in site):
-            keys.append(task.key(run))
-            outcome = "failed" if run.family == "old" else "none"
-            result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), "outcome": outcome}
-            result |= {"state": "SEARCHING", "reason": "no place", "cost_s": 1.0, "site_s": 2.0}
-            append(task.results, result)
-            yield result
-
-    monkeypatch.setattr(integrity, "everywhere", everywhere)
-    return keys
-
-
-def test_only_missing_and_failed_runs_are_made_and_shards_share_their_results(asked, made):
-    for share in ("1/3", "2/3", "3/3"):
-        rows = list(integrity.rows(asked("--shard", share)))
-    assert len(made) == len(set(made)) == 60
-    assert len(rows[-1].details["results"]) == 60
-    failed = [key for key in made if key.endswith("-old")]
-    assert [row.holds for row in rows if row.name.endswith("runs that failed")] == [False]
-    made.clear()
-    list(integrity.rows(asked()))
-    assert made == failed
-    list(integrity.rows(asked("--risk", "0.1", "--families", "court")))
-    assert all(key.endswith("@0.1") for key in made[len(failed) :])
-
-
-@pytest.mark.parametrize("text", ["0/3", "4/3", "three", "1/0"])
-def test_a_wrong_shard_is_refused(asked, text, capsys):
-    with pytest.raises(SystemExit):
-        asked("--shard", text)
-    assert text in capsys.readouterr().err
+def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
+    sites = plan("reported", 60)
+    assert {run.family for site in chosen(sites, "court, old") for run in site} == {"court", "old"}
+    assert chosen(sites, None) == sites
+    with pytest.raises(InputError, match="--families nowhere"):
+        chosen(sites, "nowhere")
