@@ -17,7 +17,7 @@ from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry, prepare
 from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
-from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
+from coview_stream.messages.types import OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
 from coview_stream.stream.transport.keys import NodeIdentity, RobotKeys
 from coview_stream.stream.transport.transport import Transport
@@ -45,9 +45,9 @@ class CapturedMessage:
         encoding: named by the sample; empty without one.
         size: bytes.
         codec: codec that read it; empty if none could.
-        counter: name of the node's counter for a message that cannot be read; empty for others.
-        reason: why it cannot be read; empty if it can.
-        readable_as: another codec that could read it; empty if none can.
+        counter: name of the node's counter for a message that cannot be read.
+        reason: why it cannot be read.
+        readable_as: another codec that could read it.
         stamp_ns: sensor time, None if it cannot be read.
         points: number of finite points.
         distance: median distance of the points, metres, NaN without points.
@@ -74,17 +74,9 @@ class CapturedMessage:
 
 @dataclass
 class RobotCapture:
-    """Messages of one robot between two local times.
+    """Messages of one robot between the local times ``began`` and ``ended``, seconds, in order of arrival.
 
-    Attributes:
-        keys: keys of the robot.
-        clouds: in order of arrival.
-        odometry: in order of arrival.
-        status: newest one of the node; None without any.
-        servers: names of the nodes that published statuses.
-        alive: whether a node holds the liveliness token.
-        began: local time at which the capture began, seconds.
-        ended: local time at which it ended, seconds.
+    ``status`` is the newest one, ``servers`` are the nodes that published any, ``alive`` is a node's liveliness token.
     """
 
     keys: RobotKeys
@@ -105,16 +97,7 @@ def capture_robots(
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> list[RobotCapture]:
-    """Receive the robots' messages for ``seconds``.
-
-    Args:
-        transport: open transport.
-        keys: keys of each robot.
-        seconds: duration.
-        codecs: instead of the ones that the messages name.
-        wait: passes the time.
-        clock: local time, seconds.
-    """
+    """Receive the robots' messages for ``seconds``; ``codecs`` go before the ones that the messages name."""
     prepare(*CLOUD_CODECS, *ODOMETRY_CODECS)
     captures = [RobotCapture(k) for k in keys]
     over = False
@@ -161,8 +144,8 @@ def capture_cloud(
     captured, message = _capture("cloud", CLOUD_CODECS, decode_cloud, sample, arrived, option, hint)
     if message is None:
         return captured
-    distances = np.linalg.norm(message.points, axis=1)
-    distances = distances[np.isfinite(distances)]
+    finite = message.points[np.isfinite(message.points).all(axis=1)]
+    distances = np.linalg.norm(finite, axis=1)
     sweep = None
     if message.times is not None and np.isfinite(message.times).any():
         sweep = float(np.nanmin(message.times)), float(np.nanmax(message.times))
@@ -172,14 +155,8 @@ def capture_cloud(
         points=len(distances),
         distance=float(np.median(distances)) if len(distances) else float("nan"),
         sweep=sweep,
-        cloud=_some(message.points),
+        cloud=np.array(finite[:: -(-len(finite) // _MAX_KEPT) or 1], dtype=np.float32),
     )
-
-
-def _some(points: Points) -> Points:
-    """Return every n-th finite point (N, 3), :data:`_MAX_KEPT` at most."""
-    points = points[np.isfinite(points).all(axis=1)]
-    return np.array(points[:: -(-len(points) // _MAX_KEPT) or 1], dtype=np.float32)
 
 
 def capture_odometry(
@@ -214,21 +191,16 @@ def _capture(
 
 def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: Sample) -> str:
     """Return the name of a codec that reads plausible values; the strictest formats are tried first, raw rows last."""
-    raw = ("xyzi", "xyz")
-    for name in [name for name in codecs if name not in raw] + [name for name in raw if name in codecs]:
+    for name in sorted(codecs, key=lambda name: name in ("xyzi", "xyz")):
         try:
             message = decode(sample, name, None)
         except (EncodingError, MessageError):
             continue
-        if _plausible(message):
+        if isinstance(message, OdometryMessage):
+            return name
+        size = np.abs(message.points)
+        # denormal numbers and integers read as float32 are next to zero, text and protobuf beyond all lidars
+        possible = np.isnan(size) | (size == 0) | ((size > 1e-6) & (size < _MAX_COORDINATE))
+        if len(size) > 0 and possible.all():
             return name
     return ""
-
-
-def _plausible(message: CloudMessage | OdometryMessage) -> bool:
-    if isinstance(message, OdometryMessage):
-        return True
-    size = np.abs(message.points)
-    # denormal numbers and integers read as float32 are next to zero, text and protobuf beyond all lidars
-    possible = np.isnan(size) | (size == 0) | ((size > 1e-6) & (size < _MAX_COORDINATE))
-    return len(size) > 0 and bool(possible.all())

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from coview_stream.stream.client.fleet_table import printable
 
 Verdict = Literal["ok", "warn", "FAIL"]
-
-_VERDICT_WIDTH, _NAME_WIDTH = 4, 22  # characters of the first columns
 
 
 @dataclass(frozen=True)
@@ -35,17 +33,11 @@ class Finding:
         """Return one printable line, without control characters that came from the network."""
         name = f"{self.robot} {self.what}" if self.robot else self.what
         remedy = f"  ({self.remedy})" if self.remedy else ""
-        return printable(f"{self.verdict:<{_VERDICT_WIDTH}}  {name:<{_NAME_WIDTH}}  {self.found}{remedy}").rstrip()
+        return printable(f"{self.verdict:<4}  {name:<22}  {self.found}{remedy}").rstrip()
 
     def to_json(self) -> dict[str, str | None]:
         """Return plain data, for JSON."""
-        return {
-            "verdict": self.verdict,
-            "robot": self.robot,
-            "what": self.what,
-            "found": self.found,
-            "remedy": self.remedy,
-        }
+        return asdict(self)
 
 
 def from_error(what: str, error: Exception | str) -> Finding:

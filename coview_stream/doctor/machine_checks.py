@@ -47,10 +47,7 @@ _PARTS = {
 
 
 def machine_findings(probed: Callable[[str], dict[str, Any]] | None = None) -> Iterator[Finding]:
-    """Judge the machine; takes some seconds, to compile the kernels.
-
-    ``probed`` tries a library, by default with :func:`probe`.
-    """
+    """Judge the machine; takes some seconds, to compile the kernels. ``probed`` replaces :func:`probe`."""
     probed = probed or probe
     yield python_finding(sys.version_info[:3])
     yield processor_finding(_model(), cores(), _quota())
@@ -181,13 +178,9 @@ def matplotlib_finding(result: dict[str, Any]) -> Finding:
 
 def memory() -> tuple[int | None, int | None]:
     """Return total and available bytes, within a container's limit; None where the system does not say."""
-    fields: dict[str, int] = {}
-    for line in _read("/proc/meminfo").splitlines():
-        name, _, rest = line.partition(":")
-        number = rest.split()[:1]
-        if number and number[0].isdigit():
-            fields[name] = int(number[0]) * 1024
-    total, available = fields.get("MemTotal"), fields.get("MemAvailable")
+    numbers = (line.split() for line in _read("/proc/meminfo").splitlines())
+    fields = {line[0]: int(line[1]) * 1024 for line in numbers if len(line) > 1 and line[1].isdigit()}
+    total, available = fields.get("MemTotal:"), fields.get("MemAvailable:")
     limit, used = _read("/sys/fs/cgroup/memory.max").strip(), _read("/sys/fs/cgroup/memory.current").strip()
     if total is not None and available is not None and limit.isdigit() and used.isdigit() and int(limit) < total:
         return int(limit), min(available, max(0, int(limit) - int(used)))
@@ -257,8 +250,8 @@ def _probe_kernels() -> dict[str, Any]:
     begin = time.perf_counter()
     backend = kernels.backend()
     kernels.warm_up()
-    seconds = time.perf_counter() - begin
-    return {"backend": backend, "seconds": round(seconds, 2), "differing": differing(kernels, reference)}
+    seconds = round(time.perf_counter() - begin, 2)
+    return {"backend": backend, "seconds": seconds, "differing": differing(kernels, reference)}
 
 
 def differing(native: Any, twin: Any) -> list[str]:
@@ -266,14 +259,13 @@ def differing(native: Any, twin: Any) -> list[str]:
     cloud = np.random.default_rng(0).uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
     T = np.eye(4)
     T[:3, 3] = 1.0, -2.0, 0.5
+    zero = np.zeros(3)
     cases: dict[str, tuple[Any, ...]] = {
         "transform_unique": (cloud, T, 0.5, 1.0, 20.0),
-        "polar_bin": (cloud, np.zeros(3), 20, 60, 50.0),
-        "describe_points": (cloud, np.zeros(3), 20, 60, 50.0),
+        "polar_bin": (cloud, zero, 20, 60, 50.0),
+        "describe_points": (cloud, zero, 20, 60, 50.0),
     }
-    return [
-        name for name, args in cases.items() if not _close(getattr(native, name)(*args), getattr(twin, name)(*args))
-    ]
+    return [name for name, a in cases.items() if not _close(getattr(native, name)(*a), getattr(twin, name)(*a))]
 
 
 def _close(one: Any, other: Any) -> bool:

@@ -16,10 +16,7 @@ from coview_stream.errors import CloudError, CoViewError, MapError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
-if TYPE_CHECKING:
-    from coview_stream.basemap.basemap import BaseMap
     from coview_stream.recordings.run import Run
-
 
 # of onnxruntime, the network and other imports, in two processes
 _NETWORK_MEMORY = 0.2 * GB
@@ -46,7 +43,13 @@ def map_findings(base_map: BaseMap, size: int, available: int | None) -> Iterato
     yield Finding("ok", "map sha256", base_map.sha256)
     if not len(base_map):
         yield Finding("FAIL", "map stations", "none: nowhere to search", "build it again, from ground and walls")
-    yield _features_finding(base_map)
+    missing = base_map.require_features("auto")
+    if missing is not None:
+        yield replace(from_error("map features", missing), verdict="warn")
+    elif base_map.learned is None:
+        yield Finding("ok", "map features", "none: searches go by co-view descriptors")
+    else:
+        yield Finding("ok", "map features", f"{base_map.learned.bytes / 1e6:.1f} MB, of the installed networks")
     needed = node_memory(base_map)
     text = f"a node needs about {needed / GB:.1f} GB, and {size / GB:.2f} GB of page cache for the file"
     if available is not None and needed > available:
@@ -59,29 +62,16 @@ def map_findings(base_map: BaseMap, size: int, available: int | None) -> Iterato
         yield Finding("ok", "map memory", text)
 
 
-def _features_finding(base_map: BaseMap) -> Finding:
-    missing = base_map.require_features("auto")
-    if missing is not None:
-        return replace(from_error("map features", missing), verdict="warn")
-    if base_map.learned is None:
-        return Finding("ok", "map features", "none: searches go by co-view descriptors")
-    return Finding("ok", "map features", f"{base_map.learned.bytes / 1e6:.1f} MB, of the installed networks")
-
-
 def node_memory(base_map: BaseMap) -> float:
-    """Return a node's bytes: processes, the station index, the likelihood field, and a search."""
-    surveyed = int((base_map.survey.values > 0).sum()) * base_map.config.block**2
-    return MIN_MEMORY + len(base_map) * _INDEX_MEMORY + surveyed * _FIELD_MEMORY + _learned_memory(base_map)
+    """Return a node's bytes: processes, the station index, the likelihood field, a search, and learned features.
 
-
-def _learned_memory(base_map: BaseMap) -> float:
-    """Return the bytes that learned features add: libraries, features, their spectra, and a query's scores.
-
-    They fill the rectangle around the map, however little of it has points.
+    Learned features fill the rectangle around the map, however little of it has points.
     """
-    if base_map.require_features("auto") is not None or base_map.learned is None:
-        return 0.0
-    return _NETWORK_MEMORY + base_map.learned.box_area * _FEATURE_MEMORY
+    surveyed = int((base_map.survey.values > 0).sum()) * base_map.config.block**2
+    needed = MIN_MEMORY + len(base_map) * _INDEX_MEMORY + surveyed * _FIELD_MEMORY
+    if base_map.learned is not None and base_map.require_features("auto") is None:
+        needed += _NETWORK_MEMORY + base_map.learned.box_area * _FEATURE_MEMORY
+    return needed
 
 
 # sizes of the sample
@@ -150,21 +140,19 @@ def place_finding(run: Run, base_map: BaseMap) -> Finding:
         from coview_stream.localization.localizer import Localizer
         from coview_stream.localization.state import State
     except ImportError as error:
-        return Finding(
-            "warn", "place", f"not searched for: {error.name} is missing", "pip install 'coview-stream[all]'"
-        )
+        remedy = "pip install 'coview-stream[all]'"
+        return Finding("warn", "place", f"not searched for: {error.name} is missing", remedy)
     localizer = Localizer(base_map)
     reason, driven = "", 0.0
     step = max(1, len(run) // _SEARCHED)
     indices = range(0, len(run), step) if len(run) <= 4 * _SEARCHED else range(0, 4 * _SEARCHED, 4)
-    before = None
+    before = run.poses[0, :3, 3]
     for index in indices:
         try:
             frame = run.read(index)
         except CloudError:
             continue
-        if before is not None:
-            driven += float(np.linalg.norm(frame.T_odom_body[:3, 3] - before))
+        driven += float(np.linalg.norm(frame.T_odom_body[:3, 3] - before))
         before = frame.T_odom_body[:3, 3]
         fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         if fix is None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import socket
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 
-from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_robots
+from coview_stream.doctor.capture import Codecs, Wait, capture_robots
 from coview_stream.doctor.finding import Finding
 from coview_stream.doctor.frame_checks import frame_findings
 from coview_stream.doctor.robot_checks import (
@@ -22,7 +22,7 @@ from coview_stream.doctor.robot_checks import (
 from coview_stream.errors import ConfigError
 from coview_stream.stream.transport.keys import RobotKeys, robot_keys
 from coview_stream.stream.transport.rmw import dds_type
-from coview_stream.stream.transport.transport import Connection, Transport
+from coview_stream.stream.transport.transport import Transport
 
 _TYPES = {"cloud": "sensor_msgs/msg/PointCloud2", "odometry": "nav_msgs/msg/Odometry"}
 _DDS = {dds_type(name): channel for channel, name in _TYPES.items()}
@@ -74,11 +74,6 @@ def discover(transport: Transport, wait: Callable[[float], object] = time.sleep)
         for token in transport.tokens(expression):
             add(from_token(token))
     return sorted(candidates)
-
-
-def served_robots(transport: Transport) -> set[str]:
-    """Return the names of the robots for which a node holds a liveliness token, of any base."""
-    return {token.split("/")[-2] for token in transport.tokens("**/alive") if "/" in token}
 
 
 def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "", served: Iterable[str] = ()) -> str:
@@ -173,11 +168,16 @@ _TCP = re.compile(r"(?:tcp|tls|ws)/(\[[^\]]+\]|[^:/]+):(\d+)")
 def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait = time.sleep) -> Finding:
     """Judge whether a router or a peer is connected; ``connect`` are the endpoints to name if not."""
     waited = 0.0
-    while not _connected(transport) and waited < (_CONNECT_TIMEOUT if connect else _LISTEN_TIMEOUT):
+    connection = transport.connection()
+    while not (connection.routers or connection.peers) and waited < (_CONNECT_TIMEOUT if connect else _LISTEN_TIMEOUT):
         wait(_POLL_PERIOD)
         waited += _POLL_PERIOD
-    if _connected(transport):
-        return Finding("ok", "network", f"connected: {_counts(transport.connection())}")
+        connection = transport.connection()
+    if connection.routers or connection.peers:
+        clients = len(connection.clients)
+        counts = {"router": len(connection.routers), "peer": len(connection.peers) - clients, "client": clients}
+        text = ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
+        return Finding("ok", "network", f"connected: {text}")
     if not connect:
         return Finding("FAIL", "network", "nothing has connected", "start the others, and name this endpoint to them")
     reasons = [(endpoint, try_tcp(endpoint)) for endpoint in connect]
@@ -210,37 +210,6 @@ def try_tcp(endpoint: str) -> str:
         return f"cannot be reached: {error.strerror or error}"
 
 
-def _connected(transport: Transport) -> bool:
-    connection = transport.connection()
-    return bool(connection.routers or connection.peers)
-
-
-def _counts(connection: Connection) -> str:
-    """Return how many routers, peers and clients are connected, such as ``1 router, 2 peers``."""
-    clients = len(connection.clients)
-    counts = {"router": len(connection.routers), "peer": len(connection.peers) - clients, "client": clients}
-    return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
-
-
-def robot_findings(
-    capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None, served: Collection[str] = ()
-) -> Iterator[Finding]:
-    """Judge all of one robot.
-
-    Args:
-        capture: its messages.
-        candidates: other clouds and odometry on the network.
-        sha256: of the map; None if unknown.
-        served: robots that have a node.
-    """
-    others = set(served) - {capture.keys.robot}
-    yield from cloud_findings(capture, candidates_text(candidates, "cloud", capture.keys.cloud, others))
-    yield from odometry_findings(capture, candidates_text(candidates, "odometry", capture.keys.odometry, others))
-    yield from cross_findings(capture)
-    yield from frame_findings(captured_frames(capture), capture.keys.robot)
-    yield node_finding(capture, sha256)
-
-
 def robots_findings(
     transport: Transport,
     keys: Sequence[RobotKeys],
@@ -254,16 +223,20 @@ def robots_findings(
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
     candidates = discover(transport, wait=wait) if silent or not keys else []
-    served = served_robots(transport) if candidates else set()
+    # robots of any base whose node holds a liveliness token
+    tokens = transport.tokens("**/alive") if candidates else ()
+    served = {token.split("/")[-2] for token in tokens if "/" in token}
     for capture in captures:
-        yield from robot_findings(capture, candidates, sha256, served)
+        k = capture.keys
+        others = served - {k.robot}
+        yield from cloud_findings(capture, candidates_text(candidates, "cloud", k.cloud, others))
+        yield from odometry_findings(capture, candidates_text(candidates, "odometry", k.odometry, others))
+        yield from cross_findings(capture)
+        yield from frame_findings(captured_frames(capture), k.robot)
+        yield node_finding(capture, sha256)
     if not keys:
-        yield candidates_finding(candidates)
-
-
-def candidates_finding(candidates: Sequence[Candidate]) -> Finding:
-    """List the clouds and odometry on the network, for a user who has named no robot."""
-    texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(candidates, channel))]
-    if texts:
-        return Finding("ok", "robots", "; ".join(texts))
-    return Finding("warn", "robots", "nothing that looks like clouds or odometry", "name one: --robot NAME")
+        texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(candidates, channel))]
+        if texts:
+            yield Finding("ok", "robots", "; ".join(texts))
+        else:
+            yield Finding("warn", "robots", "nothing that looks like clouds or odometry", "name one: --robot NAME")

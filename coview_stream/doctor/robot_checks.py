@@ -54,7 +54,12 @@ def odometry_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding
     robot, messages = capture.keys.robot, capture.odometry
     maker = str((capture.status or {}).get("odometry", "robot"))
     if maker != "robot":
-        yield _made_by_node(maker, len(messages), robot)
+        found = f"the node makes it of the clouds ({maker})"
+        if not messages:
+            yield Finding("ok", "odometry", found, robot=robot)
+            return
+        remedy = "the robot's is as a rule better: `serve --odometry robot`"
+        yield Finding("warn", "odometry", f"{found} and ignores the {len(messages)} samples heard", remedy, robot)
         return
     readable = [m for m in messages if m.stamp_ns is not None]
     if not messages:
@@ -73,14 +78,6 @@ def _missing(channel: str, capture: RobotCapture, key: str, elsewhere: str) -> F
         remedy += f"{'.' * bool(elsewhere)} If it has none: `serve --odometry kiss-icp`"
     result = f"none in {capture.ended - capture.began:.1f} s on {key}"
     return Finding("FAIL", channel, result, remedy, capture.keys.robot)
-
-
-def _made_by_node(maker: str, ignored: int, robot: str) -> Finding:
-    found = f"the node makes it of the clouds ({maker})"
-    if ignored:
-        remedy = "the robot's is as a rule better: `serve --odometry robot`"
-        return Finding("warn", "odometry", f"{found} and ignores the {ignored} samples heard", remedy, robot)
-    return Finding("ok", "odometry", found, robot=robot)
 
 
 def _unreadable(
@@ -108,16 +105,13 @@ def rate(messages: Sequence[CapturedMessage]) -> float | None:
 def _described(messages: Sequence[CapturedMessage]) -> str:
     hertz = rate(messages)
     size = int(statistics.median(m.size for m in messages))
+    text = f"{size} bytes" if size < 10_000 else f"{size / 1e6:.2f} MB"
     codecs = sorted({m.codec for m in messages})
     encodings = sorted({m.encoding or "none set" for m in messages})
     return (
-        f"{f'{hertz:.1f} Hz' if hertz else f'{len(messages)} only'}, {_bytes(size)}, "
+        f"{f'{hertz:.1f} Hz' if hertz else f'{len(messages)} only'}, {text}, "
         f"read as {' and '.join(codecs)} (Encoding {' and '.join(encodings)})"
     )
-
-
-def _bytes(size: int) -> str:
-    return f"{size} bytes" if size < 10_000 else f"{size / 1e6:.2f} MB"
 
 
 def _clouds(messages: list[CapturedMessage], capture: RobotCapture) -> Finding:
@@ -272,7 +266,9 @@ def pairing_finding(
         if message.T_odom_body is not None:
             kinds[buffer.add(OdometryMessage(message.stamp_ns or 0, message.T_odom_body), message.arrived)] += 1
         else:
-            pairing.add(_without_points(message), message.arrived)
+            # pairing reads stamps only
+            times = None if message.sweep is None else np.array(message.sweep)
+            pairing.add(CloudMessage(message.stamp_ns or 0, np.zeros((0, 3), np.float32), times), message.arrived)
         paired += sum(1 for _ in pairing.take_paired(message.arrived))
     paired += sum(1 for _ in pairing.take_paired(ended + config.pairing_wait))
     found = f"{paired} of {len(clouds)} clouds find odometry around their stamps"
@@ -303,12 +299,6 @@ def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
         if abs(int(stamps[nearest]) - (message.stamp_ns or 0)) < _NEAREST_NS and message.cloud is not None:
             frames.append(SeenFrame((message.stamp_ns or 0) * 1e-9, message.cloud, odometry[nearest][1]))
     return frames
-
-
-def _without_points(captured: CapturedMessage) -> CloudMessage:
-    """Return a cloud of the same stamp without points, since pairing reads stamps only."""
-    times = None if captured.sweep is None else np.array(captured.sweep)
-    return CloudMessage(captured.stamp_ns or 0, np.zeros((0, 3), np.float32), times)
 
 
 def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None = None) -> Finding:
