@@ -10,7 +10,7 @@ import hashlib
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ class Place:
 def drawn(folder: Path, seed: int, queries: int) -> Place:
     """Return the world of a seed, simulated now unless ``folder`` has it."""
     recipe, out = Recipe(submaps=queries), folder / f"drawn-{seed}-{queries}"
-    spec = {"seed": seed, "recipe": recipe.to_dict(), "code": fingerprint(*WORLDS)}
+    spec = {"seed": seed, "recipe": asdict(recipe), "code": fingerprint(*WORLDS)}
     kind = str(remembered(out / "drawn.json", spec, lambda: _simulate(out, seed, recipe))["kind"])
     return Place(f"seed {seed}", kind, out / "base.npy", [_read(out / f"drive-{k}.npz") for k in range(queries)])
 

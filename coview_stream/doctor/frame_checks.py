@@ -333,7 +333,7 @@ def _explanation(
         R_up = _turning(ground.up, _UP)
         R = rot_z(-fit.yaw) @ R_up
         if fit.spread < _YAW_SPREAD and abs(fit.scale - 1.0) < _SCALE and (ground.axis or abs(fit.yaw) > _YAW):
-            consider(_fit(pairs, R_up, None, R), _mount_finding(ground, -fit.yaw, R, robot))
+            consider(_fit(pairs, R_up, None, R), _mount_finding(ground.axis, Mount().turned(R), robot))
         for found, remedy, change, clouds_too in _READINGS:
             if (ground.axis != 0) == clouds_too:
                 R_body = _turning(_R_body_camera @ ground.up, _UP) @ _R_body_camera if clouds_too else None
@@ -358,15 +358,16 @@ def _explanation(
     return best
 
 
-def _mount_finding(ground: _Ground, yaw: float, R: Floats, robot: str | None) -> Finding:
-    """Describe a lidar whose clouds ``R`` (3, 3) turns into the body, ``yaw`` of it about the vertical."""
-    if ground.axis:
-        name = _AXIS_NAMES[ground.axis]
-        found = "the lidar is upside down" if ground.axis == 1 else f"the lidar's {name} axis points up, not its z"
-        found += f", turned by {math.degrees(yaw):.0f} degrees about the vertical" if abs(yaw) > _YAW else ""
+def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:
+    turned = f"turned by {mount.yaw:.0f} degrees"
+    if not axis:
+        found = f"the lidar is {turned} against the motion of the body"
     else:
-        found = f"the lidar is turned by {math.degrees(yaw):.0f} degrees against the motion of the body"
-    return Finding("FAIL", "mount", found, f"set --mount={Mount().turned(R).option}", robot)
+        found = (
+            "the lidar is upside down" if axis == 1 else f"the lidar's {_AXIS_NAMES[axis]} axis points up, not its z"
+        )
+        found += f", {turned} about the vertical" if abs(mount.yaw) > math.degrees(_YAW) else ""
+    return Finding("FAIL", "mount", found, f"set --mount={mount.option}", robot)
 
 
 def _still(frames: Sequence[SeenFrame], pairs: Sequence[_Pair], robot: str | None) -> Finding | None:

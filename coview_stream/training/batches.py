@@ -24,16 +24,23 @@ def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
     image = image.copy()
     if rng.random() < _CHANCE:
         _fell(image, rng)
-    if rng.random() < _CHANCE:
-        _thin(image, rng)
+    if rng.random() < _CHANCE:  # a sparser scan
+        image[:_HEIGHTS] *= rng.random(image[:_HEIGHTS].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
+        image[_SEEN] *= rng.random(image[_SEEN].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
     if rng.random() < 0.5 * _CHANCE:
-        _hide(image, aerial, rng)
+        if aerial:  # dense leaves hide the layers below
+            image[: int(rng.integers(1, 4))] = 0
+        else:  # the field of view ends below the upper layers
+            image[int(rng.integers(3, _HEIGHTS)) : _HEIGHTS] = 0
+            image[_TOP] = np.minimum(image[_TOP], int(255 * rng.uniform(0.1, 0.4)))
     if rng.random() < _CHANCE:
         power = np.exp(rng.uniform(-0.6, 0.6))
         shares = 255.0 * (np.arange(256) / 255.0) ** power
         image[:_HEIGHTS] = shares.astype(np.uint8)[image[:_HEIGHTS]]
     if rng.random() < 0.5 * _CHANCE:
-        image[_RELIEF] = 128 if rng.random() < 0.5 else _weaker(image[_RELIEF], rng.uniform(0.3, 1.5))
+        relief = image[_RELIEF].astype(np.float32) - 128.0
+        relief *= 0.0 if rng.random() < 0.5 else np.float32(rng.uniform(0.3, 1.5))
+        image[_RELIEF] = np.clip(128.0 + relief, 0.0, 255.0)
     return image
 
 
@@ -50,27 +57,6 @@ def _fell(image: Image, rng: np.random.Generator) -> None:
         y, x = np.ogrid[rows.start : min(rows.stop, height), columns.start : min(columns.stop, width)]
         near = np.hypot(y - row, x - column) * CELL < radius
         image[:_SEEN, rows, columns][:, near] = 0
-
-
-def _thin(image: Image, rng: np.random.Generator) -> None:
-    """Drop a share of the filled cells of each layer, as in a sparser scan."""
-    kept = rng.random(image[:_HEIGHTS].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
-    image[:_HEIGHTS] *= kept
-    image[_SEEN] *= rng.random(image[_SEEN].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
-
-
-def _hide(image: Image, aerial: bool, rng: np.random.Generator) -> None:
-    """Drop the layers below dense leaves (from above), or those above a sensor's field of view (from below)."""
-    if aerial:
-        image[: int(rng.integers(1, 4))] = 0
-        return
-    first = int(rng.integers(3, _HEIGHTS))
-    image[first:_HEIGHTS] = 0
-    image[_TOP] = np.minimum(image[_TOP], int(255 * rng.uniform(0.1, 0.4)))
-
-
-def _weaker(layer: Image, factor: float) -> Image:
-    return np.asarray(np.clip(128.0 + factor * (layer.astype(np.float32) - 128.0), 0.0, 255.0).astype(np.uint8))
 
 
 PIECE = 272
@@ -110,7 +96,8 @@ def draw_batch(
     images, queries, owners, poses = [], [], [], []
     for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
         world = worlds[int(k)]
-        centre, chosen = _somewhere(world, each, rng)
+        centre, near = _middle(world, each, rng)
+        chosen = rng.choice(near, each, replace=len(near) < each)
         turn = rng.uniform(-np.pi, np.pi) if rng.random() < _ROTATED else 0.5 * np.pi * rng.integers(4)
         mirrored = bool(rng.random() < 0.5)
         piece = _piece(world, centre, turn, mirrored)
@@ -131,22 +118,17 @@ def draw_batch(
     return Batch(np.stack(images), np.stack(queries), np.array(owners), np.array(poses))
 
 
-def _somewhere(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Floats, Indices]:
-    """Draw the middle (2,) of a piece and ``count`` queries near it; repeated where there are too few."""
-    best: tuple[Floats, Indices] | None = None
+def _middle(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Floats, Indices]:
+    """Draw the middle (2,) of a piece with ``count`` queries near it, or with the most, and their indices (K,)."""
+    best, most = np.zeros(2), np.zeros(0, dtype=np.intp)
     for _ in range(_TRIES):
         centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
         near = np.flatnonzero(np.linalg.norm(world.poses[:, :2] - centre, axis=1) < _REACH)
-        if best is None or len(near) > len(best[1]):
-            best = centre, near
+        if len(near) > len(most):
+            best, most = centre, near
         if len(near) >= count:
             break
-    assert best is not None
-    centre, near = best
-    if not len(near):
-        near = np.array([int(np.linalg.norm(world.poses[:, :2] - centre, axis=1).argmin())])
-        centre = world.poses[near[0], :2]
-    return centre, rng.choice(near, count, replace=len(near) < count)
+    return best, most
 
 
 def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:

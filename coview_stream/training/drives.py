@@ -10,15 +10,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coview_stream.clouds.filters import voxel_grid
-from coview_stream.geometry.arrays import Bools, Floats, Ints
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, transform
 from coview_stream.sim.layout import Layout, arc_lengths, directions
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.sensors import FRAME_PERIOD, Caster
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import DriveDirt, trained_sensor
-
-# chosen by hand
 
 CLEARANCE = 0.6
 """Metres between the robot's middle and a stem."""
@@ -47,26 +45,17 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
     heading = heading + np.cumsum(np.clip(bend, -0.2, 0.2), axis=1) * STEP
     step = STEP * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     paths = end[:, None] + np.cumsum(step, axis=1) - step[:, :1]
-    free = _clear(paths[:, ::_COARSE], obstacles) & (np.abs(paths[:, ::_COARSE]) < extent + 15).all(axis=2)
+    tested = paths[:, ::_COARSE]
+    free = (np.abs(tested) < extent + 15).all(axis=2)
+    thin = obstacles[:, 2] <= 0.5
+    for trunks in (obstacles[thin], obstacles[~thin]):
+        if len(trunks):
+            far, nearest = cKDTree(trunks[:, :2]).query(tested, distance_upper_bound=8.0)
+            free &= far > np.append(trunks[:, 2], 0.0)[nearest] + CLEARANCE
     reach = np.cumprod(free, axis=1).sum(axis=1)
     best = int(np.argmax(reach))  # the first of the longest
     kept = min(count, max(1, (int(reach[best]) - 1) * _COARSE + 1))
     return np.asarray(paths[best, :kept][::-1])
-
-
-def _clear(points: Floats, obstacles: Floats) -> Bools:
-    """Mask (...) the points (..., 2) that are clear of all obstacles."""
-    if not len(obstacles):
-        return np.ones(points.shape[:-1], dtype=bool)
-    flat = points.reshape(-1, 2)
-    clear = np.ones(len(flat), dtype=bool)
-    thin = obstacles[:, 2] <= 0.5
-    for trunks in (obstacles[thin], obstacles[~thin]):
-        if len(trunks):
-            far, nearest = cKDTree(trunks[:, :2]).query(flat, distance_upper_bound=8.0)
-            radius = np.append(trunks[:, 2], 0.0)[nearest]
-            clear &= far > radius + CLEARANCE
-    return clear.reshape(points.shape[:-1])
 
 
 def along_streets(rng: np.random.Generator, layout: Layout, extent: float, length: float) -> Floats:
@@ -142,7 +131,8 @@ def scanned(
 ) -> Frames:
     """Drive a path (N, 2) over the ``ground`` with a sensor, to its end."""
     along, frames = _moments(rng, recipe, path, sensor)
-    T = _poses(rng, recipe, path[along], _headings(path, rng)[along], ground)
+    heading = directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
+    T = _poses(rng, recipe, path[along], heading[along], ground)
     lidar = trained_sensor(sensor, lambda beams: int(np.ceil(beams * len(along) / recipe.rays)))
     noise = recipe.draw(rng, "ground_noise")
     config = OdometryConfig(
@@ -193,11 +183,6 @@ def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str
     along = np.concatenate([np.full(stood, along[0]), along])
     frames = np.concatenate([np.arange(stood) * _PAUSE, frames])
     return along, frames + int(rng.integers(0, 10_000))
-
-
-def _headings(path: Floats, rng: np.random.Generator) -> Floats:
-    """Return the headings (N,) of a path (N, 2), radians."""
-    return directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
 
 
 def _poses(

@@ -20,7 +20,6 @@ from coview_stream.training.networks import VIEWS, PlaceNet
 from coview_stream.training.recipe import TrainingConfig
 from coview_stream.training.worlds import WorldViews
 
-# set by hand
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises
 _FINAL_RATE = 0.01  # share of the learning rate at the end
 _MAX_GRADIENT = 5.0  # norm
@@ -45,7 +44,9 @@ def train(
     net.train()
     for step in range(first, config.steps):
         for group in optimiser.param_groups:
-            group["lr"] = config.rate * _schedule(step, config.steps)
+            rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * config.steps))
+            fall = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+            group["lr"] = config.rate * (rise * fall)
         torch.manual_seed(config.seed + step)  # a resumed training goes on as if it had not stopped
         loss = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
         if not torch.isfinite(loss.total):
@@ -57,44 +58,30 @@ def train(
         if report is not None:
             report(step, loss)
         if checkpoint is not None and (step + 1) % _CHECKPOINT_STEPS == 0:
-            _keep(checkpoint, net, optimiser, step + 1, config)
+            with atomic_path(checkpoint) as part:
+                state = {"net": net.state_dict(), "optimiser": optimiser.state_dict()}
+                torch.save(state | {"step": step + 1, "config": asdict(config)}, part)
     net.eval()
     return net
 
 
 def _step(net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, rng: np.random.Generator) -> Losses:
     batch = draw_batch(worlds, min(config.pieces, len(worlds)), config.each, rng)
-    encoded = [
-        net(_tensor(images), VIEWS.index(view))
+    query, piece = (
+        net((torch.from_numpy(images).float() / 255.0).contiguous(memory_format=torch.channels_last), VIEWS.index(view))
         for view, images in (("ground", batch.queries), ("aerial", batch.pieces))
-    ]
+    )
     wrong = rng.uniform(math.radians(12), 2 * math.pi - math.radians(12), (len(batch.queries), config.wrong))
     poses = torch.from_numpy(batch.poses).float()
     wrong_yaws = torch.from_numpy(batch.poses[:, 2:] + wrong).float()
     seen = _seen(batch.queries), _seen(batch.pieces)
-    return losses(encoded[0], encoded[1], torch.from_numpy(batch.piece_of), poses, wrong_yaws, seen)
+    return losses(query, piece, torch.from_numpy(batch.piece_of), poses, wrong_yaws, seen)
 
 
 def _seen(images: Any) -> torch.Tensor:
     """Mark local cells (B, 1, H / 2, W / 2) in which anything but relief was seen: 1, else 0."""
     anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
     return torch.nn.functional.max_pool2d(anything, 2)
-
-
-def _tensor(images: Any) -> torch.Tensor:
-    scaled = torch.from_numpy(images).float() / 255.0
-    return scaled.contiguous(memory_format=torch.channels_last)
-
-
-def _schedule(step: int, steps: int) -> float:
-    rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * steps))
-    return rise * (_FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)))
-
-
-def _keep(path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig) -> None:
-    state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step, "config": asdict(config)}
-    with atomic_path(path) as part:
-        torch.save(state, part)
 
 
 def _restore(path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer, config: TrainingConfig) -> int:

@@ -10,7 +10,6 @@ from torch.nn import functional
 
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
 
-# set by hand
 _COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
 _RADIUS = 29.0  # metres about a query's middle whose cells count
 _DENSE_SCALE = 20.0  # on scores in [-1, 1] before the softmax of the dense search
@@ -65,7 +64,8 @@ def dense_loss(
 ) -> tuple[Tensor, float]:
     """Return the cross-entropy over all pieces, coarse cells and headings tried, and the share of correct queries."""
     local, sigma, _ = query
-    weight = _disk(local.shape[-1], _RADIUS).to(local) / sigma
+    axis = (torch.arange(local.shape[-1]) + 0.5 - local.shape[-1] / 2) * LOCAL_CELL
+    weight = (torch.hypot(axis[:, None], axis[None]) < _RADIUS).to(local) / sigma
     coarse = functional.avg_pool2d(torch.cat([local * weight, weight], 1), _COARSE)
     yaws = torch.cat([poses[:, 2:], wrong_yaws], 1)
     count, tried = yaws.shape
@@ -113,7 +113,9 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, 
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
     angle = 2 * torch.pi * torch.rand(count, _SAMPLES)
     there = torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
-    here = _to_piece(there, poses)
+    c, s = poses[:, 2].cos()[:, None], poses[:, 2].sin()[:, None]
+    x, y = there[..., 0], there[..., 1]
+    here = torch.stack([c * x - s * y, s * x + c * y], -1) + poses[:, None, :2]
     ours, sigma_q = _at(query[0], there), _at(query[1], there)[..., 0]
     theirs, sigma_p = _at(piece[0][piece_of], here), _at(piece[1][piece_of], here)[..., 0]
     similar = ours @ theirs.transpose(1, 2) / _LOCAL_TEMPERATURE
@@ -132,8 +134,8 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
     """Make a query's global descriptor most similar to that of the map around its place."""
-    ours = _middle(query[2])
-    maps = piece[2]
+    maps, half = piece[2], query[2].shape[-1] // 2
+    ours = functional.normalize(query[2][:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
     size = maps.shape[-1]
     flat = maps.flatten(2).transpose(1, 2).reshape(-1, maps.shape[1])
     logits = ours @ flat.T / _PLACE_TEMPERATURE
@@ -158,26 +160,7 @@ def turn(images: Tensor, yaws: Tensor) -> Tensor:
     return functional.grid_sample(images, grid, align_corners=False)
 
 
-def _to_piece(points: Tensor, poses: Tensor) -> Tensor:
-    """Transform points (Q, K, 2) of the queries to their pieces' frames."""
-    c, s = poses[:, 2].cos()[:, None], poses[:, 2].sin()[:, None]
-    x, y = points[..., 0], points[..., 1]
-    return torch.stack([c * x - s * y, s * x + c * y], -1) + poses[:, None, :2]
-
-
 def _at(images: Tensor, points: Tensor) -> Tensor:
     """Interpolate local images (Q, C, n, n) bilinearly at (Q, K, 2) metres about their middles: (Q, K, C)."""
     grid = (points / (0.5 * LOCAL_CELL * images.shape[-1]))[:, :, None]
     return functional.grid_sample(images, grid, align_corners=False)[..., 0].transpose(1, 2)
-
-
-def _middle(place: Tensor) -> Tensor:
-    """Pool the global descriptor (Q, P) of the four middle cells."""
-    half = place.shape[-1] // 2
-    return functional.normalize(place[:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
-
-
-def _disk(size: int, radius: float) -> Tensor:
-    """Mask (size, size) local cells within ``radius`` metres of the middle: 1, else 0."""
-    at = (torch.arange(size) + 0.5 - size / 2) * LOCAL_CELL
-    return (torch.hypot(at[:, None], at[None]) < radius).float()

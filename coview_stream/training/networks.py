@@ -38,7 +38,6 @@ PLACE = 128
 PLACE_REACH = 7
 """Cells of 4 m about the middle that a global descriptor pools, under a Gaussian window of 14 m: up to 28 m."""
 
-# set by hand
 _PLACE_SIGMA = 3.5  # cells of 4 m
 _MIN_SIGMA = 0.05
 _MIN_ACTIVATION = 1e-4  # before GeM's power
@@ -101,7 +100,10 @@ class PlaceNet(nn.Module):
         self.power = nn.Parameter(torch.tensor(3.0))
         self.place = nn.Conv2d(4 * width, PLACE, 1)
         self.window: Tensor
-        self.register_buffer("window", _window().repeat(4 * width, 1, 1, 1), persistent=False)
+        at = torch.arange(-PLACE_REACH, PLACE_REACH + 1, dtype=torch.float32)
+        weight = torch.exp(-0.5 * (at / _PLACE_SIGMA) ** 2)
+        window = (weight / weight.sum())[:, None].repeat(4 * width, 1, 1, 1)
+        self.register_buffer("window", window, persistent=False)
 
     def forward(self, x: Tensor, view: int) -> tuple[Tensor, Tensor, Tensor]:
         """Encode images of one view, an index into ``VIEWS``."""
@@ -116,15 +118,13 @@ class PlaceNet(nn.Module):
         merged = functional.relu(self.lateral[0](at1) + _doubled(merged))
         local = functional.normalize(self.local(merged), dim=1)
         sigma = functional.softplus(self.sigma(merged)) + _MIN_SIGMA
-        return local, sigma, self._place(at4)
-
-    def _place(self, at4: Tensor) -> Tensor:
-        """Pool by the generalised mean (GeM) under a round window about every cell, then apply a linear layer."""
+        # the generalised mean (GeM) under a round window about every cell, then a linear layer
         raised = at4.clamp(min=_MIN_ACTIVATION).pow(self.power)
         down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)
         raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=4 * self.width)
-        return functional.normalize(self.place(raised.clamp(min=1e-12).pow(1.0 / self.power)), dim=1)
+        place = functional.normalize(self.place(raised.clamp(min=1e-12).pow(1.0 / self.power)), dim=1)
+        return local, sigma, place
 
 
 class OneView(nn.Module):
@@ -142,12 +142,6 @@ class OneView(nn.Module):
 
 def _doubled(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-
-
-def _window() -> Tensor:
-    at = torch.arange(-PLACE_REACH, PLACE_REACH + 1, dtype=torch.float32)
-    weight = torch.exp(-0.5 * (at / _PLACE_SIGMA) ** 2)
-    return (weight / weight.sum())[:, None]
 
 
 def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
@@ -170,8 +164,7 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
             )  # fmt: skip
         written.append(path)
     card = card | {"sha256": {path.name: file_sha256(path) for path in written}}
-    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
-    (directory / CARD).write_text(text)
+    (directory / CARD).write_text(json.dumps(card, indent=1, sort_keys=True) + "\n")
     return written
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, get_type_hints
 
 import numpy as np
 
@@ -13,45 +13,6 @@ from coview_stream.sim.kinds import KINDS
 from coview_stream.training.sensors import TRAINED_DIRT, TRAINED_SENSORS
 
 Range = tuple[float, float]
-
-_BOUNDS: dict[str, Range] = {
-    "built": (0.0, 1.0),
-    "submaps": (1, 1000),
-    "rays": (5_000, 2_000_000),
-    "leaf_off": (0.0, 1.0),
-    "standing": (0.0, 1.0),
-    "size": (80.0, 400.0),
-    "changed": (0.0, 0.5),
-    "stems": (20.0, 3000.0),
-    "tree_height": (2.0, 60.0),
-    "crown_width": (0.03, 0.6),
-    "crown_base": (0.0, 0.9),
-    "crown_offset": (0.0, 3.0),
-    "stem_radius": (0.03, 1.0),
-    "mortality": (0.0, 0.5),
-    "dead": (0.0, 0.5),
-    "understory": (0.0, 0.3),
-    "slope": (0.0, 35.0),
-    "roughness": (0.0, 0.5),
-    "wind": (0.0, 1.0),
-    "aerial_porosity": (0.0, 0.95),
-    "ground_porosity": (0.0, 0.95),
-    "leaf_depth": (0.0, 2.0),
-    "pulses": (1.0, 200.0),
-    "altitude": (150.0, 1000.0),
-    "swath": (5.0, 45.0),
-    "strip_shift": (0.0, 1.0),
-    "strip_lift": (0.0, 1.0),
-    "aerial_noise": (0.0, 0.3),
-    "ground_noise": (0.0, 0.3),
-    "sensor_height": (0.3, 5.0),
-    "travel": (0.0, 60.0),
-    "frame_step": (0.1, 5.0),
-    "tilt": (0.0, 20.0),
-    "gravity_error": (0.0, 3.0),
-    "scale_error": (0.0, 0.2),
-    "yaw_walk": (0.0, 2.0),
-}
 
 
 @dataclass(frozen=True)
@@ -105,49 +66,55 @@ class Recipe:
         ConfigError: a value out of its range, or an unknown kind or sensor.
     """
 
-    built: float = 0.25
+    built: Annotated[float, 0.0, 1.0] = 0.25
     kinds: tuple[str, ...] = ("town", "campus", "village", "industrial")
-    size: Range = (160.0, 200.0)
-    submaps: int = 60
-    changed: Range = (0.0, 0.2)
-    stems: Range = (150.0, 1200.0)
-    tree_height: Range = (4.0, 35.0)
-    crown_width: Range = (0.08, 0.5)
-    crown_base: Range = (0.1, 0.75)
-    crown_offset: Range = (0.0, 1.5)
-    stem_radius: Range = (0.05, 0.5)
-    mortality: Range = (0.0, 0.15)
-    dead: Range = (0.0, 0.1)
-    leaf_off: float = 0.2
-    understory: Range = (0.0, 0.1)
-    slope: Range = (0.0, 30.0)
-    roughness: Range = (0.0, 0.15)
-    wind: Range = (0.0, 0.3)
-    aerial_porosity: Range = (0.2, 0.7)
-    ground_porosity: Range = (0.1, 0.6)
-    leaf_depth: Range = (0.05, 0.6)
-    pulses: Range = (5.0, 60.0)
-    altitude: Range = (180.0, 400.0)
-    swath: Range = (12.0, 30.0)
-    strip_shift: Range = (0.0, 0.1)
-    strip_lift: Range = (0.0, 0.05)
-    aerial_noise: Range = (0.02, 0.06)
-    ground_noise: Range = (0.01, 0.04)
+    size: Annotated[Range, 80.0, 400.0] = (160.0, 200.0)
+    submaps: Annotated[int, 1, 1000] = 60
+    changed: Annotated[Range, 0.0, 0.5] = (0.0, 0.2)
+    stems: Annotated[Range, 20.0, 3000.0] = (150.0, 1200.0)
+    tree_height: Annotated[Range, 2.0, 60.0] = (4.0, 35.0)
+    crown_width: Annotated[Range, 0.03, 0.6] = (0.08, 0.5)
+    crown_base: Annotated[Range, 0.0, 0.9] = (0.1, 0.75)
+    crown_offset: Annotated[Range, 0.0, 3.0] = (0.0, 1.5)
+    stem_radius: Annotated[Range, 0.03, 1.0] = (0.05, 0.5)
+    mortality: Annotated[Range, 0.0, 0.5] = (0.0, 0.15)
+    dead: Annotated[Range, 0.0, 0.5] = (0.0, 0.1)
+    leaf_off: Annotated[float, 0.0, 1.0] = 0.2
+    understory: Annotated[Range, 0.0, 0.3] = (0.0, 0.1)
+    slope: Annotated[Range, 0.0, 35.0] = (0.0, 30.0)
+    roughness: Annotated[Range, 0.0, 0.5] = (0.0, 0.15)
+    wind: Annotated[Range, 0.0, 1.0] = (0.0, 0.3)
+    aerial_porosity: Annotated[Range, 0.0, 0.95] = (0.2, 0.7)
+    ground_porosity: Annotated[Range, 0.0, 0.95] = (0.1, 0.6)
+    leaf_depth: Annotated[Range, 0.0, 2.0] = (0.05, 0.6)
+    pulses: Annotated[Range, 1.0, 200.0] = (5.0, 60.0)
+    altitude: Annotated[Range, 150.0, 1000.0] = (180.0, 400.0)
+    swath: Annotated[Range, 5.0, 45.0] = (12.0, 30.0)
+    strip_shift: Annotated[Range, 0.0, 1.0] = (0.0, 0.1)
+    strip_lift: Annotated[Range, 0.0, 1.0] = (0.0, 0.05)
+    aerial_noise: Annotated[Range, 0.0, 0.3] = (0.02, 0.06)
+    ground_noise: Annotated[Range, 0.0, 0.3] = (0.01, 0.04)
     sensors: tuple[str, ...] = ("vlp16", "os64", "mid360", "vlp16-inclined")
-    sensor_height: Range = (0.6, 2.2)
-    travel: Range = (3.0, 25.0)
-    standing: float = 0.2
-    frame_step: Range = (0.7, 2.0)
-    tilt: Range = (0.3, 1.5)
-    gravity_error: Range = (0.0, 0.4)
-    scale_error: Range = (0.0, 0.02)
-    yaw_walk: Range = (0.0, 0.2)
-    rays: int = 160_000
+    sensor_height: Annotated[Range, 0.3, 5.0] = (0.6, 2.2)
+    travel: Annotated[Range, 0.0, 60.0] = (3.0, 25.0)
+    standing: Annotated[float, 0.0, 1.0] = 0.2
+    frame_step: Annotated[Range, 0.1, 5.0] = (0.7, 2.0)
+    tilt: Annotated[Range, 0.0, 20.0] = (0.3, 1.5)
+    gravity_error: Annotated[Range, 0.0, 3.0] = (0.0, 0.4)
+    scale_error: Annotated[Range, 0.0, 0.2] = (0.0, 0.02)
+    yaw_walk: Annotated[Range, 0.0, 2.0] = (0.0, 0.2)
+    rays: Annotated[int, 5_000, 2_000_000] = 160_000
     dirt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, bounds in _BOUNDS.items():
-            _require_within(name, getattr(self, name), bounds)
+        for name, hint in get_type_hints(Recipe, include_extras=True).items():
+            if not hasattr(hint, "__metadata__"):
+                continue
+            (low, high), value = hint.__metadata__, getattr(self, name)
+            ends = (value, value) if hint.__origin__ in (int, float) else tuple(value)
+            if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
+                bounds = f"stay, smallest first, within {low:g} to {high:g}"
+                raise ConfigError(f"{name}: {value!r} is out of range; {bounds}")
         for name, choices in (("kinds", tuple(KINDS)), ("sensors", TRAINED_SENSORS)):
             values = getattr(self, name)
             if not values or not set(values) <= set(choices):
@@ -159,19 +126,6 @@ class Recipe:
         """Draw one value of the range ``name``, evenly."""
         low, high = getattr(self, name)
         return float(rng.uniform(low, high))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, for JSON."""
-        return asdict(self)
-
-
-def _require_within(name: str, value: Any, bounds: Range) -> None:
-    """Refuse a number or range that leaves its bounds."""
-    low, high = bounds
-    single = {field.name for field in fields(Recipe) if field.type in ("int", "float")}
-    ends = (value, value) if name in single else tuple(value)
-    if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
-        raise ConfigError(f"{name}: {value!r} is out of range; stay, smallest first, within {low:g} to {high:g}")
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,9 @@ _GROUP = {"vlp16": 16, "os64": 64, "os64-2048": 64, _ROTATING: 16}  # beams fire
 
 def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
     """Make a sensor by its name; ``stride`` maps its number of beams to n: only every n-th column is cast."""
-    sensor = _inclined() if name == _ROTATING else SENSORS[name]()
+    sensor = SENSORS["vlp16" if name == _ROTATING else name]()
+    if name == _ROTATING:
+        sensor = Sensor(name, _rotating(sensor.beams(0)), sensor.min_range, sensor.max_range)
     nth = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
     if nth == 1:
         return sensor
@@ -52,20 +54,18 @@ def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sen
     return Sensor(name, thinned, sensor.min_range, sensor.max_range)
 
 
-def _inclined() -> Sensor:
-    upright = SENSORS["vlp16"]()
-    rays = upright.beams(0)
+def _rotating(rays: Floats) -> Callable[[int], Floats]:
+    """Incline the rays (N, 3) of one frame, and turn them about the vertical meanwhile."""
     c, s = np.cos(INCLINATION), np.sin(INCLINATION)
-    leaning = rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    x, y, z = (rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])).T
     within = np.arange(len(rays)) // (len(rays) // _COLUMNS) / _COLUMNS
 
     def beams(frame: int) -> Floats:
         angle = 2 * np.pi * TURNS * FRAME_PERIOD * (frame + within)
         c, s = np.cos(angle), np.sin(angle)
-        x, y, z = leaning.T
         return np.column_stack([c * x - s * y, s * x + c * y, z])
 
-    return Sensor(_ROTATING, beams, upright.min_range, upright.max_range)
+    return beams
 
 
 TRAINED_DIRT = ("mounting", "beams", "grass")

@@ -22,7 +22,6 @@ from coview_stream.training.sensors import TRAINED_DIRT
 from coview_stream.training.worlds import WorldViews, read_world, write_dataset
 from coview_stream.version import __version__
 
-# set by hand
 _REPORT_STEPS = 20  # from one line of progress to the next
 _CALIBRATED = 120  # queries from which the ranges of the quantised network are taken
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
@@ -130,7 +129,7 @@ def train_session(
     )
     worlds = [read_world(path) for path in paths]
     for path, world in zip(paths, worlds, strict=True):
-        if world.recipe["recipe"] != json.loads(json.dumps(plan.recipe.to_dict())):
+        if world.recipe["recipe"] != json.loads(json.dumps(asdict(plan.recipe))):
             raise InputError(f"{path}: a world of another recipe; choose another folder, or delete it")
     history: list[list[float]] = []
 
@@ -147,7 +146,7 @@ def train_session(
         "version": __version__,
         "torch": str(torch.__version__),
         "plan": asdict(plan),
-        "data_sha256": _digest(paths[: plan.worlds]),
+        "data_sha256": _digest(worlds[: plan.worlds]),
         "threads": int(torch.get_num_threads()),
         "parameters": sum(p.numel() for p in net.parameters()),
         "loss": {"first": history[0][0], "last": float(np.mean([row[0] for row in history[-_REPORT_STEPS:]]))}
@@ -178,17 +177,14 @@ def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries
     return result
 
 
-def _digest(paths: Sequence[Path]) -> str:
+def _digest(worlds: Sequence[WorldViews]) -> str:
     """Return the hash of the worlds' arrays: the files themselves differ with the compression's version."""
     total = hashlib.sha256()
-    for path in paths:
-        world = read_world(path)
+    for world in worlds:
         for array in (world.aerial, world.queries, world.poses):
             total.update(np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
 
-
-# all set by hand
 
 HEADINGS = 36
 """Headings that the dense search tries."""
@@ -235,7 +231,8 @@ def search_queries(
     yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     results = []
     for number, world in enumerate(worlds):
-        features, _ = downsample(aerial(_cropped(world.aerial)).local)
+        rows, columns = (n // 8 * 8 for n in world.aerial.shape[1:])  # whole cells of 4 m
+        features, _ = downsample(aerial(world.aerial[:, :rows, :columns]).local)
         index = FeatureIndex(features, world.corner, _CELL)
         for k in range(len(world.queries))[:max_queries]:
             query = ground(world.queries[k])
@@ -267,8 +264,3 @@ def best_places(volume: Floats32, yaws: Floats, corner: Floats) -> tuple[Floats,
         scores.append(float(top[row, column]))
         top = np.where(np.hypot(rows - row, columns - column) * _CELL < _DISTINCT, -np.inf, top)
     return np.array(places), np.array(scores)
-
-
-def _cropped(image: Image) -> Image:
-    """Crop an image to whole cells of 4 m."""
-    return image[:, : image.shape[1] // 8 * 8, : image.shape[2] // 8 * 8]

@@ -9,7 +9,7 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, copies, cylinder, ellipsoid, join
-from coview_stream.training.trees import FAMILIES, Terrain, Trees, waves
+from coview_stream.training.trees import Terrain, Trees, waves
 
 
 class MeshCopies(NamedTuple):
@@ -62,12 +62,11 @@ _MAX_CLUMPS = 110_000  # in a stand
 
 def crowns(rng: np.random.Generator, trees: Trees) -> list[MeshCopies]:
     """Draw the leaves of all trees, each of its own family."""
-    draw = (_lumpy, _cone, _storeys, _umbrella, _clumps, _column)
     parts: list[MeshCopies] = []
-    for family, name in enumerate(FAMILIES):
+    for family, draw in enumerate((_lumpy, _cone, _storeys, _umbrella, _clumps, _column)):  # in the order of FAMILIES
         of = np.flatnonzero(trees.family == family)
         if len(of):
-            parts += draw[FAMILIES.index(name)](rng, trees, of)
+            parts += draw(rng, trees, of)
     return parts
 
 
@@ -76,18 +75,13 @@ def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]
     semi = np.column_stack([wide, wide, depth])
     rough = rng.uniform(0.05, 0.25)
     parts = [scaled_copies(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, rough, of)]
-    for _ in range(int(rng.integers(0, 5))):
-        parts.append(_lump(rng, trees, of, semi, rough))
+    for _ in range(int(rng.integers(0, 5))):  # boughs off the middle
+        share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
+        centre = trees.crown_axis(trees.base[of] + depth * rng.uniform(0.5, 1.5, len(of)), of)
+        out = 0.7 * wide * rng.uniform(0.6, 1.2, len(of))
+        centre[:, :2] += out[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        parts.append(scaled_copies(rng, _LUMP, centre, semi * share[:, None], rough, of))
     return parts
-
-
-def _lump(rng: np.random.Generator, trees: Trees, of: Ints, semi: Floats, rough: float) -> MeshCopies:
-    """Draw one bough off the middle of each crown."""
-    share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
-    centre = trees.crown_axis(trees.base[of] + semi[:, 2] * rng.uniform(0.5, 1.5, len(of)), of)
-    out = 0.7 * semi[:, 0] * rng.uniform(0.6, 1.2, len(of))
-    centre[:, :2] += out[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    return scaled_copies(rng, _LUMP, centre, semi * share[:, None], rough, of)
 
 
 def _cone(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
@@ -167,20 +161,6 @@ def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> MeshCo
     return scaled_copies(rng, _BUSH, centre, semi, 0.2, np.arange(count))
 
 
-def leafy(trees: Trees, winter: bool) -> Bools:
-    """Mask (N,) the trees that have leaves."""
-    return ~trees.dead & (trees.evergreen | (not winter))
-
-
-def _tube(sides: int) -> Mesh:
-    """Make the triangles of a tube of two rings, closed at its far end."""
-    i = np.arange(sides)
-    j = (i + 1) % sides
-    side = [np.column_stack([i, j, j + sides]), np.column_stack([i, j + sides, i + sides])]
-    cap = np.column_stack([np.full(sides - 2, sides), i[1:-1] + sides, i[2:] + sides])
-    return Mesh(np.zeros((2 * sides, 3)), np.concatenate([*side, cap]))
-
-
 def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, owner: Ints) -> MeshCopies:
     """Make tubes between (M, 3) points, their radius falling from ``radius`` to ``top`` (M,), metres."""
     axis = end - begin
@@ -192,7 +172,12 @@ def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, o
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
     low, high = begin[:, None] + ring * radius[:, None, None], end[:, None] + ring * top[:, None, None]
-    return MeshCopies(_tube(sides), np.concatenate([low, high], axis=1), owner)
+    i = np.arange(sides)
+    j = (i + 1) % sides
+    side = [np.column_stack([i, j, j + sides]), np.column_stack([i, j + sides, i + sides])]
+    cap = np.column_stack([np.full(sides - 2, sides), i[1:-1] + sides, i[2:] + sides])  # the far end is closed
+    template = Mesh(np.zeros((2 * sides, 3)), np.concatenate([*side, cap]))
+    return MeshCopies(template, np.concatenate([low, high], axis=1), owner)
 
 
 def stems(trees: Trees) -> MeshCopies:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
-from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
+from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, height_field
 from coview_stream.training.recipe import Recipe
 
@@ -49,8 +49,8 @@ class Terrain:
         shortness = rng.uniform(0.7, 1.6)  # exponent by which longer waves are higher
         for wavelength in (220.0, 110.0, 55.0, 27.0):
             z += wavelength**shortness * rng.uniform(0.2, 1.0) * waves(rng, wavelength, 5)(X, Y)
-        z = tilted + (1 - share) * z / np.quantile(_slopes(z), 0.95)
-        z *= np.tan(np.radians(slope)) / max(float(np.quantile(_slopes(z), 0.95)), 1e-6)
+        z = tilted + (1 - share) * z / _steepness(z)
+        z *= np.tan(np.radians(slope)) / max(_steepness(z), 1e-6)
         bumps = gaussian_filter(rng.normal(size=X.shape), rng.uniform(1.0, 3.0))
         self._heights: Floats = z - z.mean() + roughness * bumps / bumps.std()
 
@@ -70,9 +70,9 @@ class Terrain:
         return height_field(self._axis, self._heights)
 
 
-def _slopes(z: Floats) -> Floats:
-    dx, dy = np.gradient(z, _STEP)
-    return np.asarray(np.hypot(dx, dy))
+def _steepness(z: Floats) -> float:
+    """Return the slope that is exceeded on 5 % of a grid."""
+    return float(np.quantile(np.hypot(*np.gradient(z, _STEP)), 0.95))
 
 
 FAMILIES = ("lumpy", "cone", "storeys", "umbrella", "clumps", "column")
@@ -85,15 +85,7 @@ _MIN_SPACING = 0.8  # metres between two stems
 
 
 class Species(NamedTuple):
-    """A tree species of a stand.
-
-    Attributes:
-        family: shape of its crowns, one of ``FAMILIES``.
-        width: crown diameter, in shares of the height.
-        base: height of the lowest leaves, in shares of the height.
-        thick: stem radius, in shares of the height.
-        evergreen: whether it keeps its leaves in winter.
-    """
+    """Tree species: family of its crowns; crown diameter, lowest leaves and stem radius in shares of the height."""
 
     family: str
     width: float
@@ -159,7 +151,12 @@ def draw_species(rng: np.random.Generator, recipe: Recipe) -> list[Species]:
 def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: Floats, species: list[Species]) -> Trees:
     """Draw the sizes of trees that stand at (N, 2)."""
     count = len(xy)
-    kind = _species_of(rng, xy, len(species))
+    # species grow in patches, or mixed
+    scores = [
+        waves(rng, rng.uniform(30, 100))(*xy.T) * rng.uniform(0, 2) + rng.gumbel(size=count) + rng.normal()
+        for _ in species
+    ]
+    kind = np.argmax(np.array(scores), axis=0)
     height = _heights(rng, recipe, xy)
     pick = {name: np.array([getattr(sort, name) for sort in species])[kind] for name in Species._fields}
     crown = _crowns(rng, recipe, pick["width"], height, (2 * terrain.half) ** 2)
@@ -194,15 +191,6 @@ def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Flo
     return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
 
 
-def _species_of(rng: np.random.Generator, xy: Floats, kinds: int) -> Indices:
-    """Draw the species (N,) by index: in patches, or mixed."""
-    scores = [
-        waves(rng, rng.uniform(30, 100))(*xy.T) * rng.uniform(0, 2) + rng.gumbel(size=len(xy)) + rng.normal()
-        for _ in range(kinds)
-    ]
-    return np.asarray(np.argmax(np.array(scores), axis=0))
-
-
 def _heights(rng: np.random.Generator, recipe: Recipe, xy: Floats) -> Floats:
     low, high = recipe.tree_height
     mean = rng.uniform(low + 0.05 * (high - low), low + 0.9 * (high - low))
@@ -218,7 +206,14 @@ def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half:
     count = int(per_hectare * area / 1e4)
     spacing = np.sqrt(1e4 / per_hectare)
     if pattern == "rows":
-        return _rows(rng, spacing, half)
+        stretch = rng.uniform(1.0, 1.6)
+        across, along = spacing * np.sqrt(stretch), spacing / np.sqrt(stretch)
+        u, v = np.arange(-1.5 * half, 1.5 * half, across), np.arange(-1.5 * half, 1.5 * half, along)
+        xy = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        xy = xy + rng.normal(0, rng.uniform(0.05, 0.2) * along, xy.shape)
+        yaw = rng.uniform(0, np.pi)
+        xy = xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        return np.asarray(xy[(np.abs(xy) < half).all(axis=1) & (rng.random(len(xy)) > rng.uniform(0, 0.25))])
     if pattern == "clustered":
         per = rng.uniform(3, 15)
         parents = rng.uniform(-half, half, (max(1, int(count / per)), 2))
@@ -227,18 +222,6 @@ def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half:
     dense = rng.uniform(-half, half, (int(1.6 * count) if pattern == "hard-core" else count, 2))
     apart = rng.uniform(0.45, 0.7) * spacing if pattern == "hard-core" else _MIN_SPACING
     return dense[_spaced(rng, dense, apart)][:count]
-
-
-def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
-    stretch = rng.uniform(1.0, 1.6)
-    across, along = spacing * np.sqrt(stretch), spacing / np.sqrt(stretch)
-    u, v = np.arange(-1.5 * half, 1.5 * half, across), np.arange(-1.5 * half, 1.5 * half, along)
-    xy = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    xy = xy + rng.normal(0, rng.uniform(0.05, 0.2) * along, xy.shape)
-    yaw = rng.uniform(0, np.pi)
-    xy = xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    kept = (np.abs(xy) < half).all(axis=1) & (rng.random(len(xy)) > rng.uniform(0, 0.25))
-    return np.asarray(xy[kept])
 
 
 def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
@@ -260,19 +243,11 @@ def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
         middle, radii = rng.uniform(-half, half, 2), rng.uniform(4, 16, 2)
         keep &= ((xy - middle) ** 2 / radii**2).sum(axis=1) > 1
     if rng.random() < 0.7:
-        keep &= _distance_to(xy, _trail(rng, half)) > rng.uniform(1.0, 2.5)
+        along = np.arange(-1.5 * half, 1.5 * half, 1.0)
+        sideways = rng.uniform(-0.4, 0.4) * half
+        sideways = sideways + rng.uniform(0, 12) * waves(rng, rng.uniform(60, 140))(along, np.zeros_like(along))
+        yaw = rng.uniform(0, 2 * np.pi)
+        c, s = np.cos(yaw), np.sin(yaw)
+        trail = np.column_stack([along, sideways]) @ np.array([[c, s], [-s, c]])
+        keep &= cKDTree(trail).query(xy)[0] > rng.uniform(1.0, 2.5)
     return keep
-
-
-def _trail(rng: np.random.Generator, half: float) -> Floats:
-    along = np.arange(-1.5 * half, 1.5 * half, 1.0)
-    sideways = rng.uniform(-0.4, 0.4) * half + rng.uniform(0, 12) * waves(rng, rng.uniform(60, 140))(
-        along, np.zeros_like(along)
-    )
-    yaw = rng.uniform(0, 2 * np.pi)
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.asarray(np.column_stack([along, sideways]) @ np.array([[c, s], [-s, c]]))
-
-
-def _distance_to(xy: Floats, line: Floats) -> Floats:
-    return np.asarray(cKDTree(line).query(xy)[0])

@@ -8,7 +8,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -60,29 +60,21 @@ class World:
 
 
 def draw_world(seed: int, recipe: Recipe) -> World:
-    """Draw the world of a seed.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """Draw the world of a seed."""
     rng = np.random.default_rng([seed, _PLACE])
     size = 4.0 * round(recipe.draw(rng, "size") / 4.0)
-    if rng.random() < recipe.built:
-        return _built(rng, seed, recipe, size)
-    stand = draw_stand(rng, recipe, size / 2 + _BEYOND)
-    return World(
-        size=size,
-        kind=tags(stand.drawn),
-        mapped=stand.mapped,
-        now=stand.now,
-        ground=stand.terrain.z,
-        span=stand.terrain.span,
-        path=lambda rng, extent, length: between_trees(rng, stand.obstacles, extent, length),
-        drawn=stand.drawn,
-    )
-
-
-def _built(rng: np.random.Generator, seed: int, recipe: Recipe, size: float) -> World:
+    if rng.random() >= recipe.built:
+        stand = draw_stand(rng, recipe, size / 2 + _BEYOND)
+        return World(
+            size=size,
+            kind=tags(stand.drawn),
+            mapped=stand.mapped,
+            now=stand.now,
+            ground=stand.terrain.z,
+            span=stand.terrain.span,
+            path=lambda rng, extent, length: between_trees(rng, stand.obstacles, extent, length),
+            drawn=stand.drawn,
+        )
     kind, changed = str(rng.choice(recipe.kinds)), recipe.draw(rng, "changed")
     scene = build_scene(kind, seed, size, changed)
     axis: Floats = np.linspace(-size / 2, size / 2, 50)
@@ -102,17 +94,8 @@ def _built(rng: np.random.Generator, seed: int, recipe: Recipe, size: float) -> 
 def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str, float]]:
     """Scan the map from the air: (N, 3) float32 metres, one point per voxel, and the values drawn for the flight."""
     rng = np.random.default_rng([seed, _FLIGHT])
-    names = (
-        "pulses",
-        "altitude",
-        "swath",
-        "aerial_noise",
-        "aerial_porosity",
-        "leaf_depth",
-        "strip_shift",
-        "strip_lift",
-    )
-    drawn = {name: recipe.draw(rng, name) for name in names}
+    names = "pulses altitude swath aerial_noise aerial_porosity leaf_depth strip_shift strip_lift"
+    drawn = {name: recipe.draw(rng, name) for name in names.split()}
     swath = float(np.radians(drawn["swath"]))
     relief = max(abs(end) for end in world.span) + 30.0
     flight = Flight(
@@ -184,11 +167,7 @@ class WorldViews:
 
 
 def world_views(seed: int, recipe: Recipe) -> WorldViews:
-    """Draw the world of a seed, and its views.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """Draw the world of a seed, and its views."""
     world = draw_world(seed, recipe)
     base, flight = base_scan(world, seed, recipe)
     cells, corner = round(world.size / CELL), np.full(2, -world.size / 2)
@@ -202,7 +181,7 @@ def world_views(seed: int, recipe: Recipe) -> WorldViews:
         sensor=np.array([sensor for sensor, _ in driven]),
         kind=world.kind,
         travelled=np.array([submap.travelled for _, submap in driven]),
-        recipe={"seed": seed, "recipe": recipe.to_dict(), "world": world.drawn, "flight": flight},
+        recipe={"seed": seed, "recipe": asdict(recipe), "world": world.drawn, "flight": flight},
     )
 
 
@@ -210,13 +189,12 @@ def write_world(path: str | os.PathLike[str], seed: int, recipe: Recipe) -> None
     """Write the world of a seed; the file is complete or not there.
 
     Raises:
-        InputError: the file cannot be written.
-        DependencyError: Open3D cannot be loaded.
+        InputError: the file cannot be written. DependencyError: Open3D cannot be loaded.
     """
-    path, views = Path(path), world_views(seed, recipe)
+    views = world_views(seed, recipe)
     fields = {name: getattr(views, name) for name in _KEYS} | {"recipe": json.dumps(views.recipe)}
     try:
-        with atomic_file(path) as file:
+        with atomic_file(Path(path)) as file:
             np.savez_compressed(file, **fields)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another directory") from error
@@ -244,21 +222,12 @@ def write_dataset(
     workers: int = 1,
     progress: Callable[[int, float], None] | None = None,
 ) -> list[Path]:
-    """Write ``SEED.npz`` for each seed into a directory; existing files stay.
+    """Write ``SEED.npz`` for each seed into a directory, and return the files in that order; existing files stay.
 
-    Args:
-        directory: created if it is missing.
-        seeds: of the worlds.
-        recipe: ranges to draw from.
-        workers: processes.
-        progress: called with the seed and the seconds it took, when a file is ready.
-
-    Returns:
-        The files, in the order of the seeds.
+    ``progress`` is called with the seed and the seconds it took, when one of the processes has written a file.
 
     Raises:
-        InputError: the directory or a file cannot be written.
-        DependencyError: Open3D cannot be loaded.
+        InputError: the directory or a file cannot be written. DependencyError: Open3D cannot be loaded.
     """
     directory = Path(directory)
     try:

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 
 import numpy as np
@@ -159,7 +159,7 @@ def test_world_files_round_trip(tmp_path) -> None:
     np.testing.assert_array_equal(views.aerial, small_views().aerial)
     assert views.kind.startswith("forest")
     assert views.recipe["seed"] == 3
-    assert views.recipe["recipe"] == json.loads(json.dumps(recipe.to_dict()))
+    assert views.recipe["recipe"] == json.loads(json.dumps(asdict(recipe)))
     write_dataset(tmp_path / "views", [3], recipe, 1, lambda seed, seconds: told.append(seed))
     assert told == [3]
     assert not list((tmp_path / "views").glob("*.part"))
