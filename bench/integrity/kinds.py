@@ -132,7 +132,7 @@ def _from_tripods(scene: Scene, caster: Caster, rng: np.random.Generator) -> Flo
         rays = rng.normal(size=(_RAYS, 3))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         origin = np.array([x, y, 1.6])
-        t = caster.cast(np.tile(origin, (_RAYS, 1)).astype(np.float32), rays.astype(np.float32), rng, 0.0).distance
+        t = caster.trace(np.tile(origin, (_RAYS, 1)).astype(np.float32), rays.astype(np.float32), rng, 0.0).distance
         if np.mean(t[rays[:, 2] > 0.2] < _REACH) > 0.95:  # below the ceiling
             near = t < _REACH
             far = t[near].astype(np.float64) + rng.normal(0, _NOISE, int(near.sum()))

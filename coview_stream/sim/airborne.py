@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from coview_stream.clouds.filters import voxel_grid
 from coview_stream.config.checks import within
 from coview_stream.errors import InputError
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Reals
+from coview_stream.geometry.arrays import Bools, Floats, Indices, Reals
 from coview_stream.sim.sensors import MeshCaster
 
 ALTITUDE = 250.0
@@ -107,22 +107,13 @@ def _strip(
         # pulses whose target cannot be on the map are not worth casting
         target = origins[:, :2] + ray[:, :2] / -ray[:, 2:] * flight.altitude
         near = (np.abs(target) < half + flight.margin).all(axis=1)
-        points.append(_returns(caster, origins[near], ray[near], half, rng, flight))
+        origins, ray = origins[near], ray[near]
+        hits = caster.trace(origins.astype(np.float32), ray.astype(np.float32), rng, flight.porosity)
+        hit = np.isfinite(hits.distance)
+        t = hits.distance[hit].astype(np.float64) + rng.normal(0, flight.noise, int(hit.sum()))
+        met = origins[hit] + ray[hit] * t[:, None]
+        points.append(met[(np.abs(met[:, :2]) < half).all(axis=1)])
     return np.concatenate(points) if points else np.zeros((0, 3))
-
-
-def _returns(
-    caster: MeshCaster, origins: Floats, rays: Floats, half: float, rng: np.random.Generator, flight: Flight
-) -> Floats:
-    t = caster.trace(_single(origins), _single(rays), rng, flight.porosity).distance.astype(np.float64)
-    hit = np.isfinite(t)
-    t = t[hit] + rng.normal(0, flight.noise, int(hit.sum()))
-    points = origins[hit] + rays[hit] * t[:, None]
-    return np.asarray(points[(np.abs(points[:, :2]) < half).all(axis=1)])
-
-
-def _single(values: Floats) -> Floats32:
-    return values.astype(np.float32)
 
 
 _CROSSING = np.radians((75.0, 105.0))  # between the two flight directions
@@ -228,16 +219,11 @@ def surface_of(points: Floats) -> Surface:
     at = tree.query(points)[1]
     sample = points[:: max(1, len(points) // 20_000)]
     spacing = float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
-    return Surface(foliage[at], _below_edge(points, (upright & ~foliage)[at]), spacing)
-
-
-def _below_edge(points: Floats, upright: Bools) -> Bools:
-    """Tell of each point whether it is upright and has more of its kind above it than a top edge is high."""
-    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / _COLUMN).astype(np.int64)
-    column = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    top = np.full(int(column.max()) + 1, -np.inf)
-    np.maximum.at(top, column[upright], points[upright, 2])
-    return np.asarray(upright & (points[:, 2] < top[column] - _TOP))
+    wall = (upright & ~foliage)[at]
+    column, count = _cells(points[:, :2], _COLUMN)
+    top = np.full(count, -np.inf)
+    np.maximum.at(top, column[wall], points[wall, 2])
+    return Surface(foliage[at], wall & (points[:, 2] < top[column] - _TOP), spacing)
 
 
 def _survey_lines(size: Floats, survey: Survey, rng: np.random.Generator) -> Iterator[tuple[Floats, float, float]]:

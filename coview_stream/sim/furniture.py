@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.geometry.arrays import Floats
 from coview_stream.sim.layout import Layout, Site, directions
 from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, join, placed
 
@@ -32,16 +32,12 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
             rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
     places = np.concatenate(rows)
     clear = tree.query(places[:, :2])[0] > 0.8 * offset
-    return np.asarray(rng.permutation(places[clear & _leaves_lane_free(places, layout.route)]))
-
-
-def _leaves_lane_free(rows: Floats, route: Floats) -> Bools:
-    """Tell (N,) where a parked vehicle, both its ends included, leaves the robot's lane free."""
-    tree = cKDTree(route)
-    reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
-    along = reach * np.column_stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])])
-    ends = np.stack([rows[:, :2] - along, rows[:, :2] - along / 2, rows[:, :2] + along / 2, rows[:, :2] + along])
-    return np.asarray((tree.query(ends)[0] > _MIN_CLEARANCE).all(axis=0))
+    # a parked vehicle, both its ends included, leaves the robot's lane free
+    reach = np.where(places[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
+    along = reach * np.column_stack([np.cos(places[:, 2]), np.sin(places[:, 2])])
+    ends = places[:, :2] + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], along)
+    clear &= (cKDTree(layout.route).query(ends)[0] > _MIN_CLEARANCE).all(axis=0)
+    return np.asarray(rng.permutation(places[clear]))
 
 
 def cars(rows: Floats, site: Site) -> Mesh:

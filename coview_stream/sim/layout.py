@@ -94,16 +94,12 @@ def loop_layout(
     for start in rng.permutation(branches):
         at = int((start + rng.uniform(0.1, 0.9)) / branches * (len(route) - 1))
         outward = directions(route)[at] - np.pi / 2  # the loop runs counter-clockwise
-        streets.append(_inside(_wander(rng, route[at], outward, 2 * half), half))
+        heading = outward + np.cumsum(rng.normal(0, 0.02, int(2 * half / _STREET_STEP)))
+        steps = _STREET_STEP * np.column_stack([np.cos(heading), np.sin(heading)])
+        streets.append(_inside(route[at] + np.cumsum(steps, axis=0), half))
     a, b = rng.integers(0, len(route) // 3), rng.integers(len(route) // 2, 5 * len(route) // 6)
     streets.append(resample(route[[a, b]], _STREET_STEP))
     return Layout(route, tuple(line for line in streets if len(line) > 10), half_width)
-
-
-def _wander(rng: np.random.Generator, start: Floats, heading: float, length: float) -> Floats:
-    turns = np.cumsum(rng.normal(0, 0.02, int(length / _STREET_STEP)))
-    step = _STREET_STEP * np.column_stack([np.cos(heading + turns), np.sin(heading + turns)])
-    return np.asarray(start + np.cumsum(step, axis=0))
 
 
 def _street_lines(rng: np.random.Generator, half: float, spacing: tuple[float, float]) -> Floats:
@@ -153,22 +149,26 @@ class Site:
     ) -> None:
         self.half = half
         self.layout = layout
-        self._taken, self._road = _rasters(layout, half)
+        n = int(2 * half / _CELL) + 1
+        centre = np.ones((n, n), dtype=bool)
+        for line in (layout.route, *layout.streets):
+            i, j = np.clip(((line + half) / _CELL).astype(np.intp), 0, n - 1).T
+            centre[i, j] = False
+        # each cell's distance to a street's centre, metres, and the occupied cells: at first the streets
+        self._road: Floats32 = (distance_transform_edt(centre) * _CELL).astype(np.float32)
+        self._taken: Bools = self._road < layout.half_width
         step = max(1.0, half / 180.0)
         self._axis: Floats = np.linspace(-half, half, 2 * int(half / step) + 1, dtype=np.float64)
-        self._heights = self._relief(rng, relief, roughness, ditch)
-
-    def _relief(self, rng: np.random.Generator, relief: float, roughness: float, ditch: float) -> Floats:
         X, Y = np.meshgrid(self._axis, self._axis, indexing="ij")
         z = np.zeros_like(X)
         for wavelength, share in ((230.0, 1.0), (140.0, 0.6), (70.0, 0.2), (35.0, 0.06)):
             heading, phase = rng.uniform(0, 2 * np.pi, 2)
             along = X * np.cos(heading) + Y * np.sin(heading)
             z += share * relief * np.sin(2 * np.pi * along / wavelength + phase)
-        off_road = self.road_distance(X.ravel(), Y.ravel()).reshape(X.shape) - self.layout.half_width
+        off_road = self.road_distance(X.ravel(), Y.ravel()).reshape(X.shape) - layout.half_width
         bumps = gaussian_filter(rng.normal(size=X.shape), 2.0)
         z += roughness * bumps / bumps.std() * np.clip(off_road / 3.0, 0.0, 1.0)
-        return np.asarray(z - ditch * np.exp(-(((off_road - 1.5) / 0.9) ** 2)))
+        self._heights: Floats = z - ditch * np.exp(-(((off_road - 1.5) / 0.9) ** 2))
 
     def z(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
         """Return the height of the ground at (N,) coordinates, metres."""
@@ -210,14 +210,3 @@ class Site:
         last = len(self._taken) - 1
         i, j = (np.clip(((a + self.half) / _CELL).astype(np.intp), 0, last) for a in (x, y))
         return i, j
-
-
-def _rasters(layout: Layout, half: float) -> tuple[Bools, Floats32]:
-    """Return the occupied cells (at first the streets) and each cell's distance to a street's centre, metres."""
-    n = int(2 * half / _CELL) + 1
-    centre = np.ones((n, n), dtype=bool)
-    for line in (layout.route, *layout.streets):
-        i, j = np.clip(((line + half) / _CELL).astype(np.intp), 0, n - 1).T
-        centre[i, j] = False
-    road = (distance_transform_edt(centre) * _CELL).astype(np.float32)
-    return road < layout.half_width, road

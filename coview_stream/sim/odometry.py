@@ -63,29 +63,20 @@ def drive(scene: Scene, length: float, speed: float, height: float, rng: np.rand
     sideways = _WANDER * np.sin(2 * np.pi * at / rng.uniform(25, 45) + rng.uniform(0, 2 * np.pi))
     x = np.interp(at, arc, route[:, 0]) - sideways * np.sin(heading)
     y = np.interp(at, arc, route[:, 1]) + sideways * np.cos(heading)
-    tilts = _slopes(scene, x, y, heading) + _sway(rng, count)
+    # roll and pitch of the ground under the wheels, and sway
+    cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
+    ahead = scene.site.z(x + cx, y + cy) - scene.site.z(x - cx, y - cy)
+    left = scene.site.z(x - cy, y + cx) - scene.site.z(x + cy, y - cx)
+    fresh = rng.normal(size=(count, 2)) * _SWAY * np.sqrt(1 - _SWAY_MEMORY**2)
+    sway = np.zeros((count, 2))
+    for k in range(1, count):
+        sway[k] = _SWAY_MEMORY * sway[k - 1] + fresh[k]
+    tilts = np.arctan2(np.column_stack([left, -ahead]), _WHEELBASE) + sway
     poses = np.tile(np.eye(4), (count, 1, 1))
     angles = np.column_stack([heading, tilts[:, 1], tilts[:, 0]])
     poses[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
     poses[:, :3, 3] = np.column_stack([x, y, scene.site.z(x, y) + height])
     return poses
-
-
-def _slopes(scene: Scene, x: Floats, y: Floats, heading: Floats) -> Floats:
-    """Return (N, 2) roll and pitch of the ground under the wheels, radians."""
-    cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
-    site = scene.site
-    rise_ahead = site.z(x + cx, y + cy) - site.z(x - cx, y - cy)
-    rise_left = site.z(x - cy, y + cx) - site.z(x + cy, y - cx)
-    return np.arctan2(np.column_stack([rise_left, -rise_ahead]), _WHEELBASE)
-
-
-def _sway(rng: np.random.Generator, count: int) -> Floats:
-    fresh = rng.normal(size=(count, 2)) * _SWAY * np.sqrt(1 - _SWAY_MEMORY**2)
-    sway = np.zeros((count, 2))
-    for k in range(1, count):
-        sway[k] = _SWAY_MEMORY * sway[k - 1] + fresh[k]
-    return sway
 
 
 def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random.Generator) -> Floats:
@@ -105,11 +96,8 @@ def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random
     turns = np.stack([rot_z(angle) for angle in yaw])
     moved = np.einsum("nij,nj->ni", turns[:-1], steps) * scale + noise
     T_odom_body = np.tile(np.eye(4), (count, 1, 1))
-    T_odom_body[:, :3, :3] = turns @ T_map_body[:, :3, :3] @ _small_tilts(tilts)
+    # too small for the order of roll and pitch to matter
+    tilted = Rotation.from_rotvec(np.column_stack([tilts, np.zeros(count)])).as_matrix()
+    T_odom_body[:, :3, :3] = turns @ T_map_body[:, :3, :3] @ tilted
     T_odom_body[:, :3, 3] = origin + np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
     return T_odom_body
-
-
-def _small_tilts(tilts: Floats) -> Floats:
-    """Return (N, 3, 3) rotations by (N, 2) roll and pitch angles, too small for their order to matter."""
-    return np.asarray(Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix())

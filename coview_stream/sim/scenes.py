@@ -29,16 +29,16 @@ _GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
 
 @dataclass(frozen=True)
 class Footprint:
-    """Footprint of a building, scene frame.
+    """Footprint of a building, scene frame, metres.
 
     Attributes:
-        x: centre, metres.
-        y: centre, metres.
-        w: frontage, metres.
-        d: depth, metres.
+        x: centre.
+        y: centre.
+        w: frontage.
+        d: depth.
         yaw: heading, radians.
-        ground: height of the ground, metres.
-        top: height of the ridge, metres.
+        ground: height of the ground.
+        top: height of the ridge.
     """
 
     x: float
@@ -52,12 +52,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Scene at one time.
-
-    Attributes:
-        solid: surfaces that stop every ray.
-        foliage: surfaces that let some rays pass.
-    """
+    """Scene at one time: solid surfaces stop every ray, foliage lets some rays pass."""
 
     solid: Mesh
     foliage: Mesh
@@ -122,12 +117,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Movable:
-    """Objects of one sort that may change between the two states.
-
-    Attributes:
-        rows: one per object when the map was made.
-        spares: objects that replace changed ones.
-    """
+    """Objects of one sort: ``rows`` when the map was made, and ``spares`` that replace some of them now."""
 
     rows: Floats
     spares: Floats
@@ -154,20 +144,21 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     layout = spec.streets(rng[_GROUND], size, half)
     site = Site(rng[_GROUND], layout, half, relief=spec.relief, roughness=spec.roughness, ditch=spec.ditch)
     footprints, houses, built = _buildings(rng[_BUILT], site, spec)
-    fixed, bushes = _greenery(rng[_GREEN], site, spec)
+    area, extent = (2 * site.half) ** 2, site.half - 2.0
+    rocks = vegetation.rocks(rng[_GREEN], site, int(spec.rocks * area), extent)
+    logs = vegetation.logs(rng[_GREEN], site, int(spec.logs * area), extent)
+    bushes = vegetation.undergrowth(rng[_GREEN], site, int(spec.undergrowth * area), extent)
     cars, poles = _street_furniture(rng[_STREET], site, spec)
     trees = _trees(rng[_GREEN], rng[_SPARE], site, spec, changed)
 
     def parts(pick: Callable[[_Movable], Floats]) -> Parts:
-        rows, standing = pick(trees), (tuple(built), tuple(fixed), tuple(bushes))
-        return Parts(site.mesh(), *standing, rows, pick(cars), pick(poles))
+        return Parts(site.mesh(), tuple(built), (rocks, logs), (bushes,), pick(trees), pick(cars), pick(poles))
 
     before = parts(lambda movable: movable.rows)
     after = parts(lambda movable: movable.now(rng[_SPARE], changed)) if changed else before
     mapped = before.state(site)
     now = after.state(site) if changed else mapped
-    drawn = (tuple(footprints), (before, after), tuple(houses))
-    return Scene(kind, size, mapped, now, site, layout.route, *drawn)
+    return Scene(kind, size, mapped, now, site, layout.route, tuple(footprints), (before, after), tuple(houses))
 
 
 def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[int], list[Mesh]]:
@@ -241,16 +232,6 @@ def _draw_plot(rng: np.random.Generator, spec: Kind) -> tuple[Plot, float, float
     weights = np.array([plot.weight for plot in spec.plots])
     plot = spec.plots[int(rng.choice(len(weights), p=weights / weights.sum()))]
     return plot, rng.uniform(*plot.frontage), rng.uniform(*plot.depth)
-
-
-def _greenery(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Mesh], list[Mesh]]:
-    """Return the meshes that stay in both states: solid rocks and logs, leafy bushes."""
-    area, extent = (2 * site.half) ** 2, site.half - 2.0
-    solid = [
-        vegetation.rocks(rng, site, int(spec.rocks * area), extent),
-        vegetation.logs(rng, site, int(spec.logs * area), extent),
-    ]
-    return solid, [vegetation.undergrowth(rng, site, int(spec.undergrowth * area), extent)]
 
 
 def _trees(

@@ -34,19 +34,7 @@ class Hits(NamedTuple):
     Attributes:
         distance: (N,) metres; inf without a hit.
         incidence: (N,) absolute cosines of the angles of incidence; 1 on foliage.
-    """
-
-    distance: Floats32
-    incidence: Floats32
-
-
-class Struck(NamedTuple):
-    """First hits of (N,) rays, with the mesh and its normal.
-
-    Attributes:
-        distance: (N,) metres; inf without a hit.
-        incidence: (N,) absolute cosines of the angles of incidence; 1 on foliage.
-        mesh: (N,) index of the mesh that was hit; -1 without a hit.
+        mesh: (N,) index of the mesh; -1 without a hit.
         normal: (N, 3) unit normals of the surfaces, on either side.
     """
 
@@ -59,12 +47,9 @@ class Struck(NamedTuple):
 class MeshCaster:
     """Ray caster for meshes, on ``threads`` cores.
 
-    ``foliage`` maps the index of a mesh that lets rays pass to the probability that a ray passes one of its surfaces;
-    None for the ``porosity`` of :meth:`trace`. Leaves are hit ``leaf_depth`` metres on average below the surface of
-    their foliage.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
+    ``foliage`` maps the index of a mesh to the probability that a ray passes one of its surfaces, None for the
+    ``porosity`` of :meth:`trace`; leaves are hit ``leaf_depth`` metres on average below the surface.
+    Raises DependencyError if Open3D cannot be loaded.
     """
 
     def __init__(
@@ -86,7 +71,7 @@ class MeshCaster:
                 self._scene.add_triangles(vertices, triangles)
                 self._added.append(index)
 
-    def trace(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Struck:
+    def trace(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
         """Return the first hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres."""
         parts = [
             self._trace_block(origins[i : i + BLOCK], rays[i : i + BLOCK], rng, porosity)
@@ -94,21 +79,27 @@ class MeshCaster:
         ]
         if not parts:
             nothing = np.zeros(0, np.float32)
-            return Struck(nothing, nothing, np.zeros(0, np.intp), np.zeros((0, 3), np.float32))
-        return Struck(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            return Hits(nothing, nothing, np.zeros(0, np.intp), np.zeros((0, 3), np.float32))
+        return Hits(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def _trace_block(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Struck:
+    def _trace_block(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
         count = len(rays)
         distance, incidence = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
         struck, normals = np.full(count, -1, np.intp), np.zeros((count, 3), np.float32)
         passing = np.full(max(self._foliage, default=-1) + 2, np.nan)  # by mesh; the last place is the sky's
         for index, share in self._foliage.items():
             passing[index] = porosity if share is None else share
+        added = np.array([*self._added, -1], dtype=np.intp)
         alive: Indices = np.arange(count, dtype=np.intp)
         start = np.zeros(count, np.float32)
         for layer in range(_MAX_LAYERS):
             from_here = origins[alive] + rays[alive] * start[alive, None]
-            t, normal, mesh = self._query(from_here, rays[alive])
+            packed = np.ascontiguousarray(np.concatenate([from_here, rays[alive]], axis=1), dtype=np.float32)
+            answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
+            # a ray without a hit has a number beyond all
+            mesh = added[np.minimum(answer["geometry_ids"].numpy(), len(added) - 1)]
+            # copies: the arrays belong to the tensors of the answer
+            t, normal = answer["t_hit"].numpy().copy(), answer["primitive_normals"].numpy().copy()
             through = passing[np.where(mesh < len(passing), mesh, -1)]
             leaf = np.isfinite(through)
             t += start[alive]
@@ -123,36 +114,14 @@ class MeshCaster:
             start[alive] = t[passed] + _STEP
             if not len(alive):
                 break
-        return Struck(distance, incidence, struck, normals)
-
-    def _query(self, origins: Floats32, rays: Floats32) -> tuple[Floats32, Floats32, Indices]:
-        packed = np.ascontiguousarray(np.concatenate([origins, rays], axis=1), dtype=np.float32)
-        answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
-        number = answer["geometry_ids"].numpy()
-        # a ray without a hit has a number beyond all
-        mesh = np.array([*self._added, -1], dtype=np.intp)[np.minimum(number, len(self._added))]
-        # copies: the arrays belong to the tensors of the answer
-        return answer["t_hit"].numpy().copy(), answer["primitive_normals"].numpy().copy(), mesh
+        return Hits(distance, incidence, struck, normals)
 
 
 class Caster(MeshCaster):
-    """Ray caster for one state of a scene, on ``threads`` cores.
-
-    Leaves are hit ``leaf_depth`` metres on average below the surface of their foliage.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """Ray caster for one state of a scene; its foliage has the ``porosity`` of :meth:`trace`."""
 
     def __init__(self, scene: SceneState, threads: int = _THREADS, leaf_depth: float = _LEAF_DEPTH) -> None:
         super().__init__((scene.solid, scene.foliage), {1: None}, threads, leaf_depth)
-
-    def cast(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
-        """Return the first hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres.
-
-        Each surface of foliage lets a ray pass with probability ``porosity``.
-        """
-        return Hits(*self.trace(origins, rays, rng, porosity)[:2])
 
 
 FRAME_PERIOD = 0.1
@@ -197,7 +166,7 @@ class Sensor:
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)
-        hits = caster.cast(origins, turned, rng, porosity)
+        hits = caster.trace(origins, turned, rng, porosity)
         t = hits.distance.astype(np.float64)
         noisy = t + rng.normal(0, noise, len(t))
         detected = self.detects(t, hits.incidence, rng.random(len(t)))
@@ -242,25 +211,18 @@ def _os64(name: str = "os64", columns: int = 512) -> Sensor:
     return Sensor(name, _spinning(elevation, staggered, columns), 0.5, 120.0)
 
 
-def _mid360() -> Sensor:
-    """Return a non-repetitive lidar: 200,000 points a second, -7 to 52 degrees, another pattern in each frame."""
-    count = 20_000
-    low, high = np.radians(-7.0), np.radians(52.0)
-
-    def beams(frame: int) -> Floats:
-        t = (frame * count + np.arange(count)) * FRAME_PERIOD / count
-        # two frequencies without a common multiple fill the field of view in about a second
-        azimuth = 2 * np.pi * 37.3819660 * t
-        sweep = (t * 1163.6180340) % 1.0
-        triangle = np.abs(2 * sweep - 1)
-        return _spherical(azimuth, low + (high - low) * triangle)
-
-    return Sensor("mid360", beams, 0.1, 70.0)
+def _mid360_beams(frame: int) -> Floats:
+    """Return a non-repetitive lidar's beams: 200,000 a second, -7 to 52 degrees, another pattern in each frame."""
+    count, low, high = 20_000, np.radians(-7.0), np.radians(52.0)
+    t = (frame * count + np.arange(count)) * FRAME_PERIOD / count
+    # two frequencies without a common multiple fill the field of view in about a second
+    triangle = np.abs(2 * ((t * 1163.6180340) % 1.0) - 1)
+    return _spherical(2 * np.pi * 37.3819660 * t, low + (high - low) * triangle)
 
 
 SENSORS: dict[str, Callable[[], Sensor]] = {
     "vlp16": _vlp16,
     "os64": _os64,
     "os64-2048": partial(_os64, "os64-2048", 2048),  # its densest mode, 131,072 beams
-    "mid360": _mid360,
+    "mid360": partial(Sensor, "mid360", _mid360_beams, 0.1, 70.0),
 }

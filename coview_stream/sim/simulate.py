@@ -111,14 +111,7 @@ _AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams; the s
 
 @dataclass(frozen=True)
 class Simulated:
-    """World that :func:`simulate` wrote.
-
-    Attributes:
-        directory: its directory.
-        base_points: points of the base map.
-        frames: frames of the run.
-        distance: metres driven.
-    """
+    """World that :func:`simulate` wrote: its directory, base points, frames of the run, and metres driven."""
 
     directory: Path
     base_points: int

@@ -124,7 +124,7 @@ class DriveDirt(NamedTuple):
     ) -> tuple[Floats, Floats]:
         """Return ranges (N,) and cosines (N,) of the incidence along ``rays`` (N, 3) of the sensor."""
         origins = np.broadcast_to(T[:3, 3].astype(np.float32), rays.shape)
-        hits = caster.cast(origins, (rays @ T[:3, :3].T).astype(np.float32), self.rng, porosity)
+        hits = caster.trace(origins, (rays @ T[:3, :3].T).astype(np.float32), self.rng, porosity)
         distance, strength = hits.distance.astype(np.float64), hits.incidence.astype(np.float64)
         if self.grass is not None and self.grass.height > 0.0:
             met = np.flatnonzero(np.isfinite(distance))

@@ -244,8 +244,8 @@ def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
         keep &= ((xy - middle) ** 2 / radii**2).sum(axis=1) > 1
     if rng.random() < 0.7:
         along = np.arange(-1.5 * half, 1.5 * half, 1.0)
-        sideways = rng.uniform(-0.4, 0.4) * half
-        sideways = sideways + rng.uniform(0, 12) * waves(rng, rng.uniform(60, 140))(along, np.zeros_like(along))
+        bend = rng.uniform(-0.4, 0.4) * half
+        sideways = bend + rng.uniform(0, 12) * waves(rng, rng.uniform(60, 140))(along, np.zeros_like(along))
         yaw = rng.uniform(0, 2 * np.pi)
         c, s = np.cos(yaw), np.sin(yaw)
         trail = np.column_stack([along, sideways]) @ np.array([[c, s], [-s, c]])

@@ -78,7 +78,7 @@ def test_beam_directions_are_unit_vectors_and_repeat_as_specified(name):
 def cast_down(scene, porosity, count=4000):
     rays = np.tile(np.array([[0, 0, -1]], np.float32), (count, 1))
     origins = np.column_stack([RNG.uniform(-3, 3, (count, 2)), np.full(count, 20.0)]).astype(np.float32)
-    return Caster(scene).cast(origins, rays, np.random.default_rng(1), porosity)
+    return Caster(scene).trace(origins, rays, np.random.default_rng(1), porosity)
 
 
 def test_foliage_transmits_configured_share_of_rays():
@@ -92,7 +92,7 @@ def test_foliage_transmits_configured_share_of_rays():
 
 
 def test_rays_into_the_sky_return_nothing():
-    hits = Caster(SceneState(box(2, 2, 1), EMPTY)).cast(
+    hits = Caster(SceneState(box(2, 2, 1), EMPTY)).trace(
         np.array([[0, 0, 5]], np.float32), np.array([[0, 0, 1]], np.float32), RNG, 0.0
     )
     assert np.isinf(hits.distance).all()

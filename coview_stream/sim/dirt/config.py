@@ -89,14 +89,11 @@ class Dirt:
 
 
 class Strength(NamedTuple):
-    """The one setting of a kind of dirt that a number after its name on the command line sets."""
+    """Dataclass of a kind of dirt, its field that a number on the command line sets, and the number's meaning."""
 
     settings: Any
-    """The kind's dataclass."""
     field: str
-    """Its field."""
     unit: str
-    """Meaning of the number, for people."""
 
 
 STRENGTHS: dict[str, Strength] = {
@@ -149,23 +146,14 @@ def parse_dirt(text: str, seed: int = 0) -> Dirt:
             continue
         if name not in STRENGTHS:
             raise ConfigError(f"dirt: {name!r} is unknown; use {REAL}, or some of {', '.join(KINDS_OF_DIRT)}")
-        dirt = replace(dirt, **{name: _kind(STRENGTHS[name], word, value)})
+        strength, settings = STRENGTHS[name], {}
+        try:
+            if value:
+                settings = {strength.field: float(value)}
+            kind = strength.settings(**settings)
+        except ConfigError as error:
+            raise ConfigError(f"dirt: {word!r}, the number being {strength.unit}: {error}") from error
+        except ValueError as error:
+            raise ConfigError(f"dirt: {word!r} does not end with a number; write for example snow:0.4") from error
+        dirt = replace(dirt, **{name: kind})
     return dirt
-
-
-def _kind(strength: Strength, word: str, value: str) -> Any:
-    """Return the settings of a kind that a word such as ``snow:0.4`` names."""
-    if not value:
-        return strength.settings()
-    number = _number(word, value)
-    try:
-        return strength.settings(**{strength.field: number})
-    except ConfigError as error:
-        raise ConfigError(f"dirt: {word!r}, the number being {strength.unit}: {error}") from error
-
-
-def _number(word: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError as error:
-        raise ConfigError(f"dirt: {word!r} does not end with a number; write for example snow:0.4") from error

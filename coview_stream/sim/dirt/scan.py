@@ -69,18 +69,7 @@ class Recording:
 class Stream(IntEnum):
     """Purposes that draw random numbers."""
 
-    COVER = 1
-    GLASS = 2
-    TRAFFIC = 3
-    MOUNTING = 4
-    BEAMS = 5
-    WEATHER = 6
-    ODOMETRY = 7
-    SLIP = 8
-    GRAVITY = 9
-    STRIPS = 10
-    DENSITY = 11
-    YEARS = 12
+    COVER, GLASS, TRAFFIC, MOUNTING, BEAMS, WEATHER, ODOMETRY, SLIP, GRAVITY, STRIPS, DENSITY, YEARS = range(1, 13)
 
 
 _DIRT = 200  # apart from the streams of scene, flight and drive
@@ -146,31 +135,17 @@ class Surfaces:
             x, y = at[:, 0].astype(np.float64), at[:, 1].astype(np.float64)
             distance[ground] += self._cover.sink(x, y, strength[ground], rng)
         if self._glass is not None:
-            self._look_through(self._glass, origins, rays, hits.normal, distance, strength, hits.mesh == GLAZED, rng)
+            hit = np.flatnonzero(hits.mesh == GLAZED)
+            points = origins[hit].astype(np.float64) + distance[hit, None] * rays[hit]
+            normal = hits.normal[hit].astype(np.float64)
+            is_pane = windows(points, normal, points[:, 2] - self._site.z(points[:, 0], points[:, 1]))
+            hit, points, normal = hit[is_pane], points[is_pane], normal[is_pane]
+            _, on = panes(self._glass, points, rays[hit].astype(np.float64), normal, rng)
+            beyond = self._caster.trace(on.origins, on.rays, rng, POROSITY)
+            which = hit[on.which]
+            distance[which] += beyond.distance.astype(np.float64)
+            strength[which] = self._glass.strength * beyond.incidence
         return Echoes(distance, strength, hits.mesh == SIGN)
-
-    def _look_through(
-        self,
-        glass: Glass,
-        origins: Floats32,
-        rays: Floats32,
-        normals: Floats32,
-        distance: Floats,
-        strength: Floats,
-        glazed: Bools,
-        rng: np.random.Generator,
-    ) -> None:
-        """Replace panes by the surfaces in or behind them, in ``distance`` and ``strength``."""
-        hit = np.flatnonzero(glazed)
-        points = origins[hit].astype(np.float64) + distance[hit, None] * rays[hit]
-        normal = normals[hit].astype(np.float64)
-        is_pane = windows(points, normal, points[:, 2] - self._site.z(points[:, 0], points[:, 1]))
-        hit, points, normal = hit[is_pane], points[is_pane], normal[is_pane]
-        _, on = panes(glass, points, rays[hit].astype(np.float64), normal, rng)
-        beyond = self._caster.trace(on.origins, on.rays, rng, POROSITY)
-        which = hit[on.which]
-        distance[which] += beyond.distance.astype(np.float64)
-        strength[which] = glass.strength * beyond.incidence
 
 
 def seasonal_caster(parts: Parts, scene: Scene, seasons: Seasons) -> MeshCaster:

@@ -13,7 +13,7 @@ from coview_stream.sim.furniture import vehicle
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.layout import Site, arc_lengths, directions
 from coview_stream.sim.mesh import EMPTY, Mesh, cylinder, ellipsoid, join, placed
-from coview_stream.sim.scenes import Footprint, Parts, Scene
+from coview_stream.sim.scenes import Parts, Scene
 
 _VERGE = 1.0  # metres beside the carriageway without grass
 _STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat rays through the cover
@@ -141,13 +141,7 @@ class Seasons:
 
 @dataclass(frozen=True)
 class Fate:
-    """Fate of the buildings, as indices of ``Scene.footprints``.
-
-    Attributes:
-        gone: in the survey only.
-        new: at the drive only.
-        rebuilt: replaced by another building.
-    """
+    """Fate of the buildings, as indices of ``Scene.footprints``: in the survey only, at the drive only, replaced."""
 
     gone: Indices
     new: Indices
@@ -167,11 +161,18 @@ def aged(scene: Scene, change: Years, rng: np.random.Generator) -> tuple[Scene, 
         now[scene.houses[house]] = EMPTY
     for house in new:
         mapped[scene.houses[house]] = EMPTY
+    plots = KINDS[scene.kind].plots
     for house in rebuilt:
-        now[scene.houses[house]] = _another(scene, scene.footprints[house], rng)
-    old = replace(before, built=tuple(mapped), trees=_younger(before.trees, change, rng), cars=_half(before.cars, 0))
-    new_parts = replace(after, built=tuple(now), trees=_kept(after.trees, change, rng), cars=_half(after.cars, 1))
-    return with_parts(scene, old, new_parts), Fate(gone, new, rebuilt)
+        plot = scene.footprints[house]
+        drawn = plots[int(rng.integers(len(plots)))].draw(rng, plot.w, plot.d)
+        now[scene.houses[house]] = placed(drawn, plot.x, plot.y, plot.ground, plot.yaw)
+    # trees of the survey were smaller, and every other vehicle stood then or stands now: none stays for years
+    younger = _kept(before.trees, change, rng)
+    younger[:, 2:4] *= np.maximum(1.0 - _GROWTH * change.years / younger[:, 2], _SMALLEST)[:, None]
+    old = replace(before, built=tuple(mapped), trees=younger, cars=before.cars[0::2])
+    present = replace(after, built=tuple(now), trees=_kept(after.trees, change, rng), cars=after.cars[1::2])
+    later = replace(scene, parts=(old, present), mapped=old.state(scene.site), now=present.state(scene.site))
+    return later, Fate(gone, new, rebuilt)
 
 
 def drawn_parts(scene: Scene) -> tuple[Parts, Parts]:
@@ -180,36 +181,10 @@ def drawn_parts(scene: Scene) -> tuple[Parts, Parts]:
     return scene.parts
 
 
-def with_parts(scene: Scene, before: Parts, after: Parts) -> Scene:
-    """Return the scene put together from other parts."""
-    states = before.state(scene.site), after.state(scene.site)
-    return replace(scene, parts=(before, after), mapped=states[0], now=states[1])
-
-
-def _another(scene: Scene, plot: Footprint, rng: np.random.Generator) -> Mesh:
-    plots = KINDS[scene.kind].plots
-    drawn = plots[int(rng.integers(len(plots)))].draw(rng, plot.w, plot.d)
-    return placed(drawn, plot.x, plot.y, plot.ground, plot.yaw)
-
-
-def _younger(trees: Floats, change: Years, rng: np.random.Generator) -> Floats:
-    """Return today's trees (N, 8) at their earlier size, without those planted since."""
-    rows = _kept(trees, change, rng).copy()
-    then = np.maximum(1.0 - _GROWTH * change.years / rows[:, 2], _SMALLEST)
-    rows[:, 2:4] *= then[:, None]
-    return rows
-
-
 def _kept(trees: Floats, change: Years, rng: np.random.Generator) -> Floats:
     return np.asarray(trees[rng.random(len(trees)) < (1.0 - _FELLED) ** change.years])
 
 
-def _half(cars: Floats, which: int) -> Floats:
-    """Return every other vehicle: none of them stays for years."""
-    return cars[which::2]
-
-
-# set by hand
 _SEEN = 70.0  # metres from the robot within which traffic is drawn
 _CLEAR = 3.2  # metres: a vehicle that would come nearer to the robot waits elsewhere
 _DRIVING, _WALKING = (4.0, 12.0), (0.8, 1.7)  # metres per second

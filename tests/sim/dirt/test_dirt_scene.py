@@ -111,7 +111,7 @@ def rises(state, footprints):
     """Heights above their ground of what stands in the middle of footprints."""
     origins = np.array([[f.x, f.y, f.ground + 80.0] for f in footprints], np.float32)
     down = np.tile(np.array([[0, 0, -1]], np.float32), (len(origins), 1))
-    return 80.0 - Caster(state).cast(origins, down, RNG(0), 1.0).distance
+    return 80.0 - Caster(state).trace(origins, down, RNG(0), 1.0).distance
 
 
 @pytest.mark.slow
