@@ -7,6 +7,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -14,9 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from coview_stream.cli.options import add_shared
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.config import MapConfig
 
@@ -78,7 +76,8 @@ def run(args: argparse.Namespace) -> int:
     """Build and save the map, and print its sizes."""
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.config import map_preset
-    from coview_stream.errors import ConfigError, MapError
+    from coview_stream.descriptors.network import VIEW_NAMES, network
+    from coview_stream.errors import ConfigError, CoViewError, MapError
 
     output = Path(args.output)
     if output.resolve() in [Path(name).resolve() for name in args.maps]:
@@ -87,7 +86,15 @@ def run(args: argparse.Namespace) -> int:
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
-    options["learned"] = _networks_available() if args.learned is None else args.learned
+    options["learned"] = args.learned
+    if args.learned is None:  # where features can be made; if not, say why: the user may rely on them
+        try:
+            for view in VIEW_NAMES:
+                network(view)
+            options["learned"] = True
+        except CoViewError as error:
+            print(f"without learned features: {' '.join(str(error).split())}", file=sys.stderr)
+            options["learned"] = False
     tiles = args.output.endswith("/") or output.is_dir()
     if not tiles and (args.workers is not None or args.dask is not None or args.keep_going):
         raise ConfigError(
@@ -102,8 +109,6 @@ def run(args: argparse.Namespace) -> int:
 def _build_file(
     clouds: Clouds, args: argparse.Namespace, output: Path, options: dict[str, Any], key: SigningKey | None
 ) -> int:
-    import time
-
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.summary import summary
@@ -130,18 +135,13 @@ def _build_file(
 def _build_site(
     clouds: Clouds, args: argparse.Namespace, output: Path, config: MapConfig, key: SigningKey | None
 ) -> int:
-    import os
-    import time
-
     from coview_stream.basemap.site.executors import DaskExecutor, Executor, ProcessExecutor
     from coview_stream.basemap.site.site_build import build_site
 
     begin = time.perf_counter()
-    executor: Executor
-    if args.dask is not None:
-        executor = DaskExecutor(args.dask, args.workers)
-    else:
-        executor = ProcessExecutor(args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1))
+    workers = args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1)
+    dask = args.dask is not None
+    executor: Executor = DaskExecutor(args.dask, args.workers) if dask else ProcessExecutor(workers)
     try:
         built = build_site(
             clouds,
@@ -171,27 +171,11 @@ def _build_site(
     return 1 if built.skipped else 0
 
 
-def _networks_available() -> bool:
-    """Return whether features can be made; if not, print the reason: the user may rely on them."""
-    from coview_stream.descriptors.network import VIEW_NAMES, network
-    from coview_stream.errors import CoViewError
-
-    try:
-        for view in VIEW_NAMES:
-            network(view)
-    except CoViewError as error:
-        print(f"without learned features: {' '.join(str(error).split())}", file=sys.stderr)
-        return False
-    return True
-
-
 @contextlib.contextmanager
 def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str | os.PathLike[str]]]:
     """Fetch clouds of web servers, and windows of COPC files, into a temporary folder, and yield the local files.
 
-    Args:
-        given: files, folders, patterns and web addresses, as the command was given them.
-        window: ``X0,Y0,X1,Y1`` of all clouds; None takes whole files.
+    ``window`` is ``X0,Y0,X1,Y1`` of all clouds; None takes whole files.
 
     Raises:
         ConfigError: a malformed window. CloudError: a file cannot be fetched, or is no COPC file and has a window.

@@ -16,8 +16,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
     from coview_stream.localization.offline import RunResult
     from coview_stream.recordings.run import Run
     from coview_stream.report.evaluation import Evaluation, Trajectory
-    from coview_stream.sim import SimulationConfig
 
 
 HELP = "simulate a site and a robot, build the map, localize, compare with the truth; needs no input"
@@ -56,6 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do the four steps, write what came out, print the errors."""
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.cli.evaluate import table
+    from coview_stream.clouds.atomic_file import atomic_file
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.recordings.open_run import open_run
     from coview_stream.sim import SimulationConfig, simulate
@@ -63,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     if args.web is not None and args.offline:
         raise ConfigError("--offline has no node to show: leave --web away")
     config = SimulationConfig(scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length)
-    out = _prepare_folder(args.out)
+    out = args.out
+    _prepare_folder(out)
     world, shown = out / "world", sys.stderr.isatty()
     seconds: dict[str, float] = {}
     with _step(seconds, "simulate", f"simulating a {args.scene}, {args.size:g} m wide, and a {args.sensor}"):
@@ -77,13 +77,21 @@ def run(args: argparse.Namespace) -> int:
         located = _offline(base_map, recorded, shown) if args.offline else _live(recorded, out, shown, args.web)
     with _step(seconds, "report", "comparing with the truth, drawing"):
         evaluation = _write_results(located, base_map, read_tum(world / "truth.tum"), out)
-    _write_report(evaluation, config, seconds, out)
-    print(_text(evaluation, located, out))
+    facts = json.loads(evaluation.to_json()) | {"world": config.to_dict(), "seconds": seconds}
+    with atomic_file(out / "report.json") as stream:
+        stream.write((json.dumps(facts, indent=1) + "\n").encode())
+    print(table(evaluation))
+    if not located.posed and located.keyframes:
+        print(f"{'reason':<18} {located.keyframes[-1].reason}")
+    print(f"{'written':<18} {out}: {', '.join(name for name in _WRITTEN if (out / name).is_file())}")
+    print(f"{'step by step':<18} coview-stream build {world / 'base.laz'} -o site.coview")
+    print(f"{'':<18} coview-stream locate site.coview {world / 'run'} -o out")
+    print(f"{'':<18} coview-stream eval out/trajectory.tum {world / 'truth.tum'}")
     return 0 if evaluation.success else 1
 
 
-def _prepare_folder(out: Path) -> Path:
-    """Return the directory, created, or cleared of an earlier demo's results.
+def _prepare_folder(out: Path) -> None:
+    """Create the directory, or clear it of an earlier demo's results.
 
     Raises:
         InputError: it holds other files, or cannot be written.
@@ -100,14 +108,11 @@ def _prepare_folder(out: Path) -> Path:
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); name another with --out") from error
-    return out
 
 
-@contextmanager
+@contextlib.contextmanager
 def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
     """Print on stderr what the block does and, at its end, how long it took; enter its seconds by name."""
-    import time
-
     number = len(seconds) + 1
     print(f"[{number}/{_STEPS}] {text} ...", file=sys.stderr, flush=True)
     begin = time.perf_counter()
@@ -148,8 +153,8 @@ def _live(recorded: Run, out: Path, shown: bool, web: str | None) -> RunResult:
                 bar.set_postfix_str(str(record["state"]))
 
         (out / "logs").mkdir(exist_ok=True)
-        recording = record_live(out / "site.coview", recorded.path, out / "logs", show, web)
-    return from_stream(stamps, recording.poses, recording.statuses)
+        recorded_live = record_live(out / "site.coview", recorded.path, out / "logs", show, web)
+    return from_stream(stamps, *recorded_live)
 
 
 def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
@@ -171,53 +176,12 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
     return evaluate(estimate, truth)
 
 
-def _write_report(evaluation: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path) -> None:
-    import json
-
-    from coview_stream.clouds.atomic_file import atomic_file
-
-    facts = json.loads(evaluation.to_json()) | {"world": config.to_dict(), "seconds": seconds}
-    with atomic_file(out / "report.json") as stream:
-        stream.write((json.dumps(facts, indent=1) + "\n").encode())
-
-
-def _text(evaluation: Evaluation, located: RunResult, out: Path) -> str:
-    from coview_stream.cli.evaluate import table
-
-    lines = [table(evaluation)]
-    if not located.posed and located.keyframes:
-        lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
-    written = [name for name in _WRITTEN if (out / name).is_file()]
-    lines.append(f"{'written':<18} {out}: {', '.join(written)}")
-    lines.append(f"{'step by step':<18} coview-stream build {out / 'world' / 'base.laz'} -o site.coview")
-    lines.append(f"{'':<18} coview-stream locate site.coview {out / 'world' / 'run'} -o out")
-    lines.append(f"{'':<18} coview-stream eval out/trajectory.tum {out / 'world' / 'truth.tum'}")
-    return "\n".join(lines)
-
-
 ROBOT = "demo"
 
-# all set by hand, seconds
+# seconds
 _MAX_START = 60.0  # until the node publishes something and can search; a first run compiles its kernels
 _MAX_SHUTDOWN = 5.0  # for a process after a signal
 _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
-
-
-@dataclass
-class Recording:
-    """Messages that the watcher received, in order.
-
-    Attributes:
-        poses: as published, JSON.
-        statuses: likewise.
-    """
-
-    poses: list[dict[str, Any]] = field(default_factory=list)
-    statuses: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, record: dict[str, Any]) -> None:
-        """Append one line of the watcher to the list that its key names."""
-        (self.poses if str(record.get("key", "")).endswith("/out/pose") else self.statuses).append(record)
 
 
 def record_live(
@@ -226,8 +190,8 @@ def record_live(
     logs: Path,
     on_record: Callable[[dict[str, Any]], None] = lambda record: None,
     web: str | None = None,
-) -> Recording:
-    """Serve a map, replay a run to it at its own pace, and record what is published.
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Serve a map, replay a run to it at its own pace; return the poses and the statuses published, JSON, in order.
 
     Args:
         map_path: a ``.coview`` file.
@@ -239,8 +203,17 @@ def record_live(
     Raises:
         TransportError: a process failed; the message ends with the last line of its log.
     """
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    recording = Recording()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    records: list[dict[str, Any]] = []
+    lines: queue.Queue[dict[str, Any]] = queue.Queue()
+
+    def read(stream: IO[bytes]) -> None:
+        for line in stream:
+            with contextlib.suppress(ValueError):
+                lines.put(json.loads(line))
+
     with contextlib.ExitStack() as stack:
 
         def start(name: str, *args: str) -> subprocess.Popen[bytes]:
@@ -249,31 +222,34 @@ def record_live(
         page = () if web is None else (f"--web={web}",)
         node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint, "--no-state", *page)
         watcher = start("watch", "--json", "--robot", ROBOT, "--connect", endpoint)
-        lines = _lines(watcher)
-        _await_first(lines, recording, (node, watcher), logs)
+        if watcher.stdout is not None:
+            threading.Thread(target=read, args=(watcher.stdout,), daemon=True).start()
+        deadline = time.monotonic() + _MAX_START
+        while not records:
+            with contextlib.suppress(queue.Empty):
+                records.append(lines.get(timeout=0.1))
+            _check_running(logs, serve=node, watch=watcher)
+            if time.monotonic() > deadline:
+                raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
         _await_engines(endpoint)
         robot = start("replay", str(run_path), "--robot", ROBOT, "--connect", endpoint)
         while robot.poll() is None or not lines.empty():
             with contextlib.suppress(queue.Empty):
-                record = lines.get(timeout=0.1)
-                recording.add(record)
-                on_record(record)
-            if node.poll() is not None or watcher.poll() is not None:
-                raise _failure("serve" if node.poll() is not None else "watch", logs)
+                records.append(lines.get(timeout=0.1))
+                on_record(records[-1])
+            _check_running(logs, serve=node, watch=watcher)
         if robot.returncode:
-            raise _failure("replay", logs)
+            _check_running(logs, replay=robot)
         time.sleep(_IN_TRANSIT)
         _end(node)
         with contextlib.suppress(queue.Empty):
             while True:
-                recording.add(lines.get(timeout=0.5))
-    return recording
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+                records.append(lines.get(timeout=0.5))
+    poses: list[dict[str, Any]] = []
+    statuses: list[dict[str, Any]] = []
+    for record in records:
+        (poses if str(record.get("key", "")).endswith("/out/pose") else statuses).append(record)
+    return poses, statuses
 
 
 @contextlib.contextmanager
@@ -303,36 +279,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
-def _lines(watcher: subprocess.Popen[bytes]) -> queue.Queue[dict[str, Any]]:
-    found: queue.Queue[dict[str, Any]] = queue.Queue()
-
-    def read(stream: IO[bytes]) -> None:
-        for line in stream:
-            with contextlib.suppress(ValueError):
-                found.put(json.loads(line))
-
-    if watcher.stdout is not None:
-        threading.Thread(target=read, args=(watcher.stdout,), daemon=True).start()
-    return found
-
-
-def _await_first(
-    lines: queue.Queue[dict[str, Any]],
-    recording: Recording,
-    processes: tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]],
-    logs: Path,
-) -> None:
-    deadline = time.monotonic() + _MAX_START
-    while time.monotonic() < deadline:
-        with contextlib.suppress(queue.Empty):
-            recording.add(lines.get(timeout=0.1))
-            return
-        for name, process in zip(("serve", "watch"), processes, strict=True):
-            if process.poll() is not None:
-                raise _failure(name, logs)
-    raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
-
-
 def _await_engines(endpoint: str) -> None:
     """Wait until the node's engines can search: on a busy machine the drive would be over before."""
     from coview_stream.stream.transport.keys import node_keys
@@ -350,6 +296,8 @@ def _await_engines(endpoint: str) -> None:
         transport.close()
 
 
-def _failure(name: str, logs: Path) -> TransportError:
-    log = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
-    return TransportError(f"`coview-stream {name}` ended: {log[-1] if log else 'it said nothing'}")
+def _check_running(logs: Path, **processes: subprocess.Popen[bytes]) -> None:
+    for name, process in processes.items():
+        if process.poll() is not None:
+            log = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
+            raise TransportError(f"`coview-stream {name}` ended: {log[-1] if log else 'it said nothing'}")

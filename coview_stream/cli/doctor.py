@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import importlib.util
 import json
 import logging
 from collections.abc import Iterator
@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, local_map
 from coview_stream.cli.options import add_network, add_shared, check_codec, mount_of
-from coview_stream.errors import ConfigError, TransportError
+from coview_stream.errors import ConfigError, CoViewError, TransportError
 
 if TYPE_CHECKING:
-    from coview_stream.basemap.basemap import BaseMap
     from coview_stream.doctor.finding import Finding
     from coview_stream.stream.transport.keys import RobotKeys
 
 HELP = "check this machine, a map, the network and the robots' messages, with a remedy for each finding"
 
-_MAX_SECONDS = 600.0  # to listen, set by hand
+_MAX_SECONDS = 600.0  # to listen
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,11 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
-    """Return the keys of the robots to listen to; refuse wrong options before anything slow is done.
-
-    Raises:
-        ConfigError: a wrong option, with or without robots.
-    """
+    """Return the keys of the robots to listen to; ConfigError for a wrong option, with or without robots."""
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS
     from coview_stream.stream.transport.keys import robot_keys
 
@@ -87,11 +82,17 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
 def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
     from coview_stream.doctor.finding import from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory
-    from coview_stream.doctor.map_checks import map_findings, open_map
-    from coview_stream.errors import CoViewError
+    from coview_stream.doctor.map_checks import map_findings, open_map, run_findings
+    from coview_stream.recordings.open_run import open_run
+    from coview_stream.stream.transport.zenoh_config import compose
+    from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-    connect = _endpoints(args)
-    zenoh = connect is not None and _check_zenoh_config(args, connect)
+    connect = None  # the network is not asked for
+    if args.robot or args.connect or args.listen or args.zenoh_config:
+        connect = args.connect or ([] if args.listen or args.zenoh_config else [DEFAULT_ENDPOINT])
+    zenoh = connect is not None and importlib.util.find_spec("zenoh") is not None  # a finding where it is missing
+    if connect is not None and zenoh:
+        compose(connect, args.listen, args.zenoh_config)  # mistakes before anything slow
     yield from machine_findings()
     sha256 = base_map = None
     if args.map is not None:
@@ -108,49 +109,15 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
             sha256 = base_map.sha256
             yield from map_findings(base_map, base_map.nbytes, memory()[1])
     if args.run_path is not None:
-        yield from _recorded(args, base_map)
+        given = args.odometry, args.cloud_topic, args.odometry_topic
+        try:
+            recorded = open_run(args.run_path, *given, mount=mount_of(args))
+        except CoViewError as error:
+            yield from_error("run", error)
+        else:
+            yield from run_findings(recorded, base_map)
     if connect is not None and zenoh:
         yield from _network(args, connect, keys, sha256)
-
-
-def _recorded(args: argparse.Namespace, base_map: BaseMap | None) -> Iterator[Finding]:
-    """Judge a recorded run; what cannot be opened is a finding."""
-    from coview_stream.doctor.finding import from_error
-    from coview_stream.doctor.map_checks import run_findings
-    from coview_stream.errors import CoViewError
-    from coview_stream.recordings.open_run import open_run
-
-    try:
-        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, mount=mount_of(args))
-    except CoViewError as error:
-        yield from_error("run", error)
-        return
-    yield from run_findings(recorded, base_map)
-
-
-def _check_zenoh_config(args: argparse.Namespace, connect: list[str]) -> bool:
-    """Check endpoints and files before anything slow; False if zenoh is missing, which is a finding.
-
-    Raises:
-        TransportError: zenoh refuses them.
-    """
-    try:
-        import zenoh  # noqa: F401 - only whether it is there
-    except ImportError:
-        return False
-    from coview_stream.stream.transport.zenoh_config import compose
-
-    compose(connect, args.listen, args.zenoh_config)
-    return True
-
-
-def _endpoints(args: argparse.Namespace) -> list[str] | None:
-    """Return the endpoints to connect to; None if the network is not asked for."""
-    from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
-
-    if not (args.robot or args.connect or args.listen or args.zenoh_config):
-        return None
-    return args.connect or ([] if args.listen or args.zenoh_config else [DEFAULT_ENDPOINT])
 
 
 def _network(
@@ -160,12 +127,16 @@ def _network(
     from coview_stream.doctor.network_checks import connection_finding, robots_findings
     from coview_stream.stream.transport.zenoh_transport import open_transport
 
+    logger = logging.getLogger("coview_stream.stream")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)  # what the transport would log is a finding here
     try:
-        with _silent("coview_stream.stream"):  # what the transport would log is a finding here
-            transport = open_transport(connect, args.listen, args.zenoh_config)
+        transport = open_transport(connect, args.listen, args.zenoh_config)
     except TransportError as error:
         yield from_error("network", error)
         return
+    finally:
+        logger.setLevel(before)
     try:
         connected = connection_finding(transport, connect)
         yield connected
@@ -174,14 +145,3 @@ def _network(
             yield from robots_findings(transport, keys, args.seconds, codecs, sha256)
     finally:
         transport.close()
-
-
-@contextlib.contextmanager
-def _silent(name: str) -> Iterator[None]:
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)

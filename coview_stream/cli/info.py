@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,12 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the map's contents, parameters and hash."""
-    import json
-
     import numpy as np
 
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.site.manifest import site_directory
+    from coview_stream.basemap.file_format import signer
+    from coview_stream.basemap.site.manifest import Manifest, site_directory
     from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError
 
@@ -60,7 +60,9 @@ def run(args: argparse.Namespace) -> int:
         facts["site"] = _site(directory)
     for mirror in source.mirrors:
         facts["fetched from"] = mirror.source.name + (", not reached now" if mirror.offline else "")
-    facts["signature"] = _signature(directory or args.map, args.verify_key is not None)
+    by = signer(args.map) if directory is None else Manifest.load(directory).signer
+    verified = "verified" if args.verify_key is not None else "it says; --verify-key verifies it"
+    facts["signature"] = f"by {by}, {verified}" if by else "none"
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
     if args.json:
@@ -105,9 +107,12 @@ def describe(base_map: BaseMap) -> dict[str, object]:
 
     from coview_stream.basemap.summary import summary
 
+    low, high = (corner + base_map.origin for corner in (base_map.points.min(axis=0), base_map.points.max(axis=0)))
+    learned, features = "no features", base_map.learned
+    if features is not None:
+        size = f"{features.bytes / 1e6:.1f} MB"
+        learned = f"features of {features.area:.0f} m2, {size}, weights {features.weights[:12]}"
     covered = summary(base_map)
-    low = base_map.points.min(axis=0) + base_map.origin
-    high = base_map.points.max(axis=0) + base_map.origin
     return {
         "covers": str(covered),
         "warnings": list(covered.warnings) or "none",
@@ -119,7 +124,7 @@ def describe(base_map: BaseMap) -> dict[str, object]:
         "origin": base_map.origin.tolist(),
         "crs": base_map.crs,
         "ground filter": base_map.parameters.get("ground_filter"),
-        "learned": _learned(base_map),
+        "learned": learned,
         "sources": base_map.sources,
         "sha256": base_map.sha256,
         "parameters": asdict(base_map.config),
@@ -138,30 +143,6 @@ def _site(directory: Path) -> dict[str, object]:
     return {"tiles": len(site.tiles), "edge": site.tile, "bytes": site.nbytes, "manifest": site.sha256} | {
         f"bytes of {name}": size for name, size in layers.items()
     }
-
-
-def _signature(path: Path, verified: bool) -> str:
-    """Describe who signed a map, and whether that has been verified."""
-    from coview_stream.basemap.file_format import signer
-
-    if path.is_dir():
-        from coview_stream.basemap.site.manifest import Manifest
-
-        by = Manifest.load(path).signer or None
-    else:
-        by = signer(path)
-    if by is None:
-        return "none"
-    return f"by {by}, verified" if verified else f"by {by}, it says; --verify-key verifies it"
-
-
-def _learned(base_map: BaseMap) -> str:
-    """Describe the map's features for learned re-localization."""
-    features = base_map.learned
-    if features is None:
-        return "no features"
-    size = features.bytes / 1e6
-    return f"features of {features.area:.0f} m2, {size:.1f} MB, weights {features.weights[:12]}"
 
 
 def _text(value: object) -> str:

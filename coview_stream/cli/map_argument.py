@@ -46,15 +46,10 @@ def local_map(
     connect: Sequence[str] = (),
     config: Path | None = None,
 ) -> LocalMap:
-    """Return the map that a command was given; a site elsewhere is fetched and checked.
+    """Return the map that a command was given, by path or address; a site elsewhere is fetched and checked.
 
-    Args:
-        name: path or address.
-        around: ``X,Y,RADIUS``; None for all of it.
-        verify_key: must have signed a site elsewhere.
-        base: first part of zenoh keys.
-        connect: zenoh endpoints, for ``zenoh://SITE``.
-        config: a zenoh configuration, likewise.
+    ``around`` is ``X,Y,RADIUS``, None for all of it; ``verify_key`` must have signed a site elsewhere. ``base``,
+    ``connect`` and ``config`` are the zenoh key, endpoints and configuration for ``zenoh://SITE``.
 
     Raises:
         ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.
@@ -101,17 +96,14 @@ def open_map_argument(args: argparse.Namespace) -> LocalMap:
     else:
         from coview_stream.basemap.joined import write_names
 
-        named = [_named(str(text)) for text in given]
+        named = []
+        for text in map(str, given):
+            name, sign, path = text.partition("=")
+            if not (sign and name and "/" not in name):  # a path alone
+                name, path = Path(text.rstrip("/")).name.removesuffix(".coview"), text
+            named.append((name, path))
         maps = [(name, local_map(path, args.around, key, base, connect, config)) for name, path in named]
         mirrors = tuple(mirror for _, part in maps for mirror in part.mirrors)
         opened = LocalMap(write_names([(name, part.path) for name, part in maps]), mirrors)
     args.map = opened.path
     return opened
-
-
-def _named(text: str) -> tuple[str, str]:
-    """Return the name and the path of ``NAME=PATH``, or of a path alone."""
-    name, sign, path = text.partition("=")
-    if sign and name and "/" not in name:
-        return name, path
-    return Path(text.rstrip("/")).name.removesuffix(".coview"), text

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         plan.with_numbers(args.worlds, args.steps, args.first_world, args.seed),
         args.workers,
         args.threads,
-        _log,
+        lambda line: print(line, file=sys.stderr, flush=True),
     )
     recall = card["validation"]
     print(
@@ -48,7 +48,3 @@ def run(args: argparse.Namespace) -> int:
         f"{recall['queries']} queries in {recall['worlds']} worlds of other seeds (chance {recall['chance']:.3f})"
     )
     return 0
-
-
-def _log(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
