@@ -46,23 +46,14 @@ Field = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Table:
-    """Points in a buffer, in rows of fields.
-
-    Attributes:
-        data: the buffer.
-        fields: of each point.
-        step: bytes from one point to the next.
-        width: points in a row.
-        height: rows.
-        row_step: bytes from one row to the next; not used with one row.
-    """
+    """Points in a buffer, in rows of fields."""
 
     data: memoryview | bytes | npt.NDArray[np.uint8]
-    fields: tuple[Field, ...]
-    step: int
-    width: int
-    height: int = 1
-    row_step: int = 0
+    fields: tuple[Field, ...]  # of each point
+    step: int  # bytes from one point to the next
+    width: int  # points in a row
+    height: int = 1  # rows
+    row_step: int = 0  # bytes from one row to the next; not used with one row
 
     def column(self, field: Field, count: int = 1) -> npt.NDArray[Any]:
         """Return (N, count) neighbouring values of every point; a view where strides allow it."""

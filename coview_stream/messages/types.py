@@ -26,32 +26,18 @@ from coview_stream.geometry.transforms import (
 
 @dataclass(frozen=True)
 class Sample:
-    """One message as received from a transport.
+    """One message as received from a transport."""
 
-    Attributes:
-        key: the key it was published on.
-        payload: its bytes.
-        encoding: MIME type with its schema (``type;schema``), empty if the sender set none.
-        attachment: bytes sent with the payload, None if there are none.
-        size: bytes of a payload that was too large to receive (``payload`` is empty then); None otherwise.
-    """
-
-    key: str
+    key: str  # that it was published on
     payload: bytes
-    encoding: str = ""
-    attachment: bytes | None = None
-    size: int | None = None
+    encoding: str = ""  # MIME type with its schema (``type;schema``), empty if the sender set none
+    attachment: bytes | None = None  # sent with the payload
+    size: int | None = None  # bytes of a payload that was too large to receive; ``payload`` is empty then
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """A message ready to publish.
-
-    Attributes:
-        payload: its bytes.
-        encoding: MIME type with its schema, empty for none.
-        attachment: bytes to send with the payload, None for none.
-    """
+    """A message ready to publish; its fields are those of :class:`Sample`."""
 
     payload: bytes
     encoding: str = ""
@@ -89,15 +75,10 @@ class CloudMessage:
 
 @dataclass(frozen=True, eq=False)
 class OdometryMessage:
-    """One odometry sample.
+    """One odometry sample."""
 
-    Attributes:
-        stamp_ns: sensor time, nanoseconds.
-        T_odom_body: (4, 4) odometry <- body, metres, gravity aligned.
-    """
-
-    stamp_ns: int
-    T_odom_body: Pose
+    stamp_ns: int  # sensor time
+    T_odom_body: Pose  # (4, 4) odometry <- body, metres, gravity aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,43 +162,27 @@ class PoseMessage:
 class HypothesesMessage:
     """Places that a search for one robot considers; none is certain.
 
-    Attributes:
-        stamp_ns: sensor time of the keyframe, nanoseconds.
-        robot: name.
-        places: (K, 6) float64, most probable first: x, y, z (metres) and yaw (radians) of the body in the map frame,
-            posterior probability, log-likelihood ratio against chance.
-        none: probability that the robot is nowhere on the map.
-        map_sha256: hash of the base map.
-        maps: of several maps, the name of the one that each place is on, in whose frame it is; empty of one map.
+    ``places`` are (K, 6), most probable first: x, y, z (metres) and yaw (radians) of the body in the map frame,
+    posterior probability, log-likelihood ratio against chance.
     """
 
-    stamp_ns: int
+    stamp_ns: int  # sensor time of the keyframe
     robot: str
     places: Floats
-    none: float
+    none: float  # probability that the robot is nowhere on the map
     map_sha256: str
-    maps: tuple[str, ...] = ()
+    maps: tuple[str, ...] = ()  # of several maps, the one that each place is on, in whose frame it is; empty of one
 
 
 @dataclass(frozen=True, eq=False)
 class LocationMessage:
-    """A robot's location on Earth (WGS 84).
+    """A robot's location on Earth (WGS 84)."""
 
-    Attributes:
-        stamp_ns: sensor time, nanoseconds.
-        robot: name.
-        latitude: degrees, north positive. longitude: east positive.
-        height: metres; see :class:`coview_stream.clouds.reference_system.GeoReference`.
-        heading: radians, clockwise from true north.
-        covariance: (3, 3) east, north, up, m2.
-        confidence: of the pose; NaN if unknown.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # sensor time
     robot: str
-    latitude: float
-    longitude: float
-    height: float
-    heading: float
-    covariance: Floats
-    confidence: float
+    latitude: float  # degrees, north positive
+    longitude: float  # degrees, east positive
+    height: float  # metres; see :class:`coview_stream.clouds.reference_system.GeoReference`
+    heading: float  # radians, clockwise from true north
+    covariance: Floats  # (3, 3) east, north, up, m2
+    confidence: float  # of the pose; NaN if unknown

@@ -58,8 +58,7 @@ class RobotClient:
         transport: one that is open already; the caller closes it.
 
     Attributes:
-        robot: its name.
-        keys: keys that are published on and subscribed to.
+        keys: of the messages sent and received.
         latest_status: newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970.
         malformed: number of poses and statuses that could not be decoded.
 
@@ -267,8 +266,7 @@ class RobotClient:
         except MessageError as error:
             self._reject(sample, error)
             return
-        if not pose.robot:
-            pose = replace(pose, robot=self.robot)
+        pose = pose if pose.robot else replace(pose, robot=self.robot)
         self._latest_pose = monotonic(), pose
         self._poses.put(pose)
 

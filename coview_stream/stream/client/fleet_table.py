@@ -37,25 +37,15 @@ _COLUMNS = (
 
 @dataclass
 class RobotView:
-    """Newest messages of one robot. Times are of a monotonic clock, seconds.
-
-    Attributes:
-        robot: its name.
-        heard: time of the newest message.
-        pose: the newest.
-        status: the newest.
-        status_heard: time of the newest status.
-        node: who serves it, in words, if another node did before; empty else.
-        arrivals: times of the last poses.
-    """
+    """Newest messages of one robot. Times are of a monotonic clock, seconds."""
 
     robot: str
-    heard: float
+    heard: float  # time of the newest message
     pose: PoseMessage | None = None
     status: dict[str, Any] = field(default_factory=dict)
     status_heard: float = -math.inf
-    node: str = ""
-    arrivals: deque[float] = field(default_factory=deque)
+    node: str = ""  # who serves it, in words, if another node did before
+    arrivals: deque[float] = field(default_factory=deque)  # times of the last poses
 
     def pose_rate(self, now: float) -> float:
         """Return poses per second over the last :data:`WINDOW` seconds."""
@@ -100,7 +90,7 @@ class FleetTable:
             header: begin with the titles of the columns.
             width: of the terminal, characters, which no line exceeds; None: a line for each robot, however long.
         """
-        lines = header_lines(width) if header else []
+        lines = [_line([title for title, _ in _COLUMNS])[:width]] if header else []
         for name in sorted(self.views):
             row = _row(self.views[name], now)
             if width is None or len(_line(row)) <= width:
@@ -116,69 +106,45 @@ class FleetTable:
         return view
 
 
-def header_lines(width: int | None = None) -> list[str]:
-    """Return the titles of :meth:`FleetTable.table`, in one line."""
-    titles = [title for title, _ in _COLUMNS]
-    return [_line(titles)[:width]]
-
-
 def printable(text: object) -> str:
     """Return text from the network in a form safe for a terminal: no control characters, one line."""
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
 def _row(view: RobotView, now: float) -> list[str]:
-    silence = now - view.heard
-    state = view.status.get("state") or (view.pose.state if view.fresh_pose(now) and view.pose else "-")
+    silence, pose = now - view.heard, view.fresh_pose(now)
+    state = view.status.get("state") or (pose.state if pose else "-")
     if silence > SILENT:
         state = f"silent {silence:.0f} s"
     latency, counters = _mapping(view.status, "latency_ms"), _mapping(view.status, "counters")
+    cells, rate = ["-"] * 5, f"{view.pose_rate(now):.1f}"
+    if pose is not None:
+        cells = [f"{value:.2f}" for value in pose.T_map_body[:3, 3]]
+        cells += [f"{math.degrees(yaw_of(pose.T_map_body)):.1f}", _number(pose.age, 2)]
+    says = _mapping(view.status, "calibration").get("says")  # the node's remarks on sensor and odometry
+    reasons = [
+        f"on map {view.status['map']}" if isinstance(view.status.get("map"), str) else "",
+        str(view.status.get("reason") or ""),
+        view.node,
+        *(map(str, says) if isinstance(says, list) else ()),
+    ]
     return [
         printable(view.robot),
         printable(state),
-        *_pose_cells(view.fresh_pose(now), view.pose_rate(now)),
+        *cells,
+        rate,
+        "-" if pose is None else _odds(1.0 - pose.confidence),
         f"{_number(latency.get('p50'), 0)}/{_number(latency.get('p99'), 0)}",
         _number(counters.get("dropped"), 0),
-        printable(
-            "; ".join(
-                [
-                    *_map(view.status),
-                    str(view.status.get("reason") or ""),
-                    *filter(None, [view.node]),
-                    *_says(view.status),
-                ]
-            )
-        ),
-    ]
-
-
-def _map(status: dict[str, Any]) -> list[str]:
-    """Say on which of several maps a robot is."""
-    return [f"on map {status['map']}"] if isinstance(status.get("map"), str) else []
-
-
-def _pose_cells(pose: PoseMessage | None, rate: float) -> list[str]:
-    if pose is None:
-        return ["-"] * 5 + [f"{rate:.1f}", "-"]
-    x, y, z = pose.T_map_body[:3, 3]
-    yaw = math.degrees(yaw_of(pose.T_map_body))
-    return [
-        f"{x:.2f}",
-        f"{y:.2f}",
-        f"{z:.2f}",
-        f"{yaw:.1f}",
-        _number(pose.age, 2),
-        f"{rate:.1f}",
-        _odds(1.0 - pose.confidence),
+        printable("; ".join(filter(None, reasons))),
     ]
 
 
 def _line(row: list[str]) -> str:
-    return "  ".join(_cell(text, width) for text, (_, width) in zip(row, _COLUMNS, strict=False)).rstrip()
-
-
-def _cell(text: str, width: int) -> str:
-    return text.ljust(-width) if width < 0 else text.rjust(width)
+    cells = (
+        text.ljust(-width) if width < 0 else text.rjust(width) for text, (_, width) in zip(row, _COLUMNS, strict=False)
+    )
+    return "  ".join(cells).rstrip()
 
 
 def _odds(wrong: float) -> str:
@@ -193,12 +159,6 @@ def _odds(wrong: float) -> str:
 def _mapping(status: dict[str, Any], name: str) -> dict[str, Any]:
     value = status.get(name)
     return value if isinstance(value, dict) else {}
-
-
-def _says(status: dict[str, Any]) -> list[str]:
-    """Return the node's remarks on the robot's sensor and odometry."""
-    says = _mapping(status, "calibration").get("says")
-    return [str(clause) for clause in says] if isinstance(says, list) else []
 
 
 def _number(value: object, digits: int) -> str:

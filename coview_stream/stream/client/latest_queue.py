@@ -17,13 +17,7 @@ _Item = TypeVar("_Item")
 class LatestQueue(Generic[_Item]):
     """Bounded queue in order of arrival; a new item replaces the oldest when it is full.
 
-    ``put`` never blocks, so that a slow reader does not block a subscription.
-
-    Args:
-        size: maximal number of items, at least 1.
-
-    Raises:
-        ConfigError: ``size`` is below 1.
+    ``put`` never blocks, so that a slow reader does not block a subscription. ConfigError for a ``size`` below 1.
     """
 
     def __init__(self, size: int) -> None:
@@ -33,19 +27,15 @@ class LatestQueue(Generic[_Item]):
         self._arrived = threading.Condition()
         self._waking: set[Callable[[], None]] = set()  # of readers in event loops
         self._closed = False
-        self._dropped = 0
-
-    @property
-    def dropped(self) -> int:
+        self.dropped = 0
         """Number of items that were replaced unread."""
-        return self._dropped
 
     def put(self, item: _Item) -> None:
         """Add an item; after :meth:`close` it is ignored."""
         with self._arrived:
             if self._closed:
                 return
-            self._dropped += len(self._items) == self._items.maxlen
+            self.dropped += len(self._items) == self._items.maxlen
             self._items.append(item)
             self._arrived.notify()
             self._wake_loops()

@@ -58,19 +58,12 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class ScheduledSample:
-    """An odometry sample of a replay, with a frame or without.
+    """An odometry sample of a replay, with a frame or without."""
 
-    Attributes:
-        due: seconds after the start of the replay.
-        stamp: seconds of sensor time.
-        T_odom_body: (4, 4), odometry <- body, metres.
-        frame: index in the run; None between frames.
-    """
-
-    due: float
-    stamp: float
-    T_odom_body: Pose
-    frame: int | None
+    due: float  # seconds after the start of the replay
+    stamp: float  # seconds of sensor time
+    T_odom_body: Pose  # (4, 4), odometry <- body, metres
+    frame: int | None  # index in the run; None between frames
 
 
 def schedule(run: Run, config: ReplayConfig) -> Iterator[ScheduledSample]:
@@ -81,8 +74,16 @@ def schedule(run: Run, config: ReplayConfig) -> Iterator[ScheduledSample]:
     lap_stamp = float(run.stamps[-1] - run.stamps[0]) + _period(run.stamps, _SINGLE_FRAME_PERIOD)
     lap = 0
     while True:
-        for sample in _lap(run, dues, config.odometry_rate):
-            yield replace(sample, due=lap * lap_due + sample.due, stamp=lap * lap_stamp + sample.stamp)
+        for k in range(len(run)):
+            samples: list[tuple[float, float, Pose, int | None]]
+            samples = [(float(dues[k]), float(run.stamps[k]), run.poses[k], k)]
+            # none after the last frame: the robot did not drive back to the start
+            count = round((dues[k + 1] - dues[k]) * (config.odometry_rate or 0.0)) if k + 1 < len(run) else 0
+            for share in np.arange(1, count) / max(count, 1):
+                due, stamp = (float(a[k] + share * (a[k + 1] - a[k])) for a in (dues, run.stamps))
+                samples.append((due, stamp, interpolate(run.poses[k], run.poses[k + 1], share), None))
+            for due, stamp, pose, frame in samples:
+                yield ScheduledSample(lap * lap_due + due, lap * lap_stamp + stamp, pose, frame)
         if not config.loop:
             return
         lap += 1
@@ -108,23 +109,6 @@ def _period(times: Floats, single: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else single
 
 
-def _lap(run: Run, dues: Floats, odometry_rate: float | None) -> Iterator[ScheduledSample]:
-    for k in range(len(run)):
-        yield ScheduledSample(float(dues[k]), float(run.stamps[k]), run.poses[k], k)
-        # no sample after the last frame: the robot did not drive back to the start
-        if odometry_rate is not None and k + 1 < len(run):
-            yield from _between(run, dues, k, odometry_rate)
-
-
-def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[ScheduledSample]:
-    count = round((dues[k + 1] - dues[k]) * rate)
-    if count < 2:
-        return
-    for share in np.arange(1, count) / count:
-        due, stamp = (a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps))
-        yield ScheduledSample(float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None)
-
-
 _MAX_MEASUREMENTS = 100_000  # of each kind: a replay in a loop may run for days
 _LATE = 0.02  # seconds; a live lidar's own jitter stays below
 
@@ -143,31 +127,19 @@ class Clock(Protocol):
 
 @dataclass
 class ReplayReport:
-    """Result of a replay.
+    """Result of a replay."""
 
-    Attributes:
-        frames: clouds sent.
-        odometry: odometry samples sent.
-        points: in all clouds sent.
-        damaged: frames not sent: they cannot be read, or have no finite point.
-        first_error: of the damaged frames, None without any.
-        seconds: from the first message to the last.
-        put_ms: duration of publishing each cloud, milliseconds.
-        late_ms: delay of each sample after its deadline, milliseconds.
-        finished: False if it was ended before its last frame.
-        heard: False if there was no subscriber; set by the caller, who has looked.
-    """
-
-    frames: int = 0
-    odometry: int = 0
-    points: int = 0
-    damaged: int = 0
-    first_error: CloudError | None = None
-    seconds: float = 0.0
+    frames: int = 0  # clouds sent
+    odometry: int = 0  # odometry samples sent
+    points: int = 0  # in all clouds sent
+    damaged: int = 0  # frames not sent: they cannot be read, or have no finite point
+    first_error: CloudError | None = None  # of the damaged frames
+    seconds: float = 0.0  # from the first message to the last
+    # milliseconds of publishing each cloud, and of each sample's delay after its deadline
     put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
-    finished: bool = False
-    heard: bool = True
+    finished: bool = False  # or ended before its last frame
+    heard: bool = True  # False if there was no subscriber; set by the caller, who has looked
 
     def text(self) -> str:
         """Summarize in a few lines."""
@@ -221,7 +193,18 @@ def replay(
             if clock.wait(start + sample.due - clock.now()):
                 break
             report.late_ms.append(1e3 * (clock.now() - start - sample.due))
-            _send(sample, sender, clock, report)
+            if sample.odometry is not None:
+                sender.put_odometry(sample.odometry)
+                report.odometry += 1
+            if sample.error is not None:
+                report.damaged += 1
+                report.first_error = report.first_error or sample.error
+            if sample.cloud is not None:
+                before = clock.now()
+                sender.put_cloud(sample.cloud)
+                report.put_ms.append(1e3 * (clock.now() - before))
+                report.frames += 1
+                report.points += sample.points
             report.seconds = clock.now() - start
             on_frame(report.frames)
         else:
@@ -229,21 +212,6 @@ def replay(
     if report.first_error is not None and not report.frames:
         raise report.first_error
     return report
-
-
-def _send(sample: _EncodedSample, sender: Sender, clock: Clock, report: ReplayReport) -> None:
-    if sample.odometry is not None:
-        sender.put_odometry(sample.odometry)
-        report.odometry += 1
-    if sample.error is not None:
-        report.damaged += 1
-        report.first_error = report.first_error or sample.error
-    if sample.cloud is not None:
-        before = clock.now()
-        sender.put_cloud(sample.cloud)
-        report.put_ms.append(1e3 * (clock.now() - before))
-        report.frames += 1
-        report.points += sample.points
 
 
 def _encoded(run: Run, sender: Sender, config: ReplayConfig) -> Iterator[_EncodedSample]:

@@ -29,11 +29,7 @@ _MAX_STAMP = 2**63 / 1e9  # seconds; int64 nanoseconds end there
 class Sender:
     """Encoder and publishers of one robot's clouds and odometry; encoding and publishing may be on different threads.
 
-    Args:
-        transport: the caller closes it.
-        keys: of the robot; a key expression that ends in a wildcard is completed to a key.
-        cloud_encoding: codec name; None takes the preset's, ``xyz`` if it has none.
-        odometry_encoding: codec name; None takes the preset's, ``json`` if it has none.
+    The caller closes ``transport``. Encodings are names of codecs; None takes the preset's, else ``xyz`` and ``json``.
 
     Raises:
         ConfigError: an encoding is unknown, or a key cannot be published on.
@@ -82,11 +78,7 @@ class Sender:
         return self._with_convention(encode_cloud(CloudMessage(stamp_ns, xyz, seconds), encoding))
 
     def odometry(self, T_odom_body: Pose, stamp_ns: int) -> Encoded:
-        """Encode a (4, 4) pose, odometry <- body, metres.
-
-        Raises:
-            InputError: it is no rigid transform.
-        """
+        """Encode a (4, 4) pose, odometry <- body, metres; InputError if it is no rigid transform."""
         from coview_stream.messages import encode_odometry
 
         T = to_array(T_odom_body, np.float64, "T_odom_body", InputError)

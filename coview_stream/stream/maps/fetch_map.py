@@ -30,20 +30,9 @@ _LOOK = 0.1  # seconds
 
 
 def source_of(
-    address: str,
-    base: str = "coview",
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    config: Path | None = None,
+    address: str, base: str = "coview", connect: Sequence[str] = (), config: Path | None = None
 ) -> SiteSource:
-    """Return the source of an address.
-
-    Args:
-        address: of the site.
-        base: first part of zenoh keys.
-        connect: zenoh endpoints, for addresses without one.
-        listen: zenoh endpoints to listen on, likewise.
-        config: a zenoh configuration.
+    """Return the source of a site's address; ``base``, ``connect`` and ``config`` are for ``zenoh://SITE``.
 
     Raises:
         ConfigError: no address of a site. DependencyError: a library is missing. TransportError: an object store cannot
@@ -58,10 +47,10 @@ def source_of(
         raise ConfigError(f"{address}: give zenoh://SITE, zenoh://HOST:PORT/SITE, https://... or s3://...")
     site = parts.path.strip("/")
     if not site:
-        return ZenohSource(parts.netloc, base, connect, listen, config)
+        return ZenohSource(parts.netloc, base, connect, config)
     if ":" not in parts.netloc:
         raise ConfigError(f"{address}: write zenoh://HOST:PORT/SITE, or zenoh://SITE with --connect")
-    return ZenohSource(site, base, [f"tcp/{parts.netloc}"], (), config)
+    return ZenohSource(site, base, [f"tcp/{parts.netloc}"], config)
 
 
 def fetch_map(
@@ -105,19 +94,10 @@ def open_mirror(
 ) -> Mirror:
     """Open the mirror of a site, up to date if the source can be reached; the caller closes its source.
 
-    Args:
-        address: as for :func:`fetch_map`.
-        around: circle of the tiles; None for all.
-        verify_key: must have signed the site.
-        base: first part of zenoh keys.
-        connect: zenoh endpoints of an address without one.
-        config: a zenoh configuration.
-
-    Raises:
-        As :func:`fetch_map`.
+    Arguments and errors as of :func:`fetch_map`; ``base`` and ``config`` are for ``zenoh://SITE``.
     """
     endpoints = list(connect) or ([] if config is not None else [MAP_SERVER_ENDPOINT])
-    mirror = Mirror(source_of(address, base, endpoints, (), config), verify_key, around)
+    mirror = Mirror(source_of(address, base, endpoints, config), verify_key, around)
     try:
         with progress_bar(address, unit="B", scale=True) as progress:
             mirror.open(progress)
@@ -131,10 +111,7 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
     """Write the working file of a site, of a part of one, or of several maps, in a low-priority process.
 
     The node itself would miss poses meanwhile. Errors are not raised: opening the map afterwards raises the same.
-
-    Args:
-        place: path of the map.
-        cancelled: polled; True ends the process.
+    ``cancelled`` is polled; True ends the process.
     """
     if not (place.is_dir() or place.suffix in (PART_SUFFIX, JOINED_SUFFIX)):
         return

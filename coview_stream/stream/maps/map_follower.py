@@ -35,14 +35,11 @@ class MapFollower:
         outcome: Callable[[], str] = lambda: "changed",
         period: float = PERIOD,
     ) -> None:
-        """Follow mirrors that have been opened.
+        """Follow the opened mirrors of all sites of the node's map, asking their sources every ``period`` seconds.
 
-        Args:
-            mirrors: of all sites of the node's map.
-            take_over: asks the node to load the map again.
-            outcome: returns the result of that: ``changed``, ``unchanged``, ``loading`` (the mirrors stay as they are
-                meanwhile), or another word for a failure. A change that failed is asked for again, each time later.
-            period: seconds between two questions to the sources.
+        ``take_over`` asks the node to load the map again. ``outcome`` returns the result of that: ``changed``,
+        ``unchanged``, ``loading`` (the mirrors stay as they are meanwhile), or another word for a failure. A change
+        that failed is asked for again, each time later.
         """
         self._mirrors, self._take_over, self._outcome = mirrors, take_over, outcome
         self._period = period

@@ -18,13 +18,9 @@ _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 
 @dataclass(frozen=True)
 class MapKeys:
-    """The keys of one site.
+    """The keys of one site."""
 
-    Attributes:
-        prefix: of all of them.
-    """
-
-    prefix: str
+    prefix: str  # of all of them
 
     @classmethod
     def of(cls, site: str, base: str = "coview") -> MapKeys:
@@ -55,18 +51,13 @@ class ZenohSource:
     """A site on a map server; the zenoh session is opened with the first query."""
 
     def __init__(
-        self,
-        site: str,
-        base: str = "coview",
-        connect: Sequence[str] = (),
-        listen: Sequence[str] = (),
-        config: Path | None = None,
+        self, site: str, base: str = "coview", connect: Sequence[str] = (), config: Path | None = None
     ) -> None:
         """Use a site's name and zenoh endpoints; ConfigError if the name cannot be part of a key."""
         where = ",".join(connect) or ("" if config is None else str(config))
         self.name = f"zenoh://{site}" + (f" ({where})" if where else "")
         self._keys = MapKeys.of(site, base)
-        self._given = connect, listen, config
+        self._connect, self._config = connect, config
         self._session: Any = None
 
     def manifest(self) -> bytes:
@@ -87,7 +78,15 @@ class ZenohSource:
     def _get(self, key: str, limit: int) -> bytes:
         import zenoh
 
-        self._open()
+        if self._session is None:
+            configuration = zenoh_config.compose(self._connect, (), self._config)
+            try:
+                with zenoh_config.zenoh_errors(self.name):
+                    self._session = zenoh.open(configuration)
+            except TransportError as error:
+                if _UNREACHABLE not in str(error):
+                    raise
+                raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
         with zenoh_config.zenoh_errors(self.name):
             refusal = ""
             for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
@@ -98,20 +97,6 @@ class ZenohSource:
                     raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")
                 return bytes(reply.ok.payload)
         raise TransportError(f"{self.name}: {refusal or self._silence()}")
-
-    def _open(self) -> None:
-        import zenoh
-
-        if self._session is not None:
-            return
-        config = zenoh_config.compose(*self._given)
-        try:
-            with zenoh_config.zenoh_errors(self.name):
-                self._session = zenoh.open(config)
-        except TransportError as error:
-            if _UNREACHABLE not in str(error):
-                raise
-            raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
 
     def _silence(self) -> str:
         """Return the reason for a missing answer: other sites are served there, or none."""

@@ -215,7 +215,14 @@ class _Handler(BaseHTTPRequestHandler):
         if not (self.server.open_to_names or known_host(self.headers.get("Host"), self.server.host)):
             reply: Reply | EventStream = Reply(b"this host goes by another name\n", code=421)
         else:
-            reply = self._route(self.path.partition("?")[0])
+            reply = Reply(b"there is no such page\n", code=404)
+            routes, path = self.server.routes, self.path.partition("?")[0]
+            head, slash, rest = path.rpartition("/")
+            parent = head + slash
+            if path in routes and (path == "/" or not path.endswith("/")):
+                reply = routes[path]("")
+            elif parent != "/" and parent in routes and rest:
+                reply = routes[parent](rest)
         self.connection.settimeout(_SEND_TIMEOUT)
         if isinstance(reply, Reply):
             self._begin(reply.code, reply.kind, len(reply.body))
@@ -230,16 +237,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(events)
         finally:
             reply.close()
-
-    def _route(self, path: str) -> Reply | EventStream:
-        routes = self.server.routes
-        if path in routes and not (path.endswith("/") and path != "/"):
-            return routes[path]("")
-        head, slash, rest = path.rpartition("/")
-        parent = head + slash
-        if parent != "/" and parent in routes and rest:
-            return routes[parent](rest)
-        return Reply(b"there is no such page\n", code=404)
 
     def _begin(self, code: int, kind: str, length: int | None) -> None:
         self.send_response(code)

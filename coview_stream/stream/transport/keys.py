@@ -23,11 +23,7 @@ _FORBIDDEN = re.compile(r"[*$?#]")
 
 
 def check_chunk(text: str, option: str) -> str:
-    """Return ``text`` if it can be one chunk of a key, such as a robot's name.
-
-    Args:
-        text: given by the user.
-        option: its name in error messages, for example ``--robot``.
+    """Return ``text`` if it can be one chunk of a key, such as a robot's name; ``option`` names it in errors.
 
     Raises:
         ConfigError: if it is empty, starts with ``@``, or holds one of ``/*$?#`` or unprintable characters.
@@ -49,9 +45,8 @@ def check_prefix(text: str, option: str) -> str:
 
 
 def _checked_plain(chunk: str, text: str, option: str) -> str:
-    found = _FORBIDDEN.search(chunk)
-    if found:
-        raise ConfigError(f"{option} {text!r} holds {found.group()!r}, which zenoh reserves in keys: leave it out")
+    if forbidden := _FORBIDDEN.search(chunk):
+        raise ConfigError(f"{option} {text!r} holds {forbidden.group()!r}, which zenoh reserves in keys: leave it out")
     if chunk.startswith("@"):
         raise ConfigError(f"{option} {text!r}: a part that starts with '@' is hidden from zenoh wildcards: rename it")
     if not chunk.isprintable():
@@ -60,15 +55,9 @@ def _checked_plain(chunk: str, text: str, option: str) -> str:
 
 
 def check_expression(text: str, option: str, wildcards: bool = True) -> str:
-    """Return ``text`` if it is a key expression in zenoh's canonical form.
+    """Return ``text`` if it is a key expression in zenoh's canonical form, else raise ConfigError about ``option``.
 
-    Args:
-        text: given by the user.
-        option: its name in error messages.
-        wildcards: accept ``*``, ``**`` and ``$*``; False for a key to publish on.
-
-    Raises:
-        ConfigError: if it is not one.
+    Without ``wildcards`` (``*``, ``**`` and ``$*``) it must be a key to publish on.
     """
     chunks = text.split("/")
     for chunk in chunks:
@@ -107,30 +96,20 @@ _INPUT_OPTIONS = ("--cloud-key", "--odometry-key")
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """One row of the table: templates of keys, and the formats on them.
+    """Templates of keys, in which ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}`` are filled in, and formats.
 
-    Attributes:
-        cloud: key expression of lidar frames; here and below ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}``
-            are filled in.
-        odometry: key expression of odometry.
-        pose: key of our poses.
-        cloud_hint: codec to try where Encoding and key do not say; None leaves it to the payload.
-        odometry_hint: the same for odometry.
-        pose_hint: the same for a reader of our poses.
-        pose_format: codec that poses are written with, unless the user asks for another.
-        bare: poses go out without Encoding, as the convention does.
-        rmw: poses need rmw_zenoh's attachment and liveliness tokens.
+    A hint is the codec to try where Encoding and key do not say; None leaves it to the payload.
     """
 
-    cloud: str
-    odometry: str
-    pose: str
+    cloud: str  # key expression of lidar frames
+    odometry: str  # likewise
+    pose: str  # key of our poses
     cloud_hint: str | None = None
     odometry_hint: str | None = None
-    pose_hint: str | None = None
-    pose_format: str = "json"
-    bare: bool = False
-    rmw: bool = False
+    pose_hint: str | None = None  # for a reader of our poses
+    pose_format: str = "json"  # codec that poses are written with, unless the user asks for another
+    bare: bool = False  # poses go out without Encoding, as the convention has it
+    rmw: bool = False  # poses need rmw_zenoh's attachment and liveliness tokens
 
 
 PRESETS: dict[str, Preset] = {
@@ -176,46 +155,27 @@ PRESETS: dict[str, Preset] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RobotKeys(Preset):
-    """A preset filled in for one robot, with the keys that are native in all presets.
+    """A preset filled in for one robot, with the keys that are native in all presets."""
 
-    Attributes:
-        robot: its name.
-        status: key to publish the status on.
-        hypotheses: key to publish on which places a search considers.
-        location: key to publish places on Earth on, if that is asked for.
-        alive: key of the liveliness token.
-        relocalize: key that answers queries to forget the pose and search again.
-        initial_pose: key to subscribe to for guesses of the place.
-        suggest: key that answers queries with a guess of the place in their parameters.
-        reset: key that answers queries to forget everything.
-        map_view: key that answers queries with the map, thinned, to look at.
-    """
-
-    robot: str
+    robot: str  # its name
     status: str
-    hypotheses: str
-    location: str
-    alive: str
-    relocalize: str
-    initial_pose: str
-    suggest: str
-    reset: str
-    map_view: str
+    hypotheses: str  # places that a search considers
+    location: str  # places on Earth, if they are asked for
+    alive: str  # of the liveliness token
+    relocalize: str  # query: forget the pose and search again
+    initial_pose: str  # subscribed to, for guesses of the place
+    suggest: str  # query: a guess of the place in its parameters
+    reset: str  # query: forget everything
+    map_view: str  # query: the map, thinned, to look at
 
 
 @dataclass(frozen=True)
 class NodeKeys:
-    """Keys of a node, whichever robots it serves; no wildcard matches them, for ``@node`` is a verbatim chunk.
+    """Keys of a node, whichever robots it serves; no wildcard matches them, for ``@node`` is a verbatim chunk."""
 
-    Attributes:
-        health: key to publish its health and metrics on, once a second.
-        ask_health: key that answers queries with the same.
-        reload: key that answers queries to open the map's file again.
-    """
-
-    health: str
-    ask_health: str
-    reload: str
+    health: str  # its health and metrics, once a second
+    ask_health: str  # query: the same
+    reload: str  # query: open the map's file again
 
 
 def node_keys(base: str, name: str) -> NodeKeys:
@@ -305,7 +265,14 @@ def check_disjoint(keys: Sequence[RobotKeys]) -> None:
     if len(set(names)) < len(names):
         raise ConfigError(f"--robot: {', '.join(names)}: each name once")
     for one, other in combinations(keys, 2):
-        _check_inputs(one, other)
+        for first, a in zip(_INPUT_OPTIONS, (one.cloud, one.odometry), strict=True):
+            for second, b in zip(_INPUT_OPTIONS, (other.cloud, other.odometry), strict=True):
+                if matches(a, b):
+                    both = first if first == second else f"{first} and {second}"
+                    raise ConfigError(
+                        f"{first} {a!r} of robot {one.robot} and {second} {b!r} of {other.robot} have messages in "
+                        f"common: use {{robot}} in {both}"
+                    )
         if one.pose == other.pose:
             raise ConfigError(
                 f"--pose-key: poses of robots {one.robot} and {other.robot} would both go to {one.pose!r}: "
@@ -321,17 +288,6 @@ def check_disjoint(keys: Sequence[RobotKeys]) -> None:
                     )
 
 
-def _check_inputs(one: RobotKeys, other: RobotKeys) -> None:
-    for first, a in zip(_INPUT_OPTIONS, (one.cloud, one.odometry), strict=True):
-        for second, b in zip(_INPUT_OPTIONS, (other.cloud, other.odometry), strict=True):
-            if matches(a, b):
-                both = first if first == second else f"{first} and {second}"
-                raise ConfigError(
-                    f"{first} {a!r} of robot {one.robot} and {second} {b!r} of {other.robot} have messages in common: "
-                    f"use {{robot}} in {both}"
-                )
-
-
 _MAX_STATUS = 65_536  # bytes of a status that is read
 _MAX_NAME = 64  # characters of a node's name or host
 _MAX_PERIOD = 60.0  # seconds between two statuses
@@ -339,19 +295,12 @@ _MAX_PERIOD = 60.0  # seconds between two statuses
 
 @dataclass(frozen=True)
 class NodeIdentity:
-    """Identity of a node in its statuses.
-
-    Attributes:
-        node: unlike that of any other node.
-        host: name of its machine, for people.
-        period: seconds between its statuses.
-        ending: it serves no longer.
-    """
+    """Identity of a node in its statuses: a unique ``node``, its ``host`` for people, seconds between its statuses."""
 
     node: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     host: str = field(default_factory=lambda: socket.gethostname()[:_MAX_NAME])
     period: float = 1.0
-    ending: bool = False
+    ending: bool = False  # it serves no longer
 
     def __str__(self) -> str:
         return f"{self.node} on {self.host}" if self.host else self.node

@@ -99,11 +99,7 @@ class MemoryTransport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
     ) -> dict[str, Any]:
-        """Call the handler that :meth:`answer` declared; there is nothing to wait for.
-
-        Raises:
-            TransportError: if no answer is declared on ``key``, the network is away, or the handler raises.
-        """
+        """Call the handler that :meth:`answer` declared; TransportError without one, or if it raises."""
         handler = next((handler for name, handler in self._answers if matches(name, key)), None)
         if handler is None or not self._connected:
             raise TransportError(f"{key}: no answer")

@@ -63,10 +63,8 @@ def publisher_token(key: str, zid: str, node: str, entity_id: int) -> str:
 class RmwPublisher:
     """Publisher as a ROS 2 node has it: with the attachment, and without Encoding, as rmw_zenoh sets none.
 
-    Args:
-        inner: publishes the messages.
-        token: the publisher's liveliness token; its identity is derived from it.
-        now_ns: wall clock, nanoseconds, for the source time that ROS tools measure latency with.
+    The identity in the attachment derives from ``token``, the publisher's liveliness token. ``now_ns`` is the wall
+    clock, nanoseconds, for the source time that ROS tools measure latency with.
     """
 
     def __init__(self, inner: Publisher, token: str, now_ns: Callable[[], int]) -> None:

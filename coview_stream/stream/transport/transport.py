@@ -35,17 +35,11 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True)
 class Connection:
-    """Zenoh identities that a transport is connected to, sorted.
-
-    Attributes:
-        routers: the routers.
-        peers: all others; clients of a listening session count as peers.
-        clients: those of the peers that are clients.
-    """
+    """Zenoh identities that a transport is connected to, sorted."""
 
     routers: tuple[str, ...] = ()
-    peers: tuple[str, ...] = ()
-    clients: tuple[str, ...] = ()
+    peers: tuple[str, ...] = ()  # all others; clients of a listening session count as peers
+    clients: tuple[str, ...] = ()  # the peers that are clients
 
 
 class Transport(Protocol):

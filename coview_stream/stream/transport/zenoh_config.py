@@ -44,17 +44,9 @@ _SHARED_MEMORY = "transport/shared_memory/enabled"
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
 _FILES = (
-    *(
-        f"transport/link/tls/{name}"
-        for name in (
-            "root_ca_certificate",
-            "listen_certificate",
-            "listen_private_key",
-            "connect_certificate",
-            "connect_private_key",
-        )
-    ),
-    "transport/auth/usrpwd/dictionary_file",
+    *("transport/link/tls/root_ca_certificate", "transport/link/tls/listen_certificate"),
+    *("transport/link/tls/listen_private_key", "transport/link/tls/connect_certificate"),
+    *("transport/link/tls/connect_private_key", "transport/auth/usrpwd/dictionary_file"),
 )
 
 # zenoh's words
@@ -95,8 +87,8 @@ def compose(
     peers do not see each other through a router, a client is seen by all.
 
     Args:
-        connect: endpoints to connect to, for example ``tcp/10.0.0.1:7447``.
-        listen: endpoints to listen on.
+        connect: endpoints, for example ``tcp/10.0.0.1:7447``.
+        listen: endpoints.
         path: a zenoh configuration, JSON5 or YAML.
         lease_ms: how long others wait for a sign of life before they take us for dead; None leaves it at zenoh's 10 s.
 
@@ -104,25 +96,50 @@ def compose(
         TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
             malformed.
     """
+    import zenoh
+
     for endpoint in connect:
         _check_endpoint(endpoint, "--connect")
     for endpoint in listen:
         _check_endpoint(endpoint, "--listen")
-    config, text = _load(path)
+    config, text = zenoh.Config(), ""
+    if path is not None:
+        try:
+            text = _COMMENT.sub("", Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            cause = error.strerror if isinstance(error, OSError) else "not a text file"
+            raise TransportError(f"zenoh configuration {path}: {cause}: give a JSON5 file that can be read") from error
+        with zenoh_errors(f"zenoh configuration {path}"):
+            config = zenoh.Config.from_file(str(path))
+    defaults = zenoh.Config()
+
+    def is_unset(key: str) -> bool:  # zenoh does not list a file's settings; a value equal to the default counts
+        return bool(_get(config, key) == _get(defaults, key))
+
     if connect:
         _insert(config, "connect/endpoints", list(connect))
-    _set_listen(config, listen)
+    if listen:
+        _insert(config, "listen/endpoints", list(listen))
+    elif mode_of(config) != "router" and is_unset("listen/endpoints"):
+        _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
     if _get(config, "mode") is None:
         has_listen, has_connect = (bool(_get(config, "listen/endpoints")), bool(_get(config, "connect/endpoints")))
         _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
     for key, value in _DEFAULTS.items():
-        if _is_unset(config, key):
+        if is_unset(key):
             _insert(config, key, value)
-    if lease_ms is not None and "lease" not in _COMMENT.sub("", text):
+    if lease_ms is not None and "lease" not in text:
         _insert(config, "transport/link/tx/lease", lease_ms)
-    if "shared_memory" not in _COMMENT.sub("", text):  # set or not, it reads the same: ask the file's text
+    if "shared_memory" not in text:  # set or not, it reads the same: ask the file's text
         _insert(config, _SHARED_MEMORY, False)
-    _check(config, path)
+    if _get(config, "transport/unicast/lowlatency"):
+        raise TransportError(
+            f"zenoh configuration {path}: transport/unicast/lowlatency loses messages over 64 KB: take it out"
+        )
+    for key in _FILES:
+        name = _get(config, key)
+        if name is not None and not Path(name).is_file():  # zenoh would retry for ever without a word
+            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
     return config
 
 
@@ -137,46 +154,6 @@ def endpoints_of(config: Any) -> str:
     if isinstance(found, dict):
         found = found.get(mode_of(config)) or []
     return ", ".join(map(str, found)) or "no endpoint"
-
-
-def _load(path: Path | None) -> tuple[Any, str]:
-    import zenoh
-
-    if path is None:
-        return zenoh.Config(), ""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise TransportError(f"zenoh configuration {path}: {cause}: give a JSON5 file that can be read") from error
-    with zenoh_errors(f"zenoh configuration {path}"):
-        return zenoh.Config.from_file(str(path)), text
-
-
-def _is_unset(config: Any, key: str) -> bool:
-    import zenoh
-
-    # zenoh does not list a file's settings; a value equal to the default counts as unset
-    return bool(_get(config, key) == _get(zenoh.Config(), key))
-
-
-def _set_listen(config: Any, listen: Sequence[str]) -> None:
-    if listen:
-        _insert(config, "listen/endpoints", list(listen))
-    elif mode_of(config) != "router" and _is_unset(config, "listen/endpoints"):
-        _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
-
-
-def _check(config: Any, path: Path | None) -> None:
-    if _get(config, "transport/unicast/lowlatency"):
-        raise TransportError(
-            f"zenoh configuration {path}: transport/unicast/lowlatency loses messages over 64 KB: take it out"
-        )
-    for key in _FILES:
-        name = _get(config, key)
-        # zenoh would retry for ever without a word
-        if name is not None and not Path(name).is_file():
-            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
 
 
 def _check_endpoint(endpoint: str, option: str) -> None:
@@ -208,29 +185,25 @@ def _insert(config: Any, key: str, value: Any) -> None:
 def reason(error: BaseException) -> str:
     """Return zenoh's message on one line, without the lines of its source, with a remedy where we know one."""
     text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
-    text = _mistake(text.strip()) or type(error).__name__
+    text = _shortened(text.strip()) or type(error).__name__
     for cause, remedy in _REMEDIES.items():
         if cause in text:
             return f"{text}; {remedy}"
     return text
 
 
-def _mistake(text: str) -> str:
+def _shortened(text: str) -> str:
     """Shorten an error about a configuration file, which lists all keys that there could have been."""
-    if found := _MESSAGE.fullmatch(text):
-        line = f"line {found[2]}: " if found[2] else ""
-        return line + _field(re.sub(r"\\(.)", r"\1", found[1]))
-    if found := _SYNTAX.match(text):
-        return f"line {found[1]}, column {found[2]}: {found[3]}"
-    return _field(text)
-
-
-def _field(text: str) -> str:
-    found: Any = _FIELD.search(text)
-    if found is None:
-        return text
+    line = ""
+    if syntax := _SYNTAX.match(text):
+        return f"line {syntax[1]}, column {syntax[2]}: {syntax[3]}"
+    if message := _MESSAGE.fullmatch(text):
+        line = f"line {message[2]}: " if message[2] else ""
+        text = re.sub(r"\\(.)", r"\1", message[1])
+    field: Any = _FIELD.search(text)
+    if field is None:
+        return line + text
     place = _PLACE.search(text)
-    known = re.findall(r"`([^`]+)`", found[2] or "")
-    near = difflib.get_close_matches(found[1], known, 1)
-    line = f"line {place[1]}: " if place else ""
-    return f"{line}unknown key {found[1]!r}" + (f"; did you mean {near[0]!r}?" if near else "; take it out")
+    near = difflib.get_close_matches(field[1], re.findall(r"`([^`]+)`", field[2] or ""), 1)
+    line += f"line {place[1]}: " if place else ""
+    return f"{line}unknown key {field[1]!r}" + (f"; did you mean {near[0]!r}?" if near else "; take it out")

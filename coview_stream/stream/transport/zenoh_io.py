@@ -27,10 +27,7 @@ Answer = Callable[[dict[str, str]], dict[str, Any]]
 class ZenohPublisher:
     """A publisher that may exist before the session does, and outlive it.
 
-    Args:
-        key: to publish on.
-        guard: logs zenoh's refusals.
-        writer: publishes in its own time; None publishes on the thread that calls.
+    ``guard`` logs zenoh's refusals; ``writer`` publishes in its own time, None on the thread that calls.
     """
 
     def __init__(self, key: str, guard: RateLimitedErrors, writer: Writer | None = None) -> None:

@@ -129,29 +129,18 @@ class ZenohTransport:
         """
         import zenoh
 
-        _require_key(key)
-        inbox = self._inboxes.open(key, self._receiver(handler), 1 if policy == "newest" else _QUEUE)
-        declared: list[Any] = []
-        ended = threading.Event()
+        def handle(sample: Any) -> None:
+            if not self._closing.is_set() and sample.kind == zenoh.SampleKind.PUT:
+                handler(plain(sample, self._max_payload))
 
-        def declare(session: Any) -> None:
-            if ended.is_set():
-                return
-            callback = zenoh.handlers.Callback(inbox.put, indirect=False)
-            subscriber = session.declare_subscriber(key, callback)
-            declared[:] = [subscriber]
-            self._declared.append(subscriber)
-            if not any(thread.name.startswith("coview inboxes") for thread in self._threads):
-                for number in range(THREADS):
-                    self._start(f"inboxes {number + 1}", self._inboxes.run)
+        inbox = self._inboxes.open(key, handle, 1 if policy == "newest" else _QUEUE)
 
-        def end() -> None:
-            ended.set()
-            inbox.close()
-            self._undeclare(key, declare, declared)
+        def declare(session: Any) -> Any:
+            subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(inbox.put, indirect=False))
+            self._start_once("inboxes", self._inboxes.run, THREADS)
+            return subscriber
 
-        self._declare(key, declare)
-        return end
+        return self._declare_until_end(key, declare, threading.Event(), inbox.close)
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
@@ -159,8 +148,8 @@ class ZenohTransport:
 
         def declare(session: Any) -> None:
             publisher.attach(session.declare_publisher(key, **quality(urgency)))
-            if urgency == "data" and not any(thread.name == "coview writer" for thread in self._threads):
-                self._start("writer", self._writer.run)
+            if urgency == "data":
+                self._start_once("writer", self._writer.run)
 
         self._declare(key, declare)
         return publisher
@@ -172,25 +161,15 @@ class ZenohTransport:
         """
         import zenoh
 
-        declared: list[Any] = []
         ended = threading.Event()
+        callback = zenoh.handlers.Callback(self._answers.callback(key, handler, ended), indirect=False)
 
-        def declare(session: Any) -> None:
-            if ended.is_set():
-                return
-            callback = zenoh.handlers.Callback(self._answers.callback(key, handler, ended), indirect=False)
+        def declare(session: Any) -> Any:
             queryable = session.declare_queryable(key, callback)
-            declared[:] = [queryable]
-            self._declared.append(queryable)
-            if not any(thread.name == "coview answers" for thread in self._threads):
-                self._start("answers", self._answers.run)
+            self._start_once("answers", self._answers.run)
+            return queryable
 
-        def end() -> None:
-            ended.set()
-            self._undeclare(key, declare, declared)
-
-        self._declare(key, declare)
-        return end
+        return self._declare_until_end(key, declare, ended)
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
@@ -203,12 +182,7 @@ class ZenohTransport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
     ) -> dict[str, Any]:
-        """Query ``key``, after waiting for the first router if need be, and return the first JSON reply.
-
-        Raises:
-            TransportError: no answer within ``timeout`` seconds, or one that is an error, no JSON object or larger
-                than ``max_bytes``.
-        """
+        """As :meth:`Transport.query`, after waiting for the first router if need be."""
         deadline = time.monotonic() + timeout
         while (session := self._session) is None and time.monotonic() < deadline:
             time.sleep(_POLL)
@@ -220,11 +194,7 @@ class ZenohTransport:
         raise TransportError(f"{key}: no answer within {timeout:g} s; is the node running and connected?")
 
     def tokens(self, expression: str) -> list[str]:
-        """List the liveliness tokens that match ``expression`` right now, sorted; none while there is no session.
-
-        Raises:
-            TransportError: if ``expression`` is no key expression or zenoh fails.
-        """
+        """As :meth:`Transport.tokens`."""
         session = self._session
         if session is None:
             return []
@@ -233,10 +203,7 @@ class ZenohTransport:
         return sorted({str(sample.key_expr) for sample in replies if sample is not None})
 
     def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
-        """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
-
-        ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.
-        """
+        """As :meth:`Transport.await_subscriber`."""
         probe: Any = None
         deadline = time.monotonic() + seconds
         try:
@@ -282,7 +249,8 @@ class ZenohTransport:
         if session is not None:
             self._writer.flush(FLUSH)
             self._writer.end()
-            self._end_session(session)
+            self._start_once("closing", self._end, 1, session)
+            self._threads[-1].join(_CLOSE_TIMEOUT)  # a link that is held up keeps it from closing: go on without
         self._writer.end()
         self._answers.end()
         self._inboxes.end()
@@ -294,17 +262,9 @@ class ZenohTransport:
         if not any(thread.is_alive() for thread in self._threads):
             atexit.unregister(self._at_exit)
 
-    def _end_session(self, session: Any) -> None:
-        """Close a session, and go on without waiting where a link that is held up keeps it from closing."""
-
-        def end() -> None:
-            with self._guard.catch("closing"):
-                session.close()
-
-        closing = threading.Thread(target=end, name="coview closing", daemon=True)
-        self._threads.append(closing)
-        closing.start()
-        closing.join(_CLOSE_TIMEOUT)
+    def _end(self, session: Any) -> None:
+        with self._guard.catch("closing"):
+            session.close()
 
     def _at_exit(self) -> None:
         self.close()
@@ -323,7 +283,7 @@ class ZenohTransport:
                 raise
             return
         first: SimpleQueue[TransportError | None] = SimpleQueue()
-        self._start("opening", self._keep_trying, first)
+        self._start_once("opening", self._keep_trying, 1, first)
         where = zenoh_config.endpoints_of(self._config)
         try:
             error = first.get(timeout=_OPEN_TIMEOUT)
@@ -372,35 +332,41 @@ class ZenohTransport:
                     declare(self._session)
             self._declarations.append(declare)
 
-    def _undeclare(self, key: str, declare: Callable[[Any], None], declared: list[Any]) -> None:
-        """End a declaration, in this session and in one that opens later."""
-        with self._lock:
-            if declare in self._declarations:
-                self._declarations.remove(declare)
-            ending = [entity for entity in declared if entity in self._declared]
+    def _declare_until_end(
+        self, key: str, declare: Callable[[Any], Any], ended: threading.Event, close: Callable[[], None] = lambda: None
+    ) -> Callable[[], None]:
+        """Declare an entity; return the function that ends it, in this session and in one that opens later."""
+        declared: list[Any] = []
+
+        def declare_unless_ended(session: Any) -> None:
+            if not ended.is_set():
+                declared[:] = [declare(session)]
+                self._declared.extend(declared)
+
+        def end() -> None:
+            ended.set()
+            close()
+            with self._lock:
+                if declare_unless_ended in self._declarations:
+                    self._declarations.remove(declare_unless_ended)
+                ending = [entity for entity in declared if entity in self._declared]
+                for entity in ending:
+                    self._declared.remove(entity)
+                declared.clear()
             for entity in ending:
-                self._declared.remove(entity)
-            declared.clear()
-        for entity in ending:
-            with self._guard.catch(key):
-                entity.undeclare()
+                with self._guard.catch(key):
+                    entity.undeclare()
 
-    # threads
+        self._declare(key, declare_unless_ended)
+        return end
 
-    def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:
-        thread = threading.Thread(target=target, args=args, name=f"coview {name}", daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-    def _receiver(self, handler: Callable[[Sample], None]) -> Callable[[Any], None]:
-        """Return the function that an inbox calls with each of zenoh's samples."""
-        import zenoh
-
-        def handle(sample: Any) -> None:
-            if not self._closing.is_set() and sample.kind == zenoh.SampleKind.PUT:
-                handler(plain(sample, self._max_payload))
-
-        return handle
+    def _start_once(self, name: str, target: Callable[..., None], count: int = 1, *args: Any) -> None:
+        if any(thread.name.startswith(f"coview {name}") for thread in self._threads):
+            return
+        for number in range(count):
+            name_of_thread = f"coview {name} {number + 1}" if count > 1 else f"coview {name}"
+            self._threads.append(threading.Thread(target=target, args=args, name=name_of_thread, daemon=True))
+            self._threads[-1].start()
 
 
 def _require_key(key: str) -> None:
