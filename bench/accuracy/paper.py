@@ -18,7 +18,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.search import recognizers
-from coview_stream.localization.search.consensus import Consensus, Hypothesis, Request, yaw_of_shift
+from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus, exact_distances
 
 CANDIDATES = 200
@@ -104,7 +104,7 @@ class TableVote:
         """Look z-scores (K,) up; 0 for station -1."""
         return np.where(stations < 0, np.float32(0.0), self.scores[stations, shifts])
 
-    def at_all(self, requests: Sequence[Request[TableVote]]) -> list[Floats32]:
+    def at_all(self, requests: Sequence[tuple[TableVote, Ints, Ints]]) -> list[Floats32]:
         """Look all up, one after the other."""
         return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
@@ -159,7 +159,7 @@ class PaperConsensus:
     """Consensus by exact distances, or their single smallest, with the interface of the product's."""
 
     def __init__(self, retrieval: Retrieval, config: ConsensusConfig, modes: Modes) -> None:
-        self._map: Any = retrieval.stations
+        self._map: Any = retrieval.base_map
         self._modes = modes
         grid = self._map.station_grid
         self._votes: Consensus | SmallestDistance = (

@@ -181,7 +181,7 @@ class _AllCompared(Retrieval):
     """Retrieval that compares every station, however many they are."""
 
     def compared(self, area: Circle | None = None) -> SearchStations:
-        return SearchStations(self.stations.station_index, self.stations.station_grid)
+        return SearchStations(self.base_map.station_index, self.base_map.station_grid)
 
 
 def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:

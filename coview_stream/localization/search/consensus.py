@@ -1,8 +1,8 @@
-"""Consensus: every keyframe votes for one ``T_map_odom``.
+"""Consensus: all keyframes vote on hypotheses of one ``T_map_odom``.
 
-A keyframe names stations and shifts where it may have been taken; each is a hypothesis of the same unknown transform.
-Odometry predicts the station and shift of the other keyframes under it, and their votes there are added. Places that no
-keyframe names are never scored; a place that one names is scored by all.
+A keyframe names stations and shifts where it may have been taken; each pair is a hypothesis of the same unknown
+transform. Odometry predicts the station and shift of the other keyframes under it, and their votes there are added. A
+place that one keyframe names is scored by all keyframes; other places are never scored.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, NamedTuple, Protocol, Self, TypeVar
+from typing import Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +24,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import Evidence
 
 _KEPT = 8  # places per requested hypothesis that stay from keyframe to keyframe
-_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of the distances that make places distinct: bins that keep the best place each
-
-V = TypeVar("V")
+_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # size of bins, relative to the distances that make places distinct
 
 
 @dataclass(frozen=True)
@@ -34,16 +32,16 @@ class Hypothesis:
     """A hypothesis of ``T_map_odom``, from the votes that name it to its registration.
 
     Attributes:
-        T_map_odom: (4, 4).
-        station: index of its station; None for a pose hint, which has no votes.
-        shift: its number of sectors; None for a pose hint.
-        votes: sum of its votes, lower is better.
-        learned: whether the votes are those of learned features.
+        T_map_odom: (4, 4); the registered pose once there is a registration.
+        station: index of the station; None for a pose hint, which has no votes.
+        shift: number of sectors; None for a pose hint.
+        votes: sum of the votes, lower is better.
+        learned: whether learned features voted.
         hinted: whether a pose hint came to this place.
         score: of the newest keyframe, in [0, 1], by the field.
         ratio: log-likelihood ratio of the keyframes so far against chance.
         probability: posterior probability that the robot is here.
-        registration: of the newest keyframe, once registered; ``T_map_odom`` is its pose then.
+        registration: of the newest keyframe.
         evidence: for the registered pose.
     """
 
@@ -59,26 +57,13 @@ class Hypothesis:
     registration: Registration | None = None
     evidence: Evidence | None = None
 
-    def registered(self, registration: Registration, evidence: Evidence) -> Hypothesis:
-        """Return the hypothesis at its registered pose."""
-        T = registration.T_map_source
-        return replace(self, T_map_odom=T, registration=registration, evidence=evidence)
-
-
-class Request(NamedTuple, Generic[V]):
-    """A question to a vote: its z-scores of ``stations`` (K,), -1 for none, at ``shifts`` (K,)."""
-
-    vote: V
-    stations: Ints
-    shifts: Ints
-
 
 class Vote(Protocol):
     """One keyframe's scores of the stations at every shift; shift n means yaw -2 pi n / ``sectors`` (eq. 9)."""
 
     @property
     def centre(self) -> Floats:
-        """(3,) zero of its descriptor, z on the ground; odometry frame, metres."""
+        """(3,) zero of the descriptor, z on the ground; odometry frame, metres."""
         ...
 
     @property
@@ -87,15 +72,15 @@ class Vote(Protocol):
         ...
 
     def candidates(self) -> tuple[Ints, Ints]:
-        """Return distinct stations and shifts (K,) where it may have been taken."""
+        """Return distinct stations and shifts (K,) where the keyframe may have been taken."""
         ...
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
-        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1, no station."""
+        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1, none."""
         ...
 
-    def at_all(self, requests: Sequence[Request[Self]]) -> list[Floats32]:
-        """Return :meth:`at` of each request's vote; all votes are of the same kind and map as this one."""
+    def at_all(self, requests: Sequence[tuple[Self, Ints, Ints]]) -> list[Floats32]:
+        """Return :meth:`at` of several votes of this kind and map, each with its stations and shifts."""
         ...
 
 
@@ -104,10 +89,10 @@ class _Places:
     """N level hypotheses of ``T_map_odom`` and the votes on them.
 
     Attributes:
-        shift: (N,) their headings.
+        shift: (N,) headings.
         offset: (N, 3) float64 position of the odometry frame's origin; map frame, metres.
         station: (N,) of the newest keyframe, -1 for none.
-        votes: (N, W) float32 z-scores of the keyframes in the window, 0 of those that have not voted yet.
+        votes: (N, W) z-scores of the keyframes in the window, 0 before they vote.
     """
 
     shift: Ints
@@ -150,14 +135,14 @@ class Consensus:
         self._places = _Places.none(self.config.window)
 
     def vote(self, vote: Vote) -> None:
-        """Add one keyframe's vote: on the known places, and with all older votes on the places that it names."""
+        """Add a keyframe's vote on the known places, and all votes on the places that it names."""
         column = (self._votes[-1][0] + 1) % self.config.window if self._votes else 0
         self._votes.append((column, vote))
         followed, added = self._moved(self._places, vote), self._named(vote)
-        requests = [Request(vote, places.station, places.shift) for places in (followed, added)]
+        requests = [(vote, places.station, places.shift) for places in (followed, added)]
         targets = [places.votes[:, column] for places in (followed, added)]
         for other, older in list(self._votes)[:-1]:
-            requests.append(Request(older, self.grid.at(self._positions(added, older)), added.shift))
+            requests.append((older, self.grid.at(self._positions(added, older)), added.shift))
             targets.append(added.votes[:, other])
         for target, scores in zip(targets, vote.at_all(requests), strict=True):
             target[:] = scores
@@ -201,7 +186,7 @@ class Consensus:
         return np.asarray(places.offset + turned[places.shift])
 
     def _moved(self, places: _Places, vote: Vote) -> _Places:
-        """Return known places at the stations of a new keyframe, whose height they follow."""
+        """Return known places at the stations of a new keyframe; their height follows the stations'."""
         position = self._positions(places, vote)
         station = self.grid.at(position)
         on_map = station >= 0
@@ -209,13 +194,11 @@ class Consensus:
         return _Places(places.shift, places.offset, station, places.votes)
 
     def _named(self, vote: Vote) -> _Places:
-        """Return the places that a keyframe names (eq. 12, corrected: the yaw turns about it), without votes yet."""
+        """Return the places that a keyframe names, without votes (eq. 12, corrected: the yaw turns about it)."""
         station, shift = vote.candidates()
-        offset = np.zeros((len(station), 3))
         votes = np.zeros((len(station), self.config.window), dtype=np.float32)
-        places = _Places(shift, offset, station, votes)
-        offset[:] = self.grid.stations[station] - self._positions(places, vote)
-        return places
+        places = _Places(shift, np.zeros((len(station), 3)), station, votes)
+        return replace(places, offset=self.grid.stations[station] - self._positions(places, vote))
 
 
 def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> Floats:

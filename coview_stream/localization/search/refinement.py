@@ -7,7 +7,7 @@ around, and the results are weighed by the log-likelihood ratio of the scan, as 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,7 +73,8 @@ def register_place(
     registration = register(scan.cloud.every(_EVERY), T, target, settings, scales, upright, scan.body)
     if registration is None or tilt_of(registration.T_map_source) > config.acceptance.max_tilt:
         return None
-    return place.registered(registration, scan.evidence(base_map.field, registration.T_map_source))
+    T = registration.T_map_source
+    return replace(place, T_map_odom=T, registration=registration, evidence=scan.evidence(base_map.field, T))
 
 
 def gravity_information(sigma: float) -> Floats:

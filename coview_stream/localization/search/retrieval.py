@@ -1,9 +1,8 @@
 """Retrieval: a virtual local scan compared with the virtual scans of a map's stations at every shift (eqs 5-9).
 
-A search compares with all stations of a map, with those in a circle, or with every third of very many: two metres
-beside a station the surroundings look much as they do at it. In the last case one station of each six-metre square is
-compared, by the first tier of its code alone, and the places that keyframes agree on are then put on the best station
-of their square.
+A search compares with all stations of a map or of a circle. Where they are very many, one station of each six-metre
+square is compared, by the first tier of its code alone, as the surroundings look much the same two metres beside a
+station. The places that keyframes agree on are then moved to the best station of their square.
 """
 
 from __future__ import annotations
@@ -11,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_kernels import StationCodes
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import LEVEL_GAP, StationGrid
 from coview_stream.config import Channel, ConsensusConfig
@@ -25,22 +24,17 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats, Floats32, Int32s, Ints
 from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import Circle
-from coview_stream.localization.search.consensus import Consensus, Hypothesis, Request
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
 
-# a vote's candidates
-_MIN_STATIONS = 2048  # best stations whose shifts are looked at one by one
-_SHARE = 32  # on large maps it is one in so many
-_PER_STATION = 0.5  # candidates for each of them
-
-# the compared stations
-_SQUARE = 6.0  # metres: its middle is within 4.3 m of all of it; chosen between 4 and 6 by bench city
+_MIN_STATIONS, _SHARE = 2048, 32  # best stations whose shifts are compared: at least so many, and one in 32
+_PER_STATION = 0.5  # candidates per such station
+_SQUARE = 6.0  # metres: all of it is within 4.3 m of the middle; chosen between 4 and 6 by bench city
 _ORDINARY = 65_536  # stations that are all compared: 6 ms for one core
-
 _BLOCK = 8192  # stations whose exact spectra are made at a time
 
 
 class CoViewVote:
-    """Vote of one keyframe by its co-view descriptors: the station index screens all stations for it.
+    """Vote of one keyframe by its co-view descriptors.
 
     Attributes:
         centre: (3,) zero of the descriptors, z on the ground; odometry frame, metres.
@@ -61,7 +55,7 @@ class CoViewVote:
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
         stations = argsmallest(self._index.best(self._query), count)
         scores = self._index.all_shifts(self._query, stations)
-        # every station has a heading that is no worse than the best one of the last
+        # the best heading of each station is at least as good as the last station's
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
         here = scores[station, shift]
         previous, following = scores[station, shift - 1], scores[station, (shift + 1) % self.sectors]
@@ -74,11 +68,11 @@ class CoViewVote:
         return self._index.at(self._query, stations, shifts)
 
     def screened(self, codes: StationCodes, stations: Ints, shifts: Ints) -> Floats32:
-        """Return z-scores (K,) of stations at shifts by the first tier of all stations' codes."""
+        """Return z-scores (K,) of stations at shifts by the first tier of their codes."""
         return np.float32(self._query.screen_zero) - codes.at(self._query.coded, stations, shifts)
 
-    def at_all(self, requests: Sequence[Request[CoViewVote]]) -> list[Floats32]:
-        """Return :meth:`at` of each."""
+    def at_all(self, requests: Sequence[tuple[CoViewVote, Ints, Ints]]) -> list[Floats32]:
+        """Return :meth:`at` of each request."""
         return self._index.at_all([(vote._query, stations, shifts) for vote, stations, shifts in requests])
 
 
@@ -87,10 +81,10 @@ class SearchStations:
     """Stations (K,) that keyframes are compared with.
 
     Attributes:
-        index: of them.
-        grid: of them; its blocks are squares where each stands for one.
-        numbers: (K,) of them among the map's; None if they are all of the map.
-        squares: the stations that each represents; None for itself alone.
+        index: of the descriptors.
+        grid: look-up by position; its blocks are the squares, if there are any.
+        numbers: (K,) of the stations among the map's; None if they are all of the map.
+        squares: of stations that one station represents; None if each station represents itself alone.
     """
 
     index: StationIndex
@@ -117,12 +111,12 @@ class SearchStations:
         return len(self.grid)
 
     def on_the_map(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
-        """Return places with the map's numbers of their stations, each on the best one of its square.
+        """Return places with the map's numbers of their stations, each on the best station of its square.
 
         Args:
             places: as :meth:`Consensus.hypotheses` returns them.
-            vote: of the newest keyframe, by which the stations of a square are compared.
-            keyframes: how many have voted.
+            vote: of the newest keyframe; compares the stations of a square.
+            keyframes: number of keyframes that have voted.
         """
         if self.squares is not None:
             return self.squares.refined(places, vote, keyframes)
@@ -137,7 +131,7 @@ class _Squares:
     """Squares of stations.
 
     Attributes:
-        members: (K, n) numbers of each one's stations, -1 for none.
+        members: (K, n) station numbers by square, -1 for none.
         codes: of all stations of the map.
         stations: (M, 3) of the map.
     """
@@ -153,13 +147,12 @@ class _Squares:
         square = np.array([place.station for place in places], dtype=np.int64)
         shift = np.array([place.shift for place in places], dtype=np.int64)
         members = self.members[square]
-        scores = vote.screened(
-            self.codes, members.ravel().astype(np.int64), np.repeat(shift, members.shape[1])
-        ).reshape(members.shape)
+        shifts = np.repeat(shift, members.shape[1])
+        scores = vote.screened(self.codes, members.ravel().astype(np.int64), shifts).reshape(members.shape)
         scores[members < 0] = np.inf
         best = scores.argmin(axis=1)[:, None]
         station = np.take_along_axis(members, best, axis=1)[:, 0]
-        # the newest keyframe's share of the sum becomes that of the station
+        # the best station's score replaces the square's in the sum
         gained = np.take_along_axis(scores, best, axis=1)[:, 0] - vote.at(square, shift)
         votes = np.array([place.votes for place in places]) + gained / np.sqrt(keyframes)
         T = np.array([place.T_map_odom for place in places])
@@ -191,25 +184,11 @@ def _members(grid: StationGrid, stations: Ints, stride: int) -> Int32s:
     return members
 
 
-class Stations(Protocol):
-    """The part of a base map that retrieval uses."""
-
-    @property
-    def station_index(self) -> StationIndex:
-        """Return the index of the stations' descriptors."""
-        ...
-
-    @property
-    def station_grid(self) -> StationGrid:
-        """Return the look-up of the stations by position."""
-        ...
-
-
 class Retrieval:
     """The stations of a map that votes are compared with, shared by all searches of the map."""
 
-    def __init__(self, stations: Stations) -> None:
-        self.stations = stations
+    def __init__(self, base_map: BaseMap) -> None:
+        self.base_map = base_map
 
     def prepare(self) -> None:
         """Do the work that the first vote would wait for."""
@@ -223,60 +202,59 @@ class Retrieval:
         """
         if area is None:
             return self._whole
-        grid = self.stations.station_grid
+        grid = self.base_map.station_grid
         chosen = np.flatnonzero(area.holds(grid.stations))
         if not len(chosen):
             raise ValueError("no station in the circle")
-        return SearchStations.of(self.stations.station_index, grid, chosen)
+        return SearchStations.of(self.base_map.station_index, grid, chosen)
 
     @cached_property
     def _whole(self) -> SearchStations:
-        return SearchStations.of(self.stations.station_index, self.stations.station_grid)
+        return SearchStations.of(self.base_map.station_index, self.base_map.station_grid)
 
 
 class StationConsensus:
     """Consensus of keyframes by their co-view descriptors on the stations of a map, or of a circle on it."""
 
     def __init__(self, retrieval: Retrieval, config: ConsensusConfig) -> None:
-        """Begin without votes; the compared stations are chosen at the first one."""
+        """Begin without votes; the compared stations are chosen at the first vote."""
         self.retrieval = retrieval
         self.config = config
         self._area: Circle | None = None
-        self._compared: SearchStations | None = None
-        self._consensus: Consensus | None = None
-        self._newest: CoViewVote | None = None
+        self._voted: tuple[SearchStations, Consensus, CoViewVote] | None = None  # and the newest vote
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""
-        return 0 if self._consensus is None else len(self._consensus)
+        return 0 if self._voted is None else len(self._voted[1])
 
     def clear(self) -> None:
-        """Forget all votes, and the stations of a circle."""
-        if self._area is not None:
-            self._area = self._compared = self._consensus = None
-        if self._consensus is not None:
-            self._consensus.clear()
+        """Forget all votes."""
+        self._voted = None
 
     def vote(self, centre: Floats, query: Mapping[Channel, Descriptor], area: Circle | None = None) -> None:
-        """Add one keyframe's vote; another area than that of the votes so far starts again.
+        """Add one keyframe's vote; another area than the last vote's starts again.
 
         Args:
             centre: (3,) zero of the descriptors, z on the ground; odometry frame, metres.
             query: descriptors (R, S) by channel.
             area: of the map, metres from its zero, outside of which no station is compared; None for none.
         """
-        if self._compared is None or self._consensus is None or area != self._area:
-            self._compared = self.retrieval.compared(area)
-            self._consensus = Consensus(self._compared.grid, self.config)
+        if self._voted is None or area != self._area:
             self._area = area
-        self._newest = CoViewVote(centre, self._compared.index, query)
-        self._consensus.vote(self._newest)
+            compared = self.retrieval.compared(area)
+            consensus = Consensus(compared.grid, self.config)
+        else:
+            compared, consensus, _ = self._voted
+        vote = CoViewVote(centre, compared.index, query)
+        self._voted = compared, consensus, vote
+        consensus.vote(vote)
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
-        if self._consensus is None or self._compared is None or self._newest is None:
+        if self._voted is None:
             return []
-        return self._compared.on_the_map(self._consensus.hypotheses(), self._newest, len(self))
+        compared, consensus, newest = self._voted
+        return compared.on_the_map(consensus.hypotheses(), newest, len(consensus))
 
 
 def exact_distances(descriptors: npt.NDArray[np.float16], query: Descriptor) -> Floats32:

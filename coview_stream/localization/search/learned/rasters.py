@@ -15,7 +15,6 @@ import numpy as np
 from coview_kernels import WindowImages, WindowRaster, window_products
 from coview_stream.descriptors.feature_map import FeatureMap
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.localization.search.consensus import Request
 from coview_stream.localization.search.learned.correlation import MIN_COVERAGE, FeatureIndex, downsample, rotate_images
 
 WEIGHT = 7
@@ -107,7 +106,7 @@ class FeatureVote:
         z_scores[compared] = (self._median - scores[compared]) * np.float32(1.0 / self._deviation)
         return z_scores
 
-    def at_all(self, requests: Sequence[Request[FeatureVote]]) -> list[Floats32]:
+    def at_all(self, requests: Sequence[tuple[FeatureVote, Ints, Ints]]) -> list[Floats32]:
         """Return :meth:`at` of each request."""
         return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
