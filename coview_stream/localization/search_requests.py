@@ -34,14 +34,9 @@ class SearchRequests:
     """
 
     def __init__(
-        self,
-        base_map: BaseMap,
-        config: LocalizerConfig,
-        spec: RequestSpec,
-        frames: FramePreparation,
-        odometry: int,
+        self, base_map: BaseMap, config: LocalizerConfig, spec: RequestSpec, frames: FramePreparation, odometry: int,
         restarts: Iterator[int],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Begin without a keyframe, in odometry frame number ``odometry``; ``restarts`` numbers the epochs."""
         self.epoch = Epoch(odometry, next(restarts))
         self._restarts = restarts
@@ -55,12 +50,7 @@ class SearchRequests:
         self._odometry_check = OdometryCheck()
 
     def add(self, frame: Frame, travelled: float) -> SearchRequest | NoSearch | None:
-        """Add a frame; return the request of the keyframe that it completes, or why there is none.
-
-        Args:
-            frame: prepared.
-            travelled: metres that odometry has driven.
-        """
+        """Add a frame after ``travelled`` metres; return the request of the keyframe that it completes, if any."""
         anchor, calibration = self._frames.anchor, self._frames.calibration
         assert anchor is not None  # a frame has been prepared
         keyframe = self._buffer.add(frame.scan, frame.stamp)
@@ -73,30 +63,22 @@ class SearchRequests:
         if area is not None:
             hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
         if self._odometry_check.contradicts(frame.scan.levelled(calibration), frame.scan.position):
-            self._begin_anew()
+            self._restart()
             reason = "searching anew: frames do not fit together where odometry puts them"
             return NoSearch(reason, RejectionReason.ODOMETRY)
         if keyframe is None:
             return None
         if area is not None and not area.holds(self._base_map.stations).any():
             return NoSearch("nothing is searched: the map has no ground in the circle that the robot is said to be in")
-        rays = RangeImage.rays(calibration.level(frame.cloud))
         request = SearchRequest.of(
-            self._buffer,
-            keyframe,
-            cloud=rays,
-            spec=self._spec,
-            travelled=travelled,
-            epoch=self.epoch,
-            hints=hints,
-            guesses=guesses,
-            area=area,
-        )
-        # thinned as the search would: a tenth of the points remains, and requests travel through pipes
+            self._buffer, keyframe, cloud=RangeImage.rays(calibration.level(frame.cloud)), spec=self._spec,
+            travelled=travelled, epoch=self.epoch, hints=hints, guesses=guesses, area=area,
+        )  # fmt: skip
+        # the search would thin it too: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self._config.registration))
 
     def guess(self, guess: PlaceGuess) -> None:
-        """Have a guess of the place tried; one with a circle, or in place of one, begins an epoch."""
+        """Try a guess of the place; a circle that comes, goes or changes begins an epoch."""
         if guess.within is not None or self.hints.circle is not None:
             self.next_epoch()
         self.hints.guess(guess)
@@ -107,17 +89,17 @@ class SearchRequests:
         self._buffer.clear()
 
     def place_lost(self, T_map_odom: Pose) -> None:
-        """Begin anew, for odometry may have jumped; that it goes on from ``T_map_odom`` (4, 4) is a hint."""
+        """Start again, as odometry may have jumped; it may also go on from ``T_map_odom`` (4, 4): that is a hint."""
         if self._frames.anchor is not None:
             self.hints.odometry_continues(T_map_odom, self._frames.anchor)
         self._odometry_check.clear()
-        self._begin_anew()
+        self._restart()
 
     def next_epoch(self) -> None:
-        """Begin another epoch: requests under way are out of date."""
+        """Begin another epoch: results of earlier requests are out of date."""
         self.epoch = self.epoch._replace(restart=next(self._restarts))
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self._buffer.clear()
         self.hints.forget_leader()
         self.next_epoch()

@@ -14,19 +14,18 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 
-_PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points
-_RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
-_PARTS = 3  # in which the points of keyframes are gathered
-_SMEARED = np.radians(1.0)  # keyframes that lean by less are not gathered again
+_PENDING_POINTS = 200_000  # beyond which the frames of a standing robot are thinned again
+_RECENT = 5  # keyframes that are held raw
+_PARTS = 3  # groups of keyframes whose points are gathered
+_SMEARED = np.radians(1.0)  # change of the level from which keyframes are gathered again
 
-# of OdometryCheck; set by hand
-_VOXEL = 1.0  # metres
-_STRIDE = 2.0  # metres between the frames that others are compared with
+# of OdometryCheck; _MIN_SHARE is set by hand between the shares in its docstring
+_VOXEL, _BITS = 1.0, 21  # metres; bits of a coordinate in a voxel's key
+_STRIDE = 2.0  # metres between reference frames
 _POINTS = 2000  # of a frame, compared
 _MIN_POINTS = 300  # of a frame that is judged
-_MIN_SHARE = 0.22  # by the shares in the class docstring, which no command prints
+_MIN_SHARE = 0.22
 _PATIENCE = 3  # frames in a row: one may be dust
-_BITS = 21  # of a coordinate in a voxel's key
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,8 @@ class Keyframe:
     """All frames since the previous keyframe.
 
     Attributes:
-        stamp: seconds, of the newest frame.
-        scan: one point per voxel, about the newest frame's odometry.
+        stamp: of the newest frame, seconds.
+        scan: one point per voxel, with the newest frame's odometry.
         begins_anew: the calibration has changed so much that earlier keyframes have been levelled again.
     """
 
@@ -57,18 +56,17 @@ class Keyframe:
 class KeyframeBuffer:
     """Buffer of the newest keyframes, made from the frames that are added.
 
-    All coordinates are in the odometry frame, which must be gravity aligned and near its own origin. The points of the
-    newest ``capacity`` keyframes or somewhat fewer are gathered, one per voxel, for virtual local scans, levelled by
-    the calibration of their time; the newest five are held raw and levelled when they are read. Where the calibration
-    has moved by more than a degree, the gathered points are replaced by those of the newest five.
+    All coordinates are in the odometry frame, which must be gravity aligned and near its own origin. For virtual local
+    scans the points of up to ``capacity`` keyframes are gathered, one per voxel, levelled by the calibration of their
+    time. The newest five keyframes are held raw and levelled when they are read; they replace the gathered points when
+    the calibration has moved by more than a degree.
 
     Args:
-        config: distance between keyframes, how many are held, and their voxels.
-        reach: metres around the newest keyframe, horizontally, beyond which no virtual scan looks; points farther
-            away are dropped.
+        config: distance, number and voxels of the keyframes.
+        reach: horizontal metres around the newest keyframe beyond which points are dropped.
 
     Attributes:
-        keyframes: the newest ones, oldest first.
+        keyframes: the newest five, oldest first.
         calibration: of the newest frame; levels all points that are read.
     """
 
@@ -80,15 +78,18 @@ class KeyframeBuffer:
         self._gathered_by: deque[Calibration] = deque(maxlen=self.keyframes.maxlen)
         self._levelled_at: Floats | None = None  # position where the gathered points were last levelled again
         self._pending: list[RawScan] = []  # frames since the newest keyframe
-        # the points of so many keyframes each, one per voxel, which are dropped as a whole
         self._part_size = max(1, config.capacity // _PARTS)
-        self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)
-        self._in_part = 0  # keyframes in the newest of them
+        self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)  # one per voxel and part
+        self._in_part = 0  # keyframes in the newest part
 
     def add(self, scan: RawScan, stamp: float) -> Keyframe | None:
         """Add a frame; return the keyframe that it completes, if any."""
         self.calibration = scan.calibration
-        if anew := self._leans() and self._has_driven_on(scan.position):
+        leans = any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
+        at = self._levelled_at
+        # from the position of the last levelling nothing new is seen
+        anew = leans and (at is None or float(np.linalg.norm(scan.position - at)) >= self.config.distance)
+        if anew:
             self._gather_again()
             self._levelled_at = scan.position.copy()
         self._pending.append(scan)
@@ -103,17 +104,8 @@ class KeyframeBuffer:
         self._gather(keyframe)
         return keyframe
 
-    def _leans(self) -> bool:
-        """Whether a keyframe was levelled by a rotation more than a degree off the present one."""
-        return any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
-
-    def _has_driven_on(self, position: Floats) -> bool:
-        """Whether the robot has driven on since the last levelling: from the same position nothing new is seen."""
-        at = self._levelled_at
-        return at is None or float(np.linalg.norm(position - at)) >= self.config.distance
-
     def _gather(self, keyframe: Keyframe) -> None:
-        """Add a keyframe, its points to the newest part: where it has none in their voxels, and within reach."""
+        """Add a keyframe, and its points within reach to free voxels of the newest part."""
         self.keyframes.append(keyframe)
         self._gathered_by.append(self.calibration)
         if not self._parts or self._in_part == self._part_size:
@@ -139,7 +131,7 @@ class KeyframeBuffer:
         return self._unique(np.concatenate(near), voxel)
 
     def _gather_again(self) -> None:
-        """Level all held points again; of the gathered ones only those of the newest five keyframes remain."""
+        """Gather the newest five keyframes alone, levelled by the present calibration."""
         held, pending = list(self.keyframes), self._pending
         self.clear()
         for keyframe in held:
@@ -147,7 +139,7 @@ class KeyframeBuffer:
         self._pending = pending
 
     def clear(self) -> None:
-        """Forget all keyframes, for odometry does not connect them with the next frame."""
+        """Forget all keyframes: odometry does not connect them with the next frame."""
         self.keyframes.clear()
         self._gathered_by.clear()
         self._levelled_at = None
@@ -165,7 +157,7 @@ class KeyframeBuffer:
 
 
 def _within(points: Points, centre: Floats, radius: float) -> Points:
-    """Return those of (N, 3) points that are within ``radius`` metres of ``centre``, horizontally."""
+    """Return the points (N, 3) within ``radius`` metres of ``centre``, horizontally."""
     if not math.isfinite(radius):
         return points
     x, y = np.float32(centre[0]), np.float32(centre[1])
@@ -180,10 +172,10 @@ class OdometryCheck:
     """Check that consecutive frames overlap where odometry puts them, while there is no map pose to check against.
 
     Keyframes may be combined only if odometry is right between them. Where it is not (the robot was lifted and put
-    down, its odometry jumped) the old ones spoil the search for as long as they are in the buffer. So each frame is
-    compared with one that is two metres old at most: the share of its points in a cubic metre in which the other has
-    points. In simulated towns and forests (worlds 5101, 5103 and 5108) that share was 0.31 to 0.9 where odometry is
-    right, at most 0.30 two metres off and at most 0.19 four metres off.
+    down, its odometry jumped), the old ones spoil the search for as long as they are in the buffer. So each frame is
+    compared with a reference frame at most two metres away: the share of its points in a cubic metre in which the
+    reference has points. In simulated towns and forests (worlds 5101, 5103 and 5108) that share was 0.31 to 0.9 with
+    right odometry, at most 0.30 two metres off and at most 0.19 four metres off.
     """
 
     def __init__(self) -> None:
@@ -200,30 +192,21 @@ class OdometryCheck:
 
         Args:
             points: (N, 3) of the frame, one per voxel, odometry frame, metres.
-            position: (3,) the sensor's, same frame.
+            position: (3,) of the sensor, same frame.
         """
         if len(points) < _MIN_POINTS:
             return False
-        if self._voxels is None:
-            self._set_reference(points, position)
-            return False
-        keys = _voxel_keys(points[:: max(1, len(points) // _POINTS)])
-        near = np.minimum(np.searchsorted(self._voxels, keys), len(self._voxels) - 1)
-        if float((self._voxels[near] == keys).mean()) < _MIN_SHARE:
-            self._mismatches += 1
-            if self._mismatches < _PATIENCE:
+        contradicted = False
+        if self._voxels is not None:
+            keys = _voxel_keys(points[:: max(1, len(points) // _POINTS)])
+            near = np.minimum(np.searchsorted(self._voxels, keys), len(self._voxels) - 1)
+            overlaps = float((self._voxels[near] == keys).mean()) >= _MIN_SHARE
+            self._mismatches = 0 if overlaps else self._mismatches + 1
+            contradicted = self._mismatches >= _PATIENCE
+            if not contradicted and (not overlaps or float(np.linalg.norm(position - self._position)) <= _STRIDE):
                 return False
-            self.clear()
-            self._set_reference(points, position)
-            return True
-        self._mismatches = 0
-        if float(np.linalg.norm(position - self._position)) > _STRIDE:
-            self._set_reference(points, position)
-        return False
-
-    def _set_reference(self, points: Points, position: Floats) -> None:
-        self._voxels = np.unique(_voxel_keys(points))
-        self._position = position.copy()
+        self._voxels, self._position, self._mismatches = np.unique(_voxel_keys(points)), position.copy(), 0
+        return contradicted
 
 
 def _voxel_keys(points: Points) -> Ints:

@@ -1,4 +1,4 @@
-"""Place recognizers: keyframes vote for places of the map; the best places are the search's hypotheses."""
+"""Place recognizers: keyframes vote for places of the map, and the best places are the search's hypotheses."""
 
 from __future__ import annotations
 
@@ -35,21 +35,16 @@ class PlaceRecognizer(Protocol):
 
 @dataclass(frozen=True)
 class SearchIndex:
-    """The part of the recognizers that all searches of one map share; None for a recognizer that is not used.
-
-    Attributes:
-        retrieval: comparison with the stations' co-view descriptors.
-        learned: the map's learned features.
-    """
+    """The data that the recognizers of all searches of one map share; None for a recognizer that is not used."""
 
     retrieval: Retrieval | None
     learned: FeatureMatcher | None
 
     @classmethod
     def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
-        """Return the index that ``config.reloc`` asks for; the network is loaded if ``load``, spectra are not made yet.
+        """Return the index for ``config.reloc``, without spectra, and without the network unless ``load``.
 
-        ``auto`` warns if the map has learned features that cannot be used, and goes without them.
+        ``auto`` warns of learned features that cannot be used, and goes without them.
 
         Raises:
             MapError, InputError, DependencyError: as :meth:`BaseMap.require_features`.
@@ -66,7 +61,7 @@ class SearchIndex:
         return cls(retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
-        """Load and compute what the first query would wait for; CoViewError if something is missing."""
+        """Do the work that the first query would wait for; CoViewError if something is missing."""
         if self.retrieval is not None:
             self.retrieval.prepare()
         if self.learned is not None:

@@ -1,4 +1,4 @@
-"""A keyframe as the search needs it: plain data, so that the search may run later and in another process."""
+"""Search requests: plain data of a keyframe, as the search may run later and in another process."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rot
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift
-SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
-SAME_ANGLE = float(np.radians(5.0))  # likewise
+_SUBMAP_KEYFRAMES = 4  # newest keyframes that are registered: drift smears more of them
+SAME_DISTANCE, SAME_ANGLE = 2.0, float(np.radians(5.0))  # metres, radians: nearer registered hypotheses are one
 
 
 class Epoch(NamedTuple):
     """Period within which scans and poses belong together: one odometry frame, between two losses.
 
     Attributes:
-        odometry: number of the odometry frame, as the caller counts them.
-        restart: how often the localizer has begun anew.
+        odometry: the caller's number of the odometry frame.
+        restart: number of the localizer's restarts.
     """
 
     odometry: int = 0
@@ -39,10 +38,10 @@ def _no_points() -> Points:
 
 @dataclass(frozen=True)
 class RequestSpec:
-    """Parts that requests have to bring.
+    """Data that a search needs in its requests.
 
     Attributes:
-        descriptor: the local scan's descriptor; None if no scan is needed.
+        descriptor: of the local scan; None if no scan is needed.
         reach: radius of the surroundings, metres; None if they are not needed.
     """
 
@@ -55,19 +54,18 @@ class SearchRequest:
     """One keyframe to search the map for.
 
     Attributes:
-        stamp: seconds, of the keyframe.
+        stamp: of the keyframe, seconds.
         T_odom_body: (4, 4) of the keyframe.
-        scan: (N, 3) float32 virtual local scan, odometry frame, metres; empty if no descriptor is made of it.
-        submap: (N, 3) float32 points of the newest keyframes, odometry frame: to be registered.
+        scan: (N, 3) float32 virtual local scan, odometry frame, metres; empty without a descriptor.
+        submap: (N, 3) float32 points to register, of the newest keyframes, odometry frame.
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
-        epoch: of the localizer's memory; a request of another epoch starts the search from nothing.
-        hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged like the votes' hypotheses.
-        guesses: (4, 4) each, ``T_map_odom`` of a place that somebody named, heights open: tried likewise.
-        surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
-            compared.
+        epoch: a request of another epoch starts the search from nothing.
+        hints: (4, 4) each, ``T_map_odom`` that may be right: judged like the votes' hypotheses.
+        guesses: (4, 4) each, ``T_map_odom`` by a :class:`PlaceGuess`, heights open: judged likewise.
+        surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if not needed.
         calibration: has levelled ``cloud``.
-        area: of the map, metres from its zero, that is searched alone; None for all of it.
+        area: the only part of the map to search, metres from its zero; None for all of it.
     """
 
     stamp: float
@@ -101,27 +99,17 @@ class SearchRequest:
         guesses: tuple[Pose, ...] = (),
         area: Circle | None = None,
     ) -> SearchRequest:
-        """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is its newest frame, body frame."""
+        """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is the newest frame, body frame."""
         scan = surroundings = _no_points()
         if spec.descriptor is not None:
             scan = buffer.virtual_scan(keyframe.position, spec.descriptor.radius, spec.descriptor.voxel)
         if spec.reach is not None:
             surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
-        submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp,
-            keyframe.T_odom_body,
-            scan=scan,
-            submap=submap,
-            cloud=cloud,
-            travelled=travelled,
-            epoch=epoch,
-            hints=hints,
-            guesses=guesses,
-            surroundings=surroundings,
-            calibration=buffer.calibration,
-            area=area,
-        )
+            keyframe.stamp, keyframe.T_odom_body, scan=scan, submap=buffer.recent(_SUBMAP_KEYFRAMES), cloud=cloud,
+            travelled=travelled, epoch=epoch, hints=hints, guesses=guesses, surroundings=surroundings,
+            calibration=buffer.calibration, area=area,
+        )  # fmt: skip
 
 
 def same_place(

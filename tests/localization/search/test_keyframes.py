@@ -29,7 +29,7 @@ def add(buffer, points, T_odom_body, stamp):
 
 
 def points_of(keyframe):
-    return keyframe.scan.levelled(np.eye(3))
+    return keyframe.scan.levelled(Calibration())
 
 
 def test_keyframe_every_configured_distance():
