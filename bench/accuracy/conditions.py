@@ -253,7 +253,7 @@ def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[
             poses[nearest] = T
     none, count = np.full((len(stamps), 6, 6), np.nan), len(stamps)
     states = np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
-    track = Track(stamps, states, [""] * count, poses, none, np.zeros(count), np.full((count, 2), np.nan))
+    track = Track(stamps, states, poses, none, np.full((count, 2), np.nan))
     error, known = errors(track, true), track.tracking
     first = int(known.argmax()) if known.any() else None
     kept = ("first_fix_m", "rmse_m", "rmse_deg", "max_m", "max_deg", "false_frames")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,9 +14,6 @@ from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.localization.result import Fix
 
 FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than either is false
-DOUBTFUL_METRES = 0.5
-"""One further than this is counted beside them."""
-
 MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame, or so long
 
 
@@ -25,32 +23,26 @@ class Track:
 
     stamps: Floats  # seconds
     states: Sequence[str]  # names; ``SKIPPED`` for a frame that it refused
-    reasons: Sequence[str]  # of the newest evidence
     poses: Floats  # (N, 4, 4) map <- body, NaN where there was none
     covariances: Floats  # (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose
-    seconds: Floats  # that each step took
     levels: Floats  # (N, 2) protection levels, metres and degrees, likewise
 
     @classmethod
-    def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Track:
-        """Collect fixes at the ``stamps``; a refused frame has the reason in place of its fix."""
+    def of(cls, fixes: Sequence[Fix | None], stamps: Floats) -> Track:
+        """Collect fixes at the ``stamps``; a refused frame has None."""
         poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
         levels = np.full((len(fixes), 2), np.nan)
-        states, reasons = [], []
+        states = ["SKIPPED" if fix is None else fix.state.reported for fix in fixes]
         for k, fix in enumerate(fixes):
-            if isinstance(fix, str):
-                states.append("SKIPPED")
-                reasons.append(fix)
+            if fix is None:
                 continue
-            states.append(fix.state.reported)
-            reasons.append(fix.evidence.reason if fix.evidence else "")
             if fix.T_map_body is not None:
                 poses[k] = fix.T_map_body
             if fix.covariance is not None:
                 covariances[k] = fix.covariance
             if fix.protection is not None:
                 levels[k] = fix.protection.metres, fix.protection.degrees
-        return cls(stamps, states, reasons, poses, covariances, seconds, levels)
+        return cls(stamps, states, poses, covariances, levels)
 
     @property
     def tracking(self) -> Bools:
@@ -94,22 +86,18 @@ def held(stamps: Floats) -> Floats:
     return np.asarray(np.minimum(np.r_[gaps, np.median(gaps)], MAX_HELD))
 
 
-def recovery(right: Bools, stamps: Floats, driven: Floats, end: int) -> tuple[float, float] | None:
-    """Seconds and metres driven from the frame ``end`` to the first right pose; None if there is none."""
-    if not right[end:].any():
-        return None
-    k = end + int(right[end:].argmax())
-    return float(stamps[k] - stamps[end]), float(driven[k] - driven[end])
+def recovery(right: Bools, driven: Floats, end: int) -> float | None:
+    """Metres driven from the frame ``end`` to the first right pose; None if there is none."""
+    return float(driven[end + int(right[end:].argmax())] - driven[end]) if right[end:].any() else None
 
 
-def losses(states: Sequence[str], reasons: Sequence[str]) -> list[str]:
-    """Reason of each loss: of each frame that is LOST after one that was not."""
-    pairs = zip(states[:-1], states[1:], reasons[1:], strict=True)
-    return [reason for before, state, reason in pairs if state == "LOST" != before]
+def losses(states: Sequence[str]) -> int:
+    """Count the frames that are LOST after one that was not."""
+    return sum(state == "LOST" != before for before, state in itertools.pairwise(states))
 
 
 def score(track: Track, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
-    """All figures of one drive but coverage; metres, degrees, seconds, milliseconds; None where there is no pose.
+    """All figures of one drive but coverage; metres, degrees, seconds; None where there is no pose.
 
     Args:
         track: answers of the localizer.
@@ -118,41 +106,23 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[tuple[st
         events: name, first frame, and first frame after it.
     """
     error, known = errors(track, truth), track.tracking
-    right, hold = error.right, held(track.stamps)
-    false = known & ~right
-    before = np.r_[False, known[:-1]]  # stepping from a pose searches no map
-    reasons = losses(track.states, track.reasons)
-    happened = []
-    for name, begin, end in events:
-        back = recovery(right, track.stamps, driven, end)
-        until = len(right) if back is None else end + int(right[end:].argmax()) + 1
-        during = float(hold[begin:until][false[begin:until]].sum())
-        seconds, metres = back or (None, None)
-        happened.append({"what": name, "recovery_s": seconds, "recovery_m": metres, "false_s": during})
-    steps = np.percentile(track.seconds[before] * 1e3, [50, 99]).tolist() if before.any() else (None, None)
+    false = known & ~error.right
+    back = [recovery(error.right, driven, end) for _, _, end in events]
     return {
         "driven_m": float(driven[-1]),
-        "right_percent": 100 * float(right.mean()),
+        "right_percent": 100 * float(error.right.mean()),
         "first_fix_m": float(driven[known.argmax()]) if known.any() else None,
         "rmse_m": rms(error.metres[known]),
-        "max_m": _max(error.metres[known]),
+        "max_m": float(error.metres[known].max()) if known.any() else None,
         "rmse_deg": rms(error.degrees[known]),
-        "max_deg": _max(error.degrees[known]),
+        "max_deg": float(error.degrees[known].max()) if known.any() else None,
         "false_frames": int(false.sum()),
-        "false_s": float(hold[false].sum()),
-        "doubtful_frames": int((error.metres[known] > DOUBTFUL_METRES).sum()),
-        "losses": len(reasons),
-        "reasons": reasons,
-        "events": happened,
-        "p50_ms": steps[0],
-        "p99_ms": steps[1],
+        "false_s": float(held(track.stamps)[false].sum()),
+        "losses": losses(track.states),
+        "recoveries_m": back,
     }
 
 
 def rms(values: Floats) -> float | None:
     """Return the root mean square; None of nothing."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
-
-
-def _max(values: Floats) -> float | None:
-    return float(values.max()) if len(values) else None

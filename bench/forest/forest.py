@@ -20,8 +20,8 @@ import numpy as np
 import coview_kernels as kernels
 from bench.accuracy.paper import Modes, robust_zscore
 from bench.forest.worlds import Drive, Place, code, drawn, in_odometry, on_disk, place, recorded, say, weights
-from bench.harness.files import Clock, remembered
-from bench.harness.rows import NOTHING, Row, failed, informs, number, table
+from bench.harness.files import remembered
+from bench.harness.rows import Row, failed, informs, number, table
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import describe, ground_below
@@ -35,7 +35,6 @@ from coview_stream.geometry.transforms import (
     rotation_angle,
     to_local,
     transform,
-    yaw_of,
 )
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -77,28 +76,27 @@ def query_of(drive: Drive, config: LocalizerConfig) -> tuple[SearchRequest, Pose
     return query, truth
 
 
-def errors(T: Pose, truth: Pose, query: SearchRequest) -> tuple[float, float, float, float]:
-    """How far a ``T_map_odom`` puts the robot off: metres in the plane, degrees of heading, metres, degrees."""
-    found, true = T @ query.T_odom_body, truth @ query.T_odom_body
-    apart, shift = found @ inverse(true), found[:3, 3] - true[:3, 3]
-    metres = float(np.hypot(shift[0], shift[1])), float(np.linalg.norm(shift))
-    return metres[0], abs(float(np.degrees(yaw_of(apart)))), metres[1], float(np.degrees(rotation_angle(apart)))
+def errors(T: Pose, truth: Pose, query: SearchRequest) -> tuple[float, float]:
+    """Metres and degrees by which a ``T_map_odom`` puts the robot off."""
+    pose, true = T @ query.T_odom_body, truth @ query.T_odom_body
+    metres = float(np.linalg.norm(pose[:3, 3] - true[:3, 3]))
+    return metres, float(np.degrees(rotation_angle(pose @ inverse(true))))
 
 
-def best_places(xy: Reals, score: Reals, count: int = BEST) -> list[int]:
-    """Which of the places (N, 2) are best, higher scores (N,) being better, 10 m or more apart, best first."""
+def best_places(xy: Reals, score: Reals) -> list[int]:
+    """Return the indices of the best places (N, 2) by score (N,), 10 m or more apart, the highest score first."""
     at, left = np.asarray(xy, dtype=np.float64), np.array(score, dtype=np.float64)
     found: list[int] = []
-    while len(found) < count and np.isfinite(left).any():
+    while len(found) < BEST and np.isfinite(left).any():
         k = int(np.argmax(left))
         found.append(k)
         left[np.hypot(*(at - at[k]).T) < APART] = -np.inf
     return found
 
 
-def distinct(xy: Reals, score: Reals, count: int = BEST) -> Floats:
+def distinct(xy: Reals, score: Reals) -> Floats:
     """Return the best places (K, 2) themselves, see :func:`best_places`."""
-    return np.asarray(xy, dtype=np.float64)[best_places(xy, score, count)].reshape(-1, 2)
+    return np.asarray(xy, dtype=np.float64)[best_places(xy, score)].reshape(-1, 2)
 
 
 def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypothesis]:
@@ -107,12 +105,9 @@ def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypo
     for k in best_places(stations[:, :2], -volume.min(axis=1)):
         shift = int(volume[k].argmin())
         yaw = float(yaw_of_shift(shift, volume.shape[1]))
-        found.append(Hypothesis(_pose(stations[k], yaw, centre), k, shift, float(volume[k, shift])))
+        T = pose_from(rot_z(yaw), stations[k]) @ pose_from(np.eye(3), -centre)
+        found.append(Hypothesis(T, k, shift, float(volume[k, shift])))
     return found
-
-
-def _pose(at: Reals, yaw: float, centre: Floats) -> Pose:
-    return pose_from(rot_z(yaw), at) @ pose_from(np.eye(3), -centre)
 
 
 class Chain:
@@ -136,18 +131,7 @@ class Chain:
             register_place(place, scan, self._base_map, self.config, self._local_maps)
             for place in scored.places[:_REGISTERED]
         ]
-        return scored, [each for each in found if each is not None]
-
-    def metric(
-        self, named: list[Hypothesis], judged: tuple[Scored, list[Hypothesis]], truth: Pose, query: SearchRequest
-    ) -> dict[str, Any]:
-        """Errors of the best hypothesis and the best candidate, and what would have been believed; plain values."""
-        scored, candidates = judged
-        return {
-            "before": errors(named[0].T_map_odom, truth, query)[:2] if named else None,
-            "after": errors(candidates[0].T_map_odom, truth, query)[2:] if candidates else None,
-            "passes": bool(candidates) and scored.error < 0.5,
-        }
+        return scored, [place for place in found if place is not None]
 
 
 METHODS = ("scan context", "co-view", "both", "global", "dense", "verified", "search")
@@ -167,76 +151,46 @@ class Methods:
         self._chain = Chain(base_map, self.config)
         maps = LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, replace(self.config, reloc="learned"), maps)
-        area = len(base_map.stations) * base_map.config.block**2
-        # share of the places that the map knows from which 10 m reach the right one, if one of them is drawn
-        self._chance = float(min(1.0, np.pi * APART**2 / area))
 
     def ask(self, drive: Drive) -> dict[str, Any]:
-        """Ask all methods; distances (metres), errors, and milliseconds, all plain values."""
+        """Ask all methods; distances of the named places in metres, and errors, all plain values."""
         query, truth = query_of(drive, self.config)
         truth = to_local(truth, self.base_map.origin)
+        places = {name: _in_turn(hypotheses, query) for name, hypotheses in self._by_hand(query).items()}
+        metric = self._by_features(query, truth, places)
+        # the product's search by learned features: its most probable place, and the errors of a pose that it gives
+        self._search.reset()
+        result = self._search.update(query)
+        leader = result.leader
+        places["search"] = np.empty((0, 2)) if leader is None else (leader @ query.T_odom_body)[None, :2, 3]
+        found = None if leader is None or result.accepted is None else errors(leader, truth, query)
         robot = (truth @ query.T_odom_body)[:2, 3]
-        clock = Clock()
-        named = self._by_hand(query, clock)
-        places = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
-        metric = self._by_features(query, truth, clock, places)
-        places["search"], found = self._searched(query, truth)
-        apart = {name: np.hypot(*(at - robot).T) for name, at in places.items()}
-        return {
-            "sensor": drive.sensor,
-            "chance": self._chance,
-            "off": {name: np.round(values, 2).tolist() for name, values in apart.items()},
-            **metric,
-            "found": found,
-            "ms": _milliseconds(clock),
-        }
+        apart = {name: np.round(np.hypot(*(at - robot).T), 2).tolist() for name, at in places.items()}
+        return {"off": apart, **metric, "found": found}
 
-    def _by_hand(self, query: SearchRequest, clock: Clock) -> dict[str, list[Hypothesis]]:
+    def _by_hand(self, query: SearchRequest) -> dict[str, list[Hypothesis]]:
         """Name places by descriptors."""
-        with clock("descriptors"):
-            centre = on_ground(query.scan, query)
-            volumes = Modes().distances(self.base_map, describe(query.scan, centre, self.base_map.descriptor_config))
-            both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
+        centre = on_ground(query.scan, query)
+        volumes = Modes().distances(self.base_map, describe(query.scan, centre, self.base_map.descriptor_config))
+        both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in by_volume.items()}
 
-    def _by_features(
-        self, query: SearchRequest, truth: Pose, clock: Clock, places: dict[str, Floats]
-    ) -> dict[str, Any]:
-        """Add the places by learned features; return the errors of their poses."""
-        centre, stations = on_ground(query.surroundings, query), self.base_map.stations
-        with clock("network"):
-            view = self._learned.encode(query.surroundings, centre)
-        with clock("correlation"):
-            vote = self._learned.vote(view)
-            peaks = replace(self.config.consensus, peaks=BEST)
-            consensus = Consensus(self.base_map.station_grid, peaks)
-            consensus.vote(vote)
-            voted = [replace(each, learned=True) for each in consensus.hypotheses()]
-        with clock("registration"):
-            judged = self._chain.register(voted, self._chain.scan(query))
+    def _by_features(self, query: SearchRequest, truth: Pose, places: dict[str, Floats]) -> dict[str, Any]:
+        """Add the places by learned features; return the error of the best one, and whether it would be believed."""
+        view = self._learned.encode(query.surroundings, on_ground(query.surroundings, query))
+        vote = self._learned.vote(view)
+        consensus = Consensus(self.base_map.station_grid, replace(self.config.consensus, peaks=BEST))
+        consensus.vote(vote)
+        voted = [replace(place, learned=True) for place in consensus.hypotheses()]
+        scored, candidates = self._chain.register(voted, self._chain.scan(query))
         features = self._learned.features
         places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
-        named, shifts = vote.candidates()
-        places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
-        places["verified"] = _in_turn(judged[1], query)
-        return self._chain.metric(voted, judged, truth, query)
-
-    def _searched(self, query: SearchRequest, truth: Pose) -> tuple[Floats, tuple[float, float] | None]:
-        """Return the place (1, 2) that the product's search by learned features has for the most probable.
-
-        With it the errors of its pose there, metres and degrees, if it is given, by this one keyframe.
-        """
-        self._search.reset()
-        result = self._search.update(query)
-        if result.leader is None:
-            return np.empty((0, 2)), None
-        found = None if result.accepted is None else errors(result.leader, truth, query)[2:]
-        return (result.leader @ query.T_odom_body)[None, :2, 3], found
-
-
-def _milliseconds(clock: Clock) -> dict[str, float]:
-    return {name: round(1e3 * seconds, 1) for name, seconds in clock.seconds.items()}
+        stations, shifts = vote.candidates()
+        places["dense"] = distinct(self.base_map.stations[stations, :2], -vote.at(stations, shifts))
+        places["verified"] = _in_turn(candidates, query)
+        after = errors(candidates[0].T_map_odom, truth, query) if candidates else None
+        return {"after": after, "passes": bool(candidates) and scored.error < 0.5}
 
 
 def on_ground(points: Points, query: SearchRequest) -> Floats:
@@ -259,20 +213,11 @@ _QUICK = 4  # queries of a world, and worlds
 
 Answer = dict[str, Any]
 RIGHT = 10.0  # metres from the truth within which a place is the right one
-NEAR_METRES, NEAR_DEGREES = 2.0, 5.0
-"""A pose before registration is a success within both; after it, one that is not is false ..."""
-EXACT_METRES, EXACT_DEGREES = 0.3, 1.0
-"""... and within these it is a success."""
+NEAR, EXACT = (2.0, 5.0), (0.3, 1.0)
+"""Metres and degrees: a pose that is not within the first is false; within the second it is a success."""
 
-WORDS = ("sparse", "medium", "dense", "flat", "hilly", "steep", "leaf-on", "leaf-off")
-STEPS = {
-    "descriptors": "Scan Context and co-view: describing, all stations and shifts",
-    "network": "learned: bird view and ground network",
-    "correlation": "learned: coarse correlation, the best places at 36 headings",
-    "registration": "registration and verification of five places",
-}
-LEARNED = ("network", "correlation", "registration")
-"""Steps of a search by learned features alone."""
+_FOREST, _ON_DISK = "forest", ["on", "disk"]  # words of the kind of a place
+WORDS = ("sparse", "medium", "dense")
 
 
 def recall(answers: Sequence[Answer], method: str, best: int) -> float:
@@ -280,19 +225,14 @@ def recall(answers: Sequence[Answer], method: str, best: int) -> float:
     return float(np.mean([min(answer["off"][method][:best], default=RIGHT) < RIGHT for answer in answers]))
 
 
-def recall_cell(answers: Sequence[Answer], method: str) -> str:
-    """AR@1 and AR@5 in per cent."""
-    return " / ".join(_percent(recall(answers, method, best)) for best in (1, 5))
-
-
-def success(answers: Sequence[Answer], stage: str, metres: float, degrees: float) -> float:
-    """Share of queries whose pose at a stage is within both; no pose is no success."""
-    return float(np.mean([_within(answer[stage], metres, degrees) for answer in answers]))
+def success(answers: Sequence[Answer], metres: float, degrees: float) -> float:
+    """Share of queries whose registered pose is within both; no pose is no success."""
+    return float(np.mean([_within(answer["after"], metres, degrees) for answer in answers]))
 
 
 def false(answer: Answer) -> bool:
     """Tell whether a wrong pose had the evidence for it: more probable than not of the places named."""
-    return bool(answer["passes"]) and not _within(answer["after"], NEAR_METRES, NEAR_DEGREES)
+    return bool(answer["passes"]) and not _within(answer["after"], *NEAR)
 
 
 def _within(errors: Sequence[float] | None, metres: float, degrees: float) -> bool:
@@ -300,86 +240,49 @@ def _within(errors: Sequence[float] | None, metres: float, degrees: float) -> bo
 
 
 def groups(answers: Sequence[Answer]) -> Iterator[tuple[str, list[Answer]]]:
-    """All answers, then those of each sensor, of forests by what they are like, of built places, of those on disk."""
-    kinds: dict[str, Callable[[Answer], bool]] = {"all": lambda answer: True}
-    for sensor in sorted({answer["sensor"] for answer in answers}):
-        kinds[sensor] = partial(lambda answer, sensor: answer["sensor"] == sensor, sensor=sensor)
-    kinds["forest"] = _is_forest
-    kinds |= {f"forest, {word}": partial(_is_forest, word=word) for word in WORDS}
-    kinds["built"] = lambda answer: not _is_forest(answer) and answer["kind"] != "on disk"
-    kinds["on disk"] = lambda answer: answer["kind"] == "on disk"
+    """All answers, then those of forests, also by density, of built places, and of worlds on disk."""
+    kinds: dict[str, Callable[[list[str]], bool]] = {
+        "all": lambda words: True,
+        "forest": lambda words: _FOREST in words,
+    }
+    for word in WORDS:
+        kinds[f"forest, {word}"] = partial(lambda words, word: {_FOREST, word} <= set(words), word=word)
+    kinds["built"] = lambda words: _FOREST not in words and words != _ON_DISK
+    kinds["on disk"] = lambda words: words == _ON_DISK
     for name, belongs in kinds.items():
-        if some := [answer for answer in answers if belongs(answer)]:
+        if some := [answer for answer in answers if belongs(answer["kind"].split())]:
             yield name, some
-
-
-def _is_forest(answer: Answer, word: str = "forest") -> bool:
-    words = answer["kind"].split()
-    return words[:1] == ["forest"] and word in words
-
-
-def recall_table(answers: Sequence[Answer]) -> str:
-    """AR@1 / AR@5 in per cent, by method; chance is that of one place drawn from all the map knows."""
-    rows = []
-    for name, some in groups(answers):
-        shown = [recall_cell(some, method) for method in METHODS]
-        rows.append([name, str(len(some)), f"{100 * np.mean([answer['chance'] for answer in some]):.1f}", *shown])
-    return table(("AR@1 / AR@5, %", "n", "chance", *METHODS), rows)
-
-
-_POSES = (
-    "m", "deg", "2 m, 5 deg, %", "registered: m", "deg", "0.3 m, 1 deg, %", "2 m, 5 deg, %", "passes, false",
-)  # fmt: skip
-_GIVEN = ("search gives", "false")
-
-
-def _poses(answers: Sequence[Answer]) -> list[str]:
-    """Poses of the best hypothesis before registration, and of the best verified one after it, as ``_POSES`` heads."""
-    return [
-        *medians(answers, "before", (2, 1)), _percent(success(answers, "before", NEAR_METRES, NEAR_DEGREES)),
-        *medians(answers, "after", (3, 2)), _percent(success(answers, "after", EXACT_METRES, EXACT_DEGREES)),
-        _percent(success(answers, "after", NEAR_METRES, NEAR_DEGREES)),
-        str(sum(false(answer) for answer in answers)),
-    ]  # fmt: skip
-
-
-def _given(answers: Sequence[Answer]) -> list[str]:
-    """How many poses the product's search gave by this one keyframe, and how many of them were false."""
-    given = [answer["found"][0] for answer in answers if answer["found"] is not None]
-    return [str(len(given)), str(sum(metres > NEAR_METRES for metres in given))]
-
-
-def medians(answers: Sequence[Answer], stage: str, digits: tuple[int, int]) -> list[str]:
-    """Median errors, metres and degrees, of the poses that a stage gave."""
-    poses = [answer[stage] for answer in answers if answer[stage] is not None]
-    found = np.median(poses, axis=0).tolist() if poses else (None, None)
-    return [number(value, places) for value, places in zip(found, digits, strict=True)]
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f}"
 
 
+def recall_table(answers: Sequence[Answer]) -> str:
+    """AR@1 / AR@5 in per cent, by method."""
+    lines = []
+    for name, some in groups(answers):
+        pairs = [[_percent(recall(some, method, best)) for best in (1, 5)] for method in METHODS]
+        lines.append([name, str(len(some)), *map(" / ".join, pairs)])
+    return table(("AR@1 / AR@5, %", "n", *METHODS), lines)
+
+
 def metric_table(answers: Sequence[Answer]) -> str:
-    """Poses by learned features: of correlation, and after registration."""
-    rows = [
-        [name, str(len(some)), *_poses(some), *_given(some)]
-        for name, some in groups(answers)
-    ]  # fmt: skip
-    head = ("", "n", f"correlation: {_POSES[0]}", *_POSES[1:], *_GIVEN)
-    return table(head, rows)
-
-
-def times_table(answers: Sequence[Answer]) -> str:
-    """Medians over all queries, milliseconds; the first query of a map is left out."""
-    warm = [answer for answer in answers if not answer.get("first")] or list(answers)
-    rows = []
-    for step, words in STEPS.items():
-        values = [answer["ms"][step] for answer in warm if step in answer["ms"]]
-        rows.append([words, f"{np.median(values):.0f}" if values else NOTHING])
-    totals = [sum(answer["ms"][step] for step in LEARNED) for answer in warm]
-    rows.append(["learned, from the query's points to verified poses", f"{np.median(totals):.0f}"])
-    return table(("median of a query", "ms"), rows)
+    """Poses by learned features after registration, and those that the search gives by this one keyframe."""
+    lines = []
+    for name, some in groups(answers):
+        poses = [answer["after"] for answer in some if answer["after"] is not None]
+        metres, degrees = np.median(poses, axis=0).tolist() if poses else (None, None)
+        given = [answer["found"][0] for answer in some if answer["found"] is not None]
+        lines.append([
+            name, str(len(some)), number(metres, 3), number(degrees, 2),
+            *(_percent(success(some, *limits)) for limits in (EXACT, NEAR)), str(sum(map(false, some))),
+            str(len(given)), str(sum(error > NEAR[0] for error in given)),
+        ])  # fmt: skip
+    near, exact = (f"{metres:g} m, {degrees:g} deg, %" for metres, degrees in (NEAR, EXACT))
+    return table(
+        ("", "n", "registered: m", "deg", exact, near, "passes, false", "search gives", "false"), lines,
+    )  # fmt: skip
 
 
 def options(parser: ArgumentParser) -> None:
@@ -390,18 +293,14 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--world", type=Path, nargs="+", default=[], metavar="DIR", help="worlds on disk as well")
 
 
-def answers(name: str, opened: Callable[[], Place], about: dict[str, Any]) -> list[dict[str, Any]]:
-    """Answers to all queries of a place (a function that opens it), now or when the same was asked before.
-
-    ``about`` says what else they depend on: what lies in a folder, say.
-    """
+def answers(name: str, opened: Callable[[], Place], about: dict[str, Any]) -> list[Answer]:
+    """Return the answers to all queries of the place that ``opened`` returns; ``about`` is what else they depend on."""
     spec = {"name": name, "weights": weights(), "code": code(), "radius": RADIUS, **about}
 
     def work() -> dict[str, Any]:
         begin, there = time.perf_counter(), opened()
         methods = Methods(BaseMap.build(there.base, radius=RADIUS, learned=True))
-        told = {"world": there.name, "kind": there.kind}
-        found = [{**told, "first": not k, **methods.ask(drive)} for k, drive in enumerate(there.drives)]
+        found = [{"kind": there.kind, **methods.ask(drive)} for drive in there.drives]
         say(f"{name}: {there.kind}, {len(found)} queries, {time.perf_counter() - begin:.0f} s")
         return {"answers": found}
 
@@ -427,11 +326,11 @@ def rows(asked: Namespace) -> Iterator[Row]:
         except Exception as error:  # the other worlds are still worth having; the exit code tells
             yield failed(name, f"{type(error).__name__}: {error}")
             continue
-        share = 100 * success(found, "after", EXACT_METRES, EXACT_DEGREES)
+        share = 100 * success(found, *EXACT)
         yield informs(f"{name}: within 0.3 m and 1 deg", share, "%", {"answers": found})
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Recall, accuracy and times, by kind of place."""
+    """Recall and accuracy, by kind of place."""
     answers = [answer for row in rows for answer in row.details.get("answers", ())]
-    return {"recall": recall_table(answers), "metric": metric_table(answers), "times": times_table(answers)}
+    return {"recall": recall_table(answers), "metric": metric_table(answers)}

@@ -7,7 +7,6 @@ next. The simulator's own forests have a track; in the training simulator's stan
 from __future__ import annotations
 
 import json
-import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from bench.accuracy.scores import Track, errors, rms
-from bench.forest.forest import NEAR_DEGREES, NEAR_METRES
+from bench.forest.forest import NEAR
 from bench.forest.worlds import WORLDS, base_of, code, on_disk, place, say, weights
 from bench.harness.files import fingerprint, remembered
-from bench.harness.rows import Row, failed, informs, number, table
+from bench.harness.rows import Row, failed, informs, listed
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.config import LocalizerConfig, Reloc
@@ -132,28 +131,23 @@ def _map_of(world: Path) -> Path:
 
 
 def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Track, Floats]:
-    """Localize the run of a world on a map: what was said of each frame, and the true poses (N, 4, 4)."""
+    """Localize the run of a world on a map; return the track and the true poses (N, 4, 4)."""
     stamps, truth = read_tum(world / "truth.tum")
     located = locate(BaseMap.load(site), open_run(world / "run"), LocalizerConfig(reloc=reloc))
-    told = Track.of(located.fixes, np.array([fix.stamp for fix in located.fixes]), np.array(located.seconds))
-    return told, truth[np.abs(stamps[:, None] - told.stamps[None]).argmin(axis=0)]
+    track = Track.of(located.fixes, np.array([fix.stamp for fix in located.fixes]))
+    return track, truth[np.abs(stamps[:, None] - track.stamps[None]).argmin(axis=0)]
 
 
-def scored(told: Track, truth: Floats, outside: bool) -> Run:
+def scored(track: Track, truth: Floats, outside: bool) -> Run:
     """Figures of one run; outside the map every pose is a false one."""
-    error, known, way = errors(told, truth), told.tracking, driven(truth)
-    wrong = known & ((error.metres > NEAR_METRES) | (error.degrees > NEAR_DEGREES) | outside)
+    error, known, way = errors(track, truth), track.tracking, driven(truth)
+    wrong = known & ((error.metres > NEAR[0]) | (error.degrees > NEAR[1]) | outside)
     right, first = known & ~wrong, int(np.argmax(known)) if known.any() else None
-    searching = told.seconds[~np.r_[False, known[:-1]]]
     return {
-        "driven_m": float(way[-1]),
         "first_fix_m": None if first is None else float(way[first]),
-        "posed": float(known.mean()),
-        "posed_after": None if first is None else float(known[first:].mean()),
+        "posed": 100 * float(known.mean()),
         "rmse_m": rms(error.metres[right]),
-        "rmse_deg": rms(error.degrees[right]),
         "false": int(wrong.sum()),
-        "searching_ms": float(1e3 * np.percentile(searching, 95)) if len(searching) else None,
     }
 
 
@@ -175,41 +169,32 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for site in dict.fromkeys((k, (k + 1) % len(jobs))):
             label = job[0] if site == k else f"{job[0]} on {jobs[site][0]}"
             for reloc in MODES:
-                begin = time.perf_counter()
+                name = f"forest_runs/{label}, {reloc}"
+                wanted = {
+                    "runs": [job[2], jobs[site][2]], "weights": weights(), "code": fingerprint(),
+                    "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/accuracy/scores.py"),
+                }  # fmt: skip
+                file = place() / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
                 try:
-                    run = _run(label, reloc, job, jobs[site])
+                    run = remembered(file, wanted, partial(measured, job, jobs[site], reloc))
                 except Exception as error:  # the other runs are still worth having; the exit code tells
-                    yield failed(f"forest_runs/{label}, {reloc}", f"{type(error).__name__}: {error}")
+                    yield failed(name, f"{type(error).__name__}: {error}")
                     continue
-                say(f"{label}, {reloc}: {time.perf_counter() - begin:.0f} s")
-                yield informs(f"forest_runs/{label}, {reloc}: false", run["false"], "", run)
+                say(name)
+                yield informs(f"{name}: false", run["false"], "", {"run": label, "reloc": reloc, **run})
 
 
-def _run(label: str, reloc: Reloc, world: Job, site: Job) -> Run:
-    def make() -> Run:
-        return scored(*followed(world[1](), _map_of(site[1]()), reloc), outside=world is not site)
+def measured(world: Job, site: Job, reloc: Reloc) -> Run:
+    """Localize the run of a world on the map of another, or its own, and score it."""
+    return scored(*followed(world[1](), _map_of(site[1]()), reloc), outside=world is not site)
 
-    wanted = {
-        "runs": [world[2], site[2]],
-        "reloc": reloc,
-        "weights": weights(),
-        "code": fingerprint(),
-        "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/accuracy/scores.py"),
-    }
-    kept = place() / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
-    return {"run": label, "reloc": reloc, **remembered(kept, wanted, make)}
+
+COLUMNS = (
+    ("run", "run", None), ("reloc", "reloc", None), ("first fix m", "first_fix_m", 1), ("posed %", "posed", 0),
+    ("RMSE m", "rmse_m", 3), ("false", "false", 0),
+)  # fmt: skip
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per run, map and mode."""
-    columns = {
-        "driven m": ("driven_m", 1, 0), "first fix m": ("first_fix_m", 1, 1), "posed %": ("posed", 100, 0),
-        "after first %": ("posed_after", 100, 0), "RMSE m": ("rmse_m", 1, 3), "RMSE deg": ("rmse_deg", 1, 2),
-        "false": ("false", 1, 0), "searching ms": ("searching_ms", 1, 0),
-    }  # fmt: skip
-    shown = [
-        [run["run"], run["reloc"], *(number(None if run[key] is None else scale * run[key], digits)
-                                     for key, scale, digits in columns.values())]
-        for run in (row.details for row in rows if row.details)
-    ]  # fmt: skip
-    return {"": table(("run", "reloc", *columns), shown)}
+    return {"": listed(COLUMNS, [row.details for row in rows if row.details])}

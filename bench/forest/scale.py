@@ -1,15 +1,12 @@
 """How long a whole query takes on maps of 0.1 and 1 km2: one drawn forest's features and stations, laid side by side.
 
-All that depends on a map's size (correlation, votes) works on the large
-map: the middle 128 m of a drawn stand, repeated. Registration looks at the surroundings of five places, the same on
-any map, so each place is registered where its likeness in the original stand is. The limits are for two cores; BLAS
-takes the threads of OPENBLAS_NUM_THREADS, the kernels those of COVIEW_THREADS, transforms and network one.
+Correlation and votes, which depend on the size of a map, work on the large map: the middle 128 m of a drawn stand,
+repeated. Registration looks at the surroundings of five places, the same on any map, so a place is registered at its
+likeness in the original stand. The limits are for two cores.
 """
 
 from __future__ import annotations
 
-import os
-import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -21,7 +18,7 @@ import numpy.typing as npt
 from bench.forest.forest import BEST, Chain, on_ground, query_of
 from bench.forest.worlds import drawn, place
 from bench.harness.files import Clock
-from bench.harness.rows import Row, bounded, number, table
+from bench.harness.rows import Row, bounded, listed
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import LocalizerConfig
@@ -94,13 +91,11 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for side, limit in list(LIMITS.items())[: 1 if asked.quick else None]:
         large = Enlarged(base_map, side)
         assert large.learned is not None
-        begin = time.perf_counter()
         learned = SearchIndex.of(large, config).learned
         assert learned is not None
         learned.prepare()
         peaks = replace(config.consensus, peaks=BEST)
         consensus = Consensus(StationGrid(large.stations, base_map.config.block), peaks)
-        prepared = time.perf_counter() - begin
         spent: list[list[float]] = []
         for query in [queries[0], *queries * _REPEAT]:
             consensus.clear()
@@ -118,19 +113,17 @@ def rows(asked: Namespace) -> Iterator[Row]:
             spent.append([clock.seconds[part] for part in _PARTS])
         warm = np.array(spent[1:])  # the first one waits for memory and crops
         total, km2 = float(np.median(warm.sum(axis=1))), large.learned.tile_area / 1e6
-        about = {
-            "km2": km2, "stations": len(large.stations), "prepare": prepared,
-            **dict(zip(_PARTS, np.median(warm, axis=0).tolist(), strict=True)), "total": total, "limit": limit,
-            "threads": f"OPENBLAS_NUM_THREADS={os.environ.get('OPENBLAS_NUM_THREADS', 'unset')}, "
-                       f"COVIEW_THREADS={os.environ.get('COVIEW_THREADS', 'unset')}",
-        }  # fmt: skip
+        about = {"km2": km2, "stations": len(large.stations), "total": total, "limit": limit}
+        about |= dict(zip(_PARTS, np.median(warm, axis=0).tolist(), strict=True))
         yield replace(bounded(f"forest_scale/{km2:.2f} km2", total, "s", limit), details=about)
+
+
+COLUMNS = (
+    ("map, km2", "km2", 2), ("stations", "stations", 0), *((f"{part}, s", part, 3) for part in _PARTS),
+    ("query, s", "total", 2), ("limit, s", "limit", 1),
+)  # fmt: skip
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per size of the map, seconds."""
-    head = ("map, km2", "stations", "prepared once, s", *(f"{part}, s" for part in _PARTS), "query, s", "limit, s")
-    digits = {"km2": 2, "stations": 0, "prepare": 2, **dict.fromkeys(_PARTS, 3), "total": 2, "limit": 1}
-    shown = [[number(row.details[key], places) for key, places in digits.items()] for row in rows]
-    text = f"{table(head, shown)}\n\n{rows[0].details['threads']}; {os.cpu_count()} cores."
-    return {"": text}
+    return {"": listed(COLUMNS, [row.details for row in rows])}

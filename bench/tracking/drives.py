@@ -6,7 +6,6 @@ scale or stands still while the robot is carried.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -298,14 +297,11 @@ QUICK = (
 
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
     """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
-    localizer, seconds = Localizer(BaseMap.load(site)), np.zeros(len(drive))
-    fixes: list[Fix | str] = []
-    for k in range(len(drive)):
-        cloud = seen(recorded.read(int(drive.frames[k])), int(drive.cover[k]), int(drive.frames[k]))
-        begin = time.perf_counter()
+    localizer, fixes = Localizer(BaseMap.load(site)), list[Fix | None]()
+    for frame, cover, odometry, stamp in zip(drive.frames, drive.cover, drive.odometry, drive.stamps, strict=True):
+        cloud = seen(recorded.read(int(frame)), int(cover), int(frame))
         try:
-            fixes.append(localizer.step(cloud, drive.odometry[k], float(drive.stamps[k])))
-            seconds[k] = time.perf_counter() - begin
-        except (CloudError, RunError) as error:
-            fixes.append(str(error))
-    return Track.of(fixes, drive.stamps, seconds)
+            fixes.append(localizer.step(cloud, odometry, float(stamp)))
+        except (CloudError, RunError):
+            fixes.append(None)
+    return Track.of(fixes, drive.stamps)

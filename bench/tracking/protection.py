@@ -133,23 +133,15 @@ def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[Beyo
 
 
 def level_table(samples: Mapping[str, Sample]) -> str:
-    """Lay out, by name of the group: poses, how many are above their level, the bound, and how wide the levels are."""
-    head = ["poses", "one per 10 m", "> level, m", "below, %", "> level, deg", "below, %", "worst / level, m"]
-    head += ["worst / level, deg", "level m p50", "p99", "level deg p50", "p99"]
-    rows = []
+    """Lay out, by name of the group: poses, how many are above their level, and how wide the levels are."""
+    head = ("poses", "one per 10 m", "> level, m", "> level, deg", "worst / level, m", "worst / level, deg")
+    lines = []
     for name, sample in samples.items():
-        count, cells = len(sample.error), [name]
-        cells.append(str(count))
         level = sample.level(PRODUCT)
-        for hits in sample.above(PRODUCT):
-            cells += [str(hits), number(100 * upper(hits, count), 2)]
-        worst = (sample.error / level).max(axis=0) if count else [np.nan, np.nan]
-        cells += [number(float(each), 2) for each in worst]
-        for k, digits in ((0, 2), (1, 1)):
-            wide = np.quantile(level[:, k], [0.5, 0.99]) if count else [np.nan, np.nan]
-            cells += [number(float(each), digits) for each in wide]
-        rows.append(cells)
-    return table(head, rows)
+        worst, wide = (sample.error / level).max(axis=0), np.median(level, axis=0)
+        cells = [name, str(len(level)), *map(str, sample.above(PRODUCT)), *(f"{part:.2f}" for part in worst)]
+        lines.append([*cells, number(wide[0], 2), number(wide[1], 1)])
+    return table((*head, "level m p50", "level deg p50"), lines)
 
 
 WORLDS = 30  # of each family
@@ -204,10 +196,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
             said = "; ".join(f"{factor:.2f}, {freedom:.1f}" for factor, freedom in fits)
             yield judged(f"protection/tail that fits {name}: factor, freedom; m, deg", said, "", None)
     if some := found["reported"]:
-        sample, metres = (
-            Sample.joined([Sample.from_json(each["sample"]) for each in some]),
-            sum(each["driven_m"] for each in some),
-        )
+        sample = Sample.joined([Sample.from_json(each["sample"]) for each in some])
+        metres = sum(each["driven_m"] for each in some)
         for part, unit in enumerate(("m", "degrees")):
             hits, of = sample.above(PRODUCT)[part], len(sample.error)
             said = f"{hits} of {of}: below {100 * upper(hits, of):.2f} %"
@@ -218,7 +208,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Levels by kind of site, and how the tails of either family would do on the other."""
+    """Levels by kind of site and by family."""
     measured = [row.details for row in rows if "family" in row.details]
     groups: dict[str, list[Sample]] = {}
     by_family: dict[str, list[Sample]] = {}
@@ -228,7 +218,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         by_family.setdefault(each["family"], []).append(sample)
     joined = {f"{name}, all": Sample.joined(some) for name, some in by_family.items()}
     out = {name: Sample.joined(some) for name, some in sorted(groups.items())} | joined
-    return {"": f"{level_table(out)}", "tails": _tail_table(by_family)}
+    return {"": level_table(out)}
 
 
 def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
@@ -247,19 +237,3 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
         return about | {"sample": sample.to_json()}
 
     return remembered(below / "protection-results" / f"{world.name}-{variant}.json", spec, work)
-
-
-def _tail_table(families: dict[str, list[Sample]]) -> str:
-    """Show the tails: the product's, and each family's own, and what they would have left above on each family."""
-    joined = {name: Sample.joined(some) for name, some in families.items()}
-    tails = {"product": list(PRODUCT)}
-    tails |= {f"fits {name}": [tail(sample, part) for part in (0, 1)] for name, sample in joined.items()}
-    head = ["tail", "factor m", "freedom", "factor deg", "freedom", *(f"> level, {name}: m, deg" for name in joined)]
-    lines = []
-    for name, pair in tails.items():
-        cells = [name, *(number(value, 2) for each in pair for value in each)]
-        for sample in joined.values():
-            above = sample.above(pair)
-            cells.append(f"{above[0]}, {above[1]} of {len(sample.error)}")
-        lines.append(cells)
-    return table(head, lines)

@@ -1,16 +1,15 @@
 """Errors, covariance, loss and recovery of a tracked robot.
 
-Ten plain drives, and drives with an event (:mod:`bench.tracking.drives`). NAME picks the scenarios whose names
-contain it; worlds, maps and answers stay in ``--work``, so a run can be made in portions.
+Ten plain drives, and drives with an event (:mod:`bench.tracking.drives`). NAME picks the scenarios whose names contain
+it; results stay in ``--work``, so a run can be made in portions.
 
 Coverage is the share of poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by itself,
-of several by their squared Mahalanobis distance. Protection levels are judged by one pose per ten metres.
+of several by their squared Mahalanobis distance.
 """
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ from scipy.stats import chi2
 
 from bench.accuracy.scores import Errors, Track, errors, score
 from bench.harness.files import fingerprint, folder, remembered
-from bench.harness.rows import Row, informs, judged, number, table
-from bench.tracking.drives import QUICK, SEEDS, Scenario, drift_share, follow, scenarios
-from bench.tracking.protection import TO_ALERT, Sample, beyond_alert_limit, level_table
+from bench.harness.rows import NOTHING, Row, informs, judged, listed, number, table
+from bench.tracking.drives import QUICK, SEEDS, Scenario, follow, scenarios
+from bench.tracking.protection import TO_ALERT, beyond_alert_limit
 from bench.tracking.worlds import map_of, open_world
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Bools, Floats
@@ -33,15 +32,12 @@ MAX_METRES, MAX_DEGREES, MAX_RECOVERY = 0.12, 0.35, 20.0
 _JUDGED = ("x", "y", "z", "yaw", "x,y", "x,y,z")
 """What the coverage target is about; roll, pitch and the whole pose only inform."""
 
-_COLUMNS = {
-    "drift %": ("drift_percent", 1), "driven m": ("driven_m", 0), "right %": ("right_percent", 1),
-    "first m": ("first_fix_m", 1), "rmse m": ("rmse_m", 3), "max m": ("max_m", 2), "rmse deg": ("rmse_deg", 2),
-    "max deg": ("max_deg", 1), "false": ("false_frames", 0), "false s": ("false_s", 1),
-    "beyond": ("beyond", 0), "alert s": ("alert_s", 1), "alert m": ("alert_m", 1), "HMI": ("misleading", 0),
-    "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1),
-    "back s": ("recovery_s", 1), "p50 ms": ("p50_ms", 1), "p99 ms": ("p99_ms", 0),
-}  # fmt: skip
-"""Of the table: a drive's figure, or one of its worst event, and its decimals."""
+COLUMNS = (
+    ("scenario", "name", None), ("driven m", "driven_m", 0), ("right %", "right_percent", 1), ("rmse m", "rmse_m", 3),
+    ("max m", "max_m", 2), ("rmse deg", "rmse_deg", 2), ("false", "false_frames", 0), ("lost", "losses", 0),
+    ("back m", "back_m", None),
+)  # fmt: skip
+"""Of the table of drives."""
 
 FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
 PARTS = ("first minute", "later")
@@ -108,16 +104,9 @@ def pooled(drives: Sequence[Squares]) -> Squares:
 
 
 def coverage(squared: Floats, count: int) -> dict[str, Any]:
-    """Shares within 1, 2 and 3 sigma (of ``count`` axes: within the chi-square quantiles of the same shares).
-
-    ``median_nees`` is the median squared distance relative to its nominal value, 1 if the covariance is right; outliers
-    do not move it.
-    """
-    if not len(squared):
-        return {"frames": 0, "inside": None, "median_nees": None}
-    inside = [float((squared <= limit).mean()) for limit in chi2.ppf(NOMINAL, count)]
-    median = float(np.median(squared) / chi2.ppf(0.5, count))
-    return {"frames": len(squared), "inside": inside, "median_nees": median if np.isfinite(median) else None}
+    """Shares within 1, 2 and 3 sigma (of ``count`` axes: within the chi-square quantiles of the same shares)."""
+    inside = [float((squared <= limit).mean()) for limit in chi2.ppf(NOMINAL, count)] if len(squared) else None
+    return {"frames": len(squared), "inside": inside}
 
 
 def shares(squared: Squares) -> dict[str, dict[str, Any]]:
@@ -135,24 +124,20 @@ def honest(part: dict[str, Any]) -> bool:
 
 
 def coverage_table(parts: dict[str, dict[str, Any]]) -> str:
-    """Lay out shares in per cent, marked where out of their band; medians of squared distances are 1 if right."""
+    """Lay out shares in per cent, marked where out of their band."""
     columns = (*PARTS, "all")
-    head, counts = ["coverage, %", "promised"], ["poses", ""]
-    for part in columns:
-        head += [part, "median"]
-        counts += [str(parts[part]["yaw"]["frames"]), ""]
-    rows = []
+    lines = []
     for name in AXES:
-        row = [name, _percent(NOMINAL)]
-        for entry in (parts[part][name] for part in columns):
-            mark = "" if entry["inside"] is None or honest(entry) else " !"
-            row += [_percent(entry["inside"]) + mark, number(entry["median_nees"], 2)]
-        rows.append(row)
-    return table(head, [*rows, counts])
+        entries = [parts[part][name] for part in columns]
+        marks = ["" if entry["inside"] is None or honest(entry) else " !" for entry in entries]
+        cells = [_percent(entry["inside"]) + mark for entry, mark in zip(entries, marks, strict=True)]
+        lines.append([name, _percent(NOMINAL), *cells])
+    lines.append(["poses", "", *(str(parts[part]["yaw"]["frames"]) for part in columns)])
+    return table(["coverage, %", "promised", *columns], lines)
 
 
 def _percent(inside: Sequence[float] | None) -> str:
-    return "-" if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
+    return NOTHING if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
 
 
 Figures = dict[str, Any]
@@ -171,40 +156,30 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if not chosen:
         raise InputError(f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}")
     drives, parts = [], []
-    samples: dict[str, list[Sample]] = {}
     for scenario in chosen:
-        figures, squared, sample = measure(folder(), scenario)
+        figures, squared = measure(folder(), scenario)
         drives.append(figures)
         parts.append(squared)
-        samples.setdefault(f"plain: {scenario.world.kind}" if scenario.plain else "events", []).append(sample)
         rmse = np.nan if figures["rmse_m"] is None else figures["rmse_m"]
         yield informs(f"tracking/{scenario.name}", rmse, "m", figures)
-    together = pooled(parts)
-    found = shares(together)
+    found = shares(pooled(parts))
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
-    levels = level_table({name: Sample.joined(some) for name, some in samples.items()})
-    details = {"coverage": found, "protection": levels}
-    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", details)
+    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", {"coverage": found})
     yield from verdicts(drives, found, asked.quick)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Drives, coverage, protection levels, and what was lost and found again."""
+    """Drives, and coverage."""
     drives = [row.details for row in rows if "rmse_m" in row.details]
-    together = next(row.details for row in rows if "coverage" in row.details)
-    return {
-        "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
-        "coverage": coverage_table(together["coverage"]),
-        "protection": together["protection"],
-        "events": "\n".join(_events(drives)),
-    }
+    coverage = next(row.details["coverage"] for row in rows if "coverage" in row.details)
+    for figures in drives:  # of several events the latest recovery
+        back = figures["recoveries_m"]
+        figures["back_m"] = "" if not back else "never" if None in back else number(max(back), 1)
+    return {"": listed(COLUMNS, drives), "coverage": coverage_table(coverage)}
 
 
-def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]:
-    """Return the figures of a scenario, the squared distances of its coverage, and poses of its protection levels.
-
-    They are kept until the code changes.
-    """
+def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
+    """Return the figures of a scenario, and the squared distances of its coverage."""
     bench = fingerprint("bench/tracking", "bench/accuracy/scores.py")
     spec = {"code": fingerprint(), "bench": bench, "scenario": repr(scenario.world)}
 
@@ -212,36 +187,22 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
         recorded = open_world(folder, scenario.world)
         drive = scenario.drive(recorded.truth)
         track = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
-        drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
-        about = {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift}
         error = errors(track, drive.truth)
-        parts, sample = spread(track, error), Sample.of(track, error, drive.driven)
-        beyond = beyond_alert_limit(track, error, drive.driven)
-        about |= {
+        parts, beyond = spread(track, error), beyond_alert_limit(track, error, drive.driven)
+        about = {
+            "name": scenario.name,
+            "plain": scenario.plain,
             "misleading": sum(each.misleading for each in beyond),
             "beyond": len(beyond),
             "alert_s": max((each.seconds for each in beyond), default=None),
             "alert_m": max((each.metres for each in beyond), default=None),
         }
         lists = {part: {name: values.tolist() for name, values in axes.items()} for part, axes in parts.items()}
-        figures = about | score(track, drive.truth, drive.driven, drive.events)
-        return {"figures": figures, "squares": lists, "sample": sample.to_json()}
+        return {"figures": about | score(track, drive.truth, drive.driven, drive.events), "squares": lists}
 
     kept = remembered(folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json", spec, work)
     squares = {part: {n: np.array(each, float) for n, each in axes.items()} for part, axes in kept["squares"].items()}
-    return kept["figures"], squares, Sample.from_json(kept["sample"])
-
-
-def cells(figures: Figures) -> list[str]:
-    """One line of the table; of several events the worst."""
-    line = [figures["name"]]
-    for key, digits in _COLUMNS.values():
-        if key in figures:
-            line.append(number(figures[key], digits))
-        else:
-            back = [event[key] for event in figures["events"]]
-            line.append("" if not back else "never" if None in back else number(max(back), digits))
-    return line
+    return kept["figures"], squares
 
 
 def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False) -> Iterator[Row]:
@@ -262,8 +223,8 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
     yield judged("tracking/beyond the alert limit, to the alert", said, asked, not count, count)
     if quick:
         return
-    if events := [event for figures in drives for event in figures["events"]]:
-        metres = [np.inf if e["recovery_m"] is None else e["recovery_m"] for e in events]
+    if back := [metres for figures in drives for metres in figures["recoveries_m"]]:
+        metres = [np.inf if m is None else m for m in back]
         late = sum(m > MAX_RECOVERY for m in metres)
         said = f"{np.median(metres):.1f} median, {max(metres):.1f} worst; {late} of {len(metres)} later"
         yield judged("tracking/recovery, m driven", said, f"<= {MAX_RECOVERY:.0f}", not late, max(metres))
@@ -272,17 +233,3 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
             wrong = [name for name in _JUDGED if not honest(found[part][name])]
             said = f"out of it: {'; '.join(wrong)}" if wrong else "all within"
             yield judged(f"tracking/coverage, {part}", said, f"+-{100 * WITHIN:.0f} points", not wrong)
-
-
-def _events(drives: Sequence[Figures]) -> list[str]:
-    """List the losses by reason, and what each event came to."""
-    lines: list[str] = []
-    ends: list[str] = []
-    for figures in drives:
-        name = figures["name"]
-        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in Counter(figures["reasons"]).most_common()]
-        for event in figures["events"]:
-            m, s = event["recovery_m"], event["recovery_s"]
-            back = "never right again" if m is None else f"right after {m:.1f} m, {s:.1f} s"
-            ends.append(f"- {name}: {event['what']}: {event['false_s']:.1f} s false, {back}")
-    return lines + ends

@@ -17,13 +17,12 @@ def way(count=1500, step=0.2):
     return np.stack([pose_from(rot_z(h) @ tilt, p) for h, p in zip(heading, places, strict=True)])
 
 
-def track(states, poses=None, reasons=None, covariance=None, stamps=None, level=(0.2, 1.0)):
+def track(states, poses=None, covariance=None, stamps=None, level=(0.2, 1.0)):
     count = len(states)
     known = np.array([state == "TRACKING" for state in states])
     poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses.copy()
     poses[~known] = np.nan
     covariance = np.eye(6) if covariance is None else covariance
     stamps = 0.1 * np.arange(count) if stamps is None else np.asarray(stamps)
-    reasons = [""] * count if reasons is None else reasons
     covariances, levels = np.tile(covariance, (count, 1, 1)), np.tile(level, (count, 1))
-    return Track(stamps, states, reasons, poses, covariances, np.full(count, 0.005), levels)
+    return Track(stamps, states, poses, covariances, levels)

@@ -43,15 +43,13 @@ def honest(covariance):
 def test_an_honest_covariance_covers_its_promise_on_every_axis(honest):
     for name in AXES:
         np.testing.assert_allclose(honest["all"][name]["inside"], NOMINAL, atol=0.025)
-        assert honest["all"][name]["median_nees"] == pytest.approx(1.0, abs=0.1)
     assert [honest[part]["yaw"]["frames"] for part in ("first minute", "later")] == [600, 3400]
 
 
-@pytest.mark.parametrize(("scale", "one_sigma", "nees"), [(0.5, 0.383, 4.0), (2.0, 0.954, 0.25)])
-def test_a_covariance_of_wrong_size_is_detected(covariance, scale, one_sigma, nees):
+@pytest.mark.parametrize(("scale", "one_sigma"), [(0.5, 0.383), (2.0, 0.954)])
+def test_a_covariance_of_wrong_size_is_detected(covariance, scale, one_sigma):
     parts = covered(covariance, scale)
     assert parts["all"]["yaw"]["inside"][0] == pytest.approx(one_sigma, abs=0.025)
-    assert parts["all"]["pose"]["median_nees"] == pytest.approx(nees, rel=0.1)
     assert missed_by([row()], parts) == {"coverage, first minute", "coverage, later"}
 
 
@@ -75,23 +73,23 @@ def test_false_seconds_last_until_the_next_frame_and_no_longer_than_half_a_secon
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[[1, 3], 0, 3] = 1.2, 40.0
     poses[4, :3, :3] = rot_z(np.radians(5.1))
-    drive = track(states, poses, ["", "", "gone", "", ""], stamps=[0.0, 0.1, 0.3, 0.4, 5.0])
+    drive = track(states, poses, stamps=[0.0, 0.1, 0.3, 0.4, 5.0])
     figures = score(drive, np.tile(np.eye(4), (5, 1, 1)), np.arange(5.0), [])
-    assert (figures["false_frames"], figures["doubtful_frames"], figures["losses"]) == (3, 2, 1)
+    assert (figures["false_frames"], figures["losses"]) == (3, 1)
     assert figures["false_s"] == pytest.approx(0.2 + 0.5 + 0.15)  # the last one lasts a median gap
     assert figures["right_percent"] == pytest.approx(20.0)
     silent = score(track(["SEARCHING"] * 3 + ["SKIPPED"]), np.tile(np.eye(4), (4, 1, 1)), np.arange(4.0), [])
-    assert (silent["rmse_m"], silent["first_fix_m"], silent["p50_ms"]) == (None, None, None)
+    assert (silent["rmse_m"], silent["first_fix_m"], silent["max_m"]) == (None, None, None)
 
 
 def test_recovery_is_counted_from_the_end_of_the_event_to_the_first_right_pose():
     right = np.array([True, True, False, False, False, True])
-    stamps, driven = 0.1 * np.arange(6), np.array([0.0, 1.0, 1.0, 1.0, 3.0, 6.0])
-    assert recovery(right, stamps, driven, 2) == pytest.approx((0.3, 5.0))
-    assert recovery(right, stamps, driven, 1) == (0.0, 0.0)
-    assert recovery(right[:5], stamps, driven, 2) is None
+    driven = np.array([0.0, 1.0, 1.0, 1.0, 3.0, 6.0])
+    assert recovery(right, driven, 2) == 5.0
+    assert recovery(right, driven, 1) == 0.0
+    assert recovery(right[:5], driven, 2) is None
     states = ["SEARCHING", "TRACKING", "LOST", "LOST", "TRACKING", "AMBIGUOUS", "LOST"]
-    assert losses(states, list("abcdefg")) == ["c", "g"]
+    assert losses(states) == 2
 
 
 def test_a_fix_ends_with_a_search_but_not_with_a_doubt():
@@ -106,9 +104,7 @@ def missed_by(rows, parts):
 
 def row(**changes):
     out = {
-        "name": "plain/x", "plain": True, "drift_percent": 1.0, "driven_m": 300.0, "right_percent": 98.0,
-        "first_fix_m": 5.0, "rmse_m": 0.05, "max_m": 0.2, "rmse_deg": 0.05, "max_deg": 0.2, "false_frames": 0,
-        "false_s": 0.0, "doubtful_frames": 0, "losses": 0, "reasons": [], "events": [], "p50_ms": 3.0, "p99_ms": 30.0,
+        "plain": True, "rmse_m": 0.05, "rmse_deg": 0.05, "false_frames": 0, "false_s": 0.0, "recoveries_m": [],
         "misleading": 0, "beyond": 0, "alert_s": None, "alert_m": None,
     }  # fmt: skip
     return out | changes
@@ -122,8 +118,8 @@ def row(**changes):
         ({"rmse_deg": None}, {"rmse of plain drives, deg"}),
         ({"false_frames": 1, "false_s": 0.1}, {"false frames"}),
         ({"misleading": 2}, {"beyond the alert limit, to the alert"}),
-        ({"events": [{"recovery_m": 20.1, "recovery_s": 9.0}]}, {"recovery, m driven"}),
-        ({"events": [{"recovery_m": None, "recovery_s": None}]}, {"recovery, m driven"}),
+        ({"recoveries_m": [20.1]}, {"recovery, m driven"}),
+        ({"recoveries_m": [None]}, {"recovery, m driven"}),
     ],
 )
 def test_targets_are_judged(honest, changes, missed):
