@@ -10,6 +10,7 @@ import textwrap
 from collections import defaultdict
 from collections.abc import Mapping
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -115,32 +116,13 @@ def upward() -> list[str]:
     return sorted(f"{a} -> {b}" for a, found in imports().items() for b in found if rank(b) > rank(a))
 
 
-def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
-    """Return the strongly connected parts of a graph that have more than one node (Tarjan)."""
-    number: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    out: list[list[str]] = []
-
-    def visit(node: str) -> None:
-        number[node] = low[node] = len(number)
-        stack.append(node)
-        for other in graph.get(node, ()):
-            if other not in number:
-                visit(other)
-                low[node] = min(low[node], low[other])
-            elif other in stack:
-                low[node] = min(low[node], number[other])
-        if low[node] == number[node]:
-            k = stack.index(node)
-            part, stack[k:] = stack[k:], []
-            if len(part) > 1:
-                out.append(sorted(part))
-
-    for node in graph:
-        if node not in number:
-            visit(node)
-    return out
+def circles(graph: Mapping[str, set[str]]) -> list[str]:
+    """Return the nodes of a circle of a graph, the first one again at the end; none without a circle."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def folder_graph() -> dict[str, set[str]]:

@@ -60,8 +60,3 @@ def test_the_health_check_asks_whether_the_node_lives_not_whether_it_is_ready(li
         assert done.returncode == int(not live)
     finally:
         server.close()
-
-
-@pytest.mark.parametrize("word", ["HEALTHCHECK", "ENTRYPOINT", "AS build"])
-def test_it_has_a_health_check_and_two_stages(word):
-    assert word in TEXT

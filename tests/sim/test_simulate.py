@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from coview_stream.cli import main
 from coview_stream.clouds import read_cloud, read_tum
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.recordings.open_run import open_run
-from coview_stream.sim import Simulated, SimulationConfig, simulate
+from coview_stream.sim import Dirt, Simulated, SimulationConfig, simulate
 
 TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 ORIGIN = (412_000.0, 5_318_000.0, 240.0)
@@ -76,16 +75,16 @@ def test_foreign_files_are_not_overwritten(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_failed_simulation_leaves_no_files(tmp_path, monkeypatch):
-    module = sys.modules[simulate.__module__]  # the package's attribute of that name is the function
+class Broken:
+    """Dirt of the odometry that ends the simulation after the base map."""
 
-    def broken(*_):
+    def apply(self, *_):
         raise InputError("broken")
 
-    monkeypatch.setattr(module, "trajectories", broken)
-    monkeypatch.setattr(module, "base_map", lambda *_: np.zeros((5, 3)))
+
+def test_failed_simulation_leaves_no_files(tmp_path):
     with pytest.raises(InputError, match="broken"):
-        simulate(tmp_path / "w", TINY)
+        simulate(tmp_path / "w", replace(TINY, dirt=Dirt(slip=Broken())))
     assert list(tmp_path.iterdir()) == []
 
 

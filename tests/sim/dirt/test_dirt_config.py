@@ -70,6 +70,17 @@ def test_unknown_dirt_is_refused(text):
         parse_dirt(text)
 
 
+@pytest.mark.parametrize("name", KINDS_OF_DIRT)
+def test_settings_out_of_range_are_refused(name):
+    settings = type(getattr(real(), name))
+    for field in fields(settings):
+        if not isinstance(field.default, bool | tuple):
+            with pytest.raises(ConfigError, match=f"{field.name}|most"):
+                settings(**{field.name: 1e9})
+            with pytest.raises(ConfigError, match=field.name):
+                settings(**{field.name: float("nan") if isinstance(field.default, float) else -1})
+
+
 @pytest.mark.slow
 def test_the_command_line_takes_dirt(tmp_path, capsys):
     argv = ["simulate", str(tmp_path / "w"), "--scene", "village", "--seed", "5", "--size", "80", "--density", "2"]

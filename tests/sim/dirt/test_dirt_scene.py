@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from yard import standing, vlp16, yard
 
-from coview_stream.errors import ConfigError
 from coview_stream.sim.airborne import POROSITY, airborne_scan
 from coview_stream.sim.dirt import Dirt
 from coview_stream.sim.dirt.scan import Scanner, Surfaces, seasonal_caster
@@ -164,27 +163,6 @@ def test_bare_trees_let_the_survey_through_and_conifers_do_not(village):
     assert reached(winter, parts.trees[~conifers]) > reached(summer, parts.trees[~conifers]) + 0.3
     same = [reached(caster, parts.trees[conifers]) for caster in (winter, summer)]
     assert same[0] == pytest.approx(same[1], abs=0.15)
-
-
-@pytest.mark.parametrize(
-    ("settings", "values"),
-    [
-        (Traffic, {"people": -1.0}),
-        (Strips, {"most": 0.01}),
-        (Density, {"least": 0.0}),
-        (Years, {"years": 100.0}),
-        (Seasons, {"bare": 2.0}),
-        (Snow, {"depth": 5.0}),
-        (Snow, {"on_roads": 5.0}),
-        (Grass, {"height": 5.0}),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings, values):
-    with pytest.raises(ConfigError, match=next(iter(values))):
-        settings(**values)
-
-
-RNG = np.random.default_rng
 
 
 def lifts(snow, grass, y, slope=-1.0):
