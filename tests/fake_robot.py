@@ -137,9 +137,13 @@ class Robot:
         self.moved(seconds - 0.01)
         self.saw(seconds)
         self.moved(seconds + 0.01)
+        return self.answered(answer, **more)
+
+    def answered(self, answer=tracking, now=None, **more):
+        """Have the engine take the newest frame and answer it."""
         job = self.session.take_job("track")
         assert job is not None
-        self.session.handle_result(job, answer(job, **more), self.now)
+        self.session.handle_result(job, answer(job, **more), self.now if now is None else now)
         return job
 
     def localized(self, seconds=0.0, **more):

@@ -31,68 +31,37 @@ class Counters:
     """Counts of everything that can happen to a message; each message is counted once, where it ends.
 
     Each ``received`` cloud ends as one of the next eleven; up to ten more are under way.
-
-    Attributes:
-        received: clouds.
-        processed: clouds that went through the localizer.
-        rejected: readable, but of no use to the localizer or to lidar odometry.
-        dropped: made room for a newer one.
-        late: older than the oldest odometry in the buffer.
-        out_of_order: stamped before the previous cloud.
-        duplicate: with the stamp of the previous cloud.
-        no_odometry: no odometry came for the stamp.
-        malformed: does not match its encoding.
-        oversized: beyond the limits on bytes or points.
-        unknown_encoding: no codec reads it.
-        engine_errors: an engine failed at it.
-        missing: estimate of clouds that never arrived, by sequence numbers or gaps between stamps.
-        odometry_received: odometry samples, received or computed here.
-        odometry_malformed: likewise.
-        odometry_oversized: likewise.
-        odometry_unknown_encoding: likewise.
-        odometry_duplicate: likewise.
-        odometry_out_of_order: likewise.
-        odometry_gaps: pauses of odometry too long to interpolate across.
-        odometry_jumps: samples farther from the one before than a robot can drive.
-        clock_restarts: times the sender's clock restarted.
-        searches: searches of the whole map.
-        searches_skipped: requests that made room for a newer one.
-        search_errors: searches that failed.
-        fixes: times the robot was found.
-        losses: times it was lost.
-        poses: poses published.
-        engine_restarts: times an engine was started again.
     """
 
-    received: int = 0
-    processed: int = 0
-    rejected: int = 0
-    dropped: int = 0
-    late: int = 0
-    out_of_order: int = 0
-    duplicate: int = 0
-    no_odometry: int = 0
-    malformed: int = 0
-    oversized: int = 0
-    unknown_encoding: int = 0
-    engine_errors: int = 0
-    missing: int = 0
-    odometry_received: int = 0
-    odometry_malformed: int = 0
-    odometry_oversized: int = 0
-    odometry_unknown_encoding: int = 0
-    odometry_duplicate: int = 0
-    odometry_out_of_order: int = 0
-    odometry_gaps: int = 0
-    odometry_jumps: int = 0
-    clock_restarts: int = 0
-    searches: int = 0
-    searches_skipped: int = 0
-    search_errors: int = 0
-    fixes: int = 0
-    losses: int = 0
-    poses: int = 0
-    engine_restarts: int = 0
+    received: int = 0  # clouds
+    processed: int = 0  # clouds that went through the localizer
+    rejected: int = 0  # readable, but of no use to the localizer or to lidar odometry
+    dropped: int = 0  # made room for a newer one
+    late: int = 0  # older than the oldest odometry in the buffer
+    out_of_order: int = 0  # stamped before the previous cloud
+    duplicate: int = 0  # with the stamp of the previous cloud
+    no_odometry: int = 0  # no odometry came for the stamp
+    malformed: int = 0  # does not match its encoding
+    oversized: int = 0  # beyond the limits on bytes or points
+    unknown_encoding: int = 0  # no codec reads it
+    engine_errors: int = 0  # an engine failed at it
+    missing: int = 0  # estimate of clouds that never arrived, by sequence numbers or gaps between stamps
+    odometry_received: int = 0  # odometry samples, received or computed here
+    odometry_malformed: int = 0  # likewise
+    odometry_oversized: int = 0  # likewise
+    odometry_unknown_encoding: int = 0  # likewise
+    odometry_duplicate: int = 0  # likewise
+    odometry_out_of_order: int = 0  # likewise
+    odometry_gaps: int = 0  # pauses of odometry too long to interpolate across
+    odometry_jumps: int = 0  # samples farther from the one before than a robot can drive
+    clock_restarts: int = 0  # times the sender's clock restarted
+    searches: int = 0  # searches of the whole map
+    searches_skipped: int = 0  # requests that made room for a newer one
+    search_errors: int = 0  # searches that failed
+    fixes: int = 0  # times the robot was found
+    losses: int = 0  # times it was lost
+    poses: int = 0  # poses published
+    engine_restarts: int = 0  # times an engine was started again
 
     def count(self, name: str, more: int = 1) -> None:
         """Add to one counter."""

@@ -26,57 +26,34 @@ _MAX_SUPPORT = 16  # searches in a row that propose a place: with more, the map 
 
 @dataclass(frozen=True)
 class FrameJob:
-    """One lidar frame for the tracking engine.
+    """One lidar frame for the tracking engine."""
 
-    Attributes:
-        robot: name.
-        epoch: number of the robot's odometry frame; a new one makes the engine forget the robot's place.
-        stamp_ns: sensor time, nanoseconds.
-        points: (N, 3) float32 body frame, metres.
-        T_odom_body: (4, 4) odometry at the stamp.
-        times: (N,) seconds after the stamp at which each point was measured; None for no deskewing.
-        segment: odometry while the frame was measured; goes with ``times``.
-        require_verification: give no pose before this frame has verified the place.
-        search_result: of an earlier search, to be applied first.
-        defer: frames wait for the engine: put off all work that can wait.
-        hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
-        guess: of the place by somebody; tried, never trusted.
-        calibration: of its sensor and odometry at ``hint``, a prior.
-        first_epoch: the first one since a client reset the robot; another one makes the engine forget the calibration
-            as well.
-    """
-
-    robot: str
-    epoch: int
-    stamp_ns: int
-    points: Points
-    T_odom_body: Pose
-    times: Floats | None = None
-    segment: Segment | None = None
-    require_verification: bool = False
-    search_result: SearchResult | None = None
-    defer: bool = False
+    robot: str  # name
+    epoch: int  # number of the robot's odometry frame; a new one makes the engine forget the robot's place
+    stamp_ns: int  # sensor time, nanoseconds
+    points: Points  # (N, 3) float32 body frame, metres
+    T_odom_body: Pose  # (4, 4) odometry at the stamp
+    times: Floats | None = None  # (N,) seconds after the stamp at which each point was measured; None for no deskewing
+    segment: Segment | None = None  # odometry while the frame was measured; goes with ``times``
+    require_verification: bool = False  # give no pose before this frame has verified the place
+    search_result: SearchResult | None = None  # of an earlier search, to be applied first
+    defer: bool = False  # frames wait for the engine: put off all work that can wait
+    # (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis
     hint: Pose | None = None
-    guess: PlaceGuess | None = None
-    calibration: Calibration | None = None
+    guess: PlaceGuess | None = None  # of the place by somebody; tried, never trusted
+    calibration: Calibration | None = None  # of its sensor and odometry at ``hint``, a prior
+    # the first one since a client reset the robot; another one makes the engine forget the calibration as well
     first_epoch: int = 0
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """The tracking engine's answer to a frame.
+    """The tracking engine's answer to a frame."""
 
-    Attributes:
-        fix: after the frame.
-        request: keyframe to search for; None for none.
-        seconds: of the engine's work.
-        events: changes of the engine's state since its last answer for this robot and epoch, in order.
-    """
-
-    fix: Fix
-    request: SearchRequest | None
-    seconds: float
-    events: tuple[Event, ...]
+    fix: Fix  # after the frame
+    request: SearchRequest | None  # keyframe to search for; None for none
+    seconds: float  # of the engine's work
+    events: tuple[Event, ...]  # changes of the engine's state since its last answer for this robot and epoch, in order
 
 
 @dataclass(frozen=True)
@@ -97,17 +74,11 @@ Result: TypeAlias = FrameResult | SearchResult | OdometryResult
 
 
 class SearchDemand(NamedTuple):
-    """A robot's waiting keyframe, for the order of searches.
+    """A robot's waiting keyframe, for the order of searches."""
 
-    Attributes:
-        since: local time in seconds from which a keyframe has been waiting, this one or one that it replaced.
-        searches: number of searches since the robot was lost.
-        support: how many of the newest of them, in a row, proposed a place.
-    """
-
-    since: float
-    searches: int = 0
-    support: int = 0
+    since: float  # local time in seconds from which a keyframe has been waiting, this one or one that it replaced
+    searches: int = 0  # number of searches since the robot was lost
+    support: int = 0  # how many of the newest of them, in a row, proposed a place
 
 
 def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
@@ -207,17 +178,11 @@ class PlaceHints:
 
 
 class QueuedFrame(NamedTuple):
-    """A frame for the tracking engine, waiting or under way.
+    """A frame for the tracking engine, waiting or under way."""
 
-    Attributes:
-        job: the frame, as the engine gets it.
-        paired: the frame with its odometry.
-        waiting_since: local time from which on a frame of this robot has been waiting.
-    """
-
-    job: FrameJob
-    paired: PairedFrame
-    waiting_since: float
+    job: FrameJob  # the frame, as the engine gets it
+    paired: PairedFrame  # the frame with its odometry
+    waiting_since: float  # local time from which on a frame of this robot has been waiting
 
 
 class EngineQueue:
@@ -226,33 +191,26 @@ class EngineQueue:
     Of frames and of search requests only the newest waits, and one of each is under way. The result of a search waits
     here too: it goes to the tracking engine with the next frame. Jobs issued before a reset are ignored; jobs of an old
     odometry epoch are only counted.
-
-    Attributes:
-        epoch: number of the robot's odometry frame.
-        latency: from the arrival of a cloud to its fix.
-        engine_latency: the engine's part of it.
-        longest_wait: most seconds that a frame of this robot has been waiting.
-        longest_search_wait: most seconds from a keyframe's arrival to the end of its search; a keyframe that replaces
-            another one inherits its wait.
-        processed_at: local time of the newest fix; None before the first.
-        considered: places of the newest search; None once there is a place, or another epoch.
     """
 
     def __init__(self, robot: str, epoch: int, counters: Counters, errors: ErrorLog) -> None:
         """Begin with nothing to do in odometry epoch ``epoch``, which no job of this robot has had before."""
         self.robot = robot
-        self._first_epoch = self.epoch = epoch
+        self._first_epoch = self.epoch = epoch  # number of the robot's odometry frame
         self._counters = counters
         self._errors = errors
-        self.latency, self.engine_latency = Latency(), Latency()
-        self.longest_wait = self.longest_search_wait = 0.0
-        self.processed_at: float | None = None
+        self.latency = Latency()  # from the arrival of a cloud to its fix
+        self.engine_latency = Latency()  # the engine's part of it
+        self.longest_wait = 0.0  # most seconds that a frame of this robot has been waiting
+        # most seconds from a keyframe to the end of its search; it inherits the wait of one that it replaces
+        self.longest_search_wait = 0.0
+        self.processed_at: float | None = None  # local time of the newest fix
         self._search_epoch: Epoch | None = None
         self._searches = self._support = 0  # in that epoch, as of SearchDemand
         self._forget_epoch()
 
     def _forget_epoch(self) -> None:
-        self.considered: Considered | None = None
+        self.considered: Considered | None = None  # places of the newest search; None once there is a place
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
         self._search_result: SearchResult | None = None

@@ -47,53 +47,33 @@ _BREAKS = {
 
 
 class Break(NamedTuple):
-    """Interruption of the odometry: frames from before and after it must not be searched for as one place.
+    """Interruption of the odometry: frames from before and after it must not be searched for as one place."""
 
-    Attributes:
-        reason: one clause for people.
-        verify_from_ns: after a short pause, the first stamp behind it: a place that is known need only be verified.
-    """
-
-    reason: str
+    reason: str  # one clause for people
+    # after a short pause, the first stamp behind it: a place that is known need only be verified
     verify_from_ns: int | None = None
 
 
 @dataclass(frozen=True)
 class OdometryJob:
-    """One lidar frame for the odometry engine.
+    """One lidar frame for the odometry engine."""
 
-    Attributes:
-        robot: name.
-        epoch: number of its lidar odometry; a new one makes the engine begin it again.
-        stamp_ns: sensor time, nanoseconds.
-        points: (N, 3) float32 body frame, metres.
-        times: (N,) seconds after the stamp at which each point was measured; None for no deskewing.
-        config: of its lidar odometry.
-    """
-
-    robot: str
-    epoch: int
-    stamp_ns: int
-    points: Points
-    times: Floats | None
-    config: LidarOdometryConfig
+    robot: str  # name
+    epoch: int  # number of its lidar odometry; a new one makes the engine begin it again
+    stamp_ns: int  # sensor time, nanoseconds
+    points: Points  # (N, 3) float32 body frame, metres
+    times: Floats | None  # (N,) seconds after the stamp at which each point was measured; None for no deskewing
+    config: LidarOdometryConfig  # of its lidar odometry
 
 
 @dataclass(frozen=True)
 class OdometryResult:
-    """Lidar odometry at a frame.
+    """Lidar odometry at a frame."""
 
-    Attributes:
-        T_odom_body: (4, 4) odometry at its stamp.
-        points: (N, 3) deskewed; None if the job had no times.
-        restarted: the pose is not connected to those before it.
-        seconds: of the engine's work.
-    """
-
-    T_odom_body: Pose
-    points: Points | None
-    restarted: bool
-    seconds: float
+    T_odom_body: Pose  # (4, 4) odometry at its stamp
+    points: Points | None  # (N, 3) deskewed; None if the job had no times
+    restarted: bool  # the pose is not connected to those before it
+    seconds: float  # of the engine's work
 
 
 class ReceivedFrame(NamedTuple):
@@ -105,23 +85,14 @@ class ReceivedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class PairedFrame:
-    """A lidar frame with its odometry.
+    """A lidar frame with its odometry."""
 
-    Attributes:
-        message: the frame.
-        received: local time at which it came, seconds.
-        T_odom_body: (4, 4) odometry at its stamp.
-        segment: odometry while it was measured; None for no deskewing.
-        travelled: metres that odometry had driven at its stamp.
-        turned: radians that odometry had turned at its stamp.
-    """
-
-    message: CloudMessage
-    received: float
-    T_odom_body: Pose
-    segment: Segment | None
-    travelled: float
-    turned: float
+    message: CloudMessage  # the frame
+    received: float  # local time at which it came, seconds
+    T_odom_body: Pose  # (4, 4) odometry at its stamp
+    segment: Segment | None  # odometry while it was measured; None for no deskewing
+    travelled: float  # metres that odometry had driven at its stamp
+    turned: float  # radians that odometry had turned at its stamp
 
 
 class FrameSync:
@@ -187,15 +158,9 @@ class Inputs:
     """Clouds and odometry of a robot that sends both, from one reset of its session to the next.
 
     ``codecs`` of clouds and odometry go before the messages' own encodings.
-
-    Attributes:
-        odometry: buffer of the newest samples.
-        odometry_source: ``robot``, or the library that computes the odometry here.
-        disconnected_at: local time at which nothing was connected to the node: a pause of odometry says nothing about
-            the robot then.
     """
 
-    odometry_source = "robot"
+    odometry_source = "robot"  # or the library that computes the odometry here
 
     def __init__(
         self,
@@ -211,6 +176,7 @@ class Inputs:
         self.counters = counters
         self.errors = errors
         self.odometry = OdometryBuffer(config)
+        # local time at which nothing was connected to the node: a pause of odometry says nothing about the robot then
         self.disconnected_at = _NEVER
         self._frames = FrameSync(config, self.odometry, counters)
         self._missing = MissingFrames()

@@ -45,21 +45,13 @@ _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
 
 @dataclass(frozen=True, eq=False)
 class LastPlace:
-    """Place of a robot on a map. A file has its ``T_map_body``; a message between nodes its ``T_map_odom``.
+    """Place of a robot on a map. A file has its ``T_map_body``; a message between nodes its ``T_map_odom``."""
 
-    Attributes:
-        map_sha256: of the base map, 64 hexadecimal digits; of a site that of its state.
-        stamp_ns: sensor time of ``T_map_body``, nanoseconds.
-        T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
-        T_map_odom: (4, 4) map <- odometry; the robot's odometry goes on when its node changes.
-        calibration: of its sensor and odometry; None if not known.
-    """
-
-    map_sha256: str
-    stamp_ns: int | None = None
-    T_map_body: Pose | None = None
-    T_map_odom: Pose | None = None
-    calibration: Calibration | None = None
+    map_sha256: str  # of the base map, 64 hexadecimal digits; of a site that of its state
+    stamp_ns: int | None = None  # sensor time of ``T_map_body``, nanoseconds
+    T_map_body: Pose | None = None  # (4, 4) float64 in the frame of the map's sources, metres
+    T_map_odom: Pose | None = None  # (4, 4) map <- odometry; the robot's odometry goes on when its node changes
+    calibration: Calibration | None = None  # of its sensor and odometry; None if not known
 
     def to_message(self) -> dict[str, Any]:
         """Return the plain data of a message to another node."""

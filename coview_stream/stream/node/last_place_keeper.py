@@ -22,13 +22,7 @@ _MIN_TURN = float(np.radians(1.0))
 
 
 class LastPlaceKeeper:
-    """Offers every robot its last place at the start, and writes its place now and then.
-
-    Args:
-        folder: made if it is not there.
-        sessions: one per robot.
-        interval: seconds; no robot's file is written more often.
-    """
+    """Offers every robot its last place at the start, and writes its place every ``interval`` seconds."""
 
     def __init__(self, folder: Path, sessions: Sequence[Session], interval: float = _INTERVAL) -> None:
         self.folder = folder
@@ -73,8 +67,12 @@ class LastPlaceKeeper:
                 forget(self.folder, robot, sha256)
                 self._forgotten[robot] = forgotten
                 self._written.pop((robot, sha256), None)
-            if place is None or place.T_map_body is None or self._stands_still((robot, sha256), place.T_map_body):
+            if place is None or place.T_map_body is None:
                 return
+            if (written := self._written.get((robot, sha256))) is not None:
+                moved = inverse(written) @ place.T_map_body
+                if float(np.linalg.norm(moved[:3, 3])) < _MIN_MOVE and rotation_angle(moved) < _MIN_TURN:
+                    return
             save(self.folder, robot, place)
             self._written[robot, sha256] = place.T_map_body
         except OSError as error:
@@ -83,11 +81,3 @@ class LastPlaceKeeper:
             self._failing = True
         else:
             self._failing = False
-
-    def _stands_still(self, key: tuple[str, str], T_map_body: Pose) -> bool:
-        """Whether the robot is where it was when its place was written."""
-        written = self._written.get(key)
-        if written is None:
-            return False
-        moved = inverse(written) @ T_map_body
-        return float(np.linalg.norm(moved[:3, 3])) < _MIN_MOVE and rotation_angle(moved) < _MIN_TURN

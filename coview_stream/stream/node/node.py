@@ -47,19 +47,13 @@ Service = Callable[[threading.Event], None]
 
 
 class OpenedMap(NamedTuple):
-    """A map with engines that are ready for jobs.
+    """A map with engines that are ready for jobs."""
 
-    Attributes:
-        sha256: of the map.
-        engines: by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``.
-        sessions: one per robot, in the node's order, without any message.
-        file: that it was opened from; None where nobody reads it.
-    """
-
-    sha256: str
+    sha256: str  # of the map
+    # by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``
     engines: Mapping[str, EngineRunner]
-    sessions: Sequence[Session]
-    file: Path | None = None
+    sessions: Sequence[Session]  # one per robot, in the node's order, without any message
+    file: Path | None = None  # that it was opened from; None where nobody reads it
 
 
 OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
@@ -69,14 +63,7 @@ OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
 class EngineFeed:
     """Feeds the engines of one map, each by a thread of its own, and recovers from an engine's failure.
 
-    Args:
-        sessions: one per robot, all on the engines' map.
-        engines: by name: ``track``, ``search`` and perhaps ``odometry``.
-        errors: logs errors.
-        on_change: called with a session whose state may have changed; with None for any.
-
-    Attributes:
-        restarts: number of restarts of each engine.
+    ``on_change`` is called with a session whose state may have changed, with None for any.
     """
 
     def __init__(
@@ -88,7 +75,7 @@ class EngineFeed:
     ) -> None:
         self.sessions = list(sessions)
         self.engines = dict(engines)
-        self.restarts = dict.fromkeys(self.engines, 0)
+        self.restarts = dict.fromkeys(self.engines, 0)  # of each engine
         self.threads: list[threading.Thread] = []
         self._errors = errors
         self._on_change = on_change
@@ -219,16 +206,6 @@ class Node:
         open_map: opens the map again, at a reload; None if there is no way to.
         on_reload: called with True when a change of the map begins, with False when it is over.
         map_files: file of the map by its hash; the node adds those of later maps.
-
-    Attributes:
-        sessions: one per robot, those in force.
-        identity: of the node, in its statuses.
-        started: local time at which it was made.
-        beat: local time of the pose clock's newest tick.
-        reporter: publishes the statuses.
-        endpoints: of each robot, by its name.
-        reloader: changes the map; None if there is no way to.
-        feeds: of the engines of the map that is served, and of another that is to take its place.
     """
 
     def __init__(
@@ -244,7 +221,7 @@ class Node:
         on_reload: Callable[[bool], None] = lambda busy: None,
         map_files: dict[str, Path] | None = None,
     ) -> None:
-        self.sessions = list(opened.sessions)
+        self.sessions = list(opened.sessions)  # those in force
         self.transport = transport
         self.config = config or NodeConfig()
         self.identity = NodeIdentity(period=round(1.0 / self.config.status_rate, 3))
@@ -255,14 +232,14 @@ class Node:
         self._threads: list[threading.Thread] = []
         self._ending: threading.Thread | None = None
         self.reporter = Reporter(self.sessions, transport, self._errors, self.identity)
-        self.feeds: tuple[EngineFeed, ...] = (self._make_feed(opened),)
+        self.feeds: tuple[EngineFeed, ...] = (self._make_feed(opened),)  # of the map, and of one that is to follow it
         self.endpoints = {
             session.keys.robot: RobotEndpoints(session, transport, self.reporter, self._wake, pose_format, geo)
             for session in self.sessions
         }
         self._robots = list(self.endpoints.values())
         self.reloader = None if open_map is None else MapReloader(self, open_map, on_reload)
-        self.started = self.beat = time.monotonic()
+        self.started = self.beat = time.monotonic()  # local time of the start, and of the pose clock's newest tick
 
     def start(self, services: Mapping[str, Service] | None = None) -> None:
         """Declare everything and start the threads, those of ``services`` by name as well."""
@@ -397,15 +374,9 @@ class MapReloader:
     meanwhile, and the place on the old map is a hypothesis on the new one. A robot without a place changes at once, one
     that is not found on the new map after a minute changes without a place, and is searched for.
 
-    Args:
-        node: the node; its map is the old one.
-        open_map: opens the new map.
-        on_change: called with True when a change begins, with False when it is over.
-
     Attributes:
         last: outcome of the newest change: ``result`` (``none``, ``loading``, ``handing over``, ``changed``,
             ``unchanged``, ``refused`` or ``failed``), ``map_sha256`` and ``error``.
-        max_handover: most seconds that a robot keeps the old map.
     """
 
     def __init__(self, node: Node, open_map: OpenMap, on_change: Callable[[bool], None] = lambda busy: None) -> None:

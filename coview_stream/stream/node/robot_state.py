@@ -25,19 +25,14 @@ _MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them al
 
 
 class RobotState:
-    """State and odometry correction of one robot, from one reset of its session to the next; the session locks it.
-
-    Attributes:
-        last_frame_ns: stamp of the newest processed frame; None before the first.
-        calibration: of its sensor and odometry at the newest frame, in every state.
-    """
+    """State and odometry correction of one robot, from one reset of its session to the next; the session locks it."""
 
     def __init__(self, robot: str, map_sha256: str, counters: Counters, hints: PlaceHints) -> None:
         """Begin in SEARCHING; ``hints`` outlive resets."""
         self.robot = robot
         self.map_sha256 = map_sha256
-        self.last_frame_ns: int | None = None
-        self.calibration: Calibration | None = None
+        self.last_frame_ns: int | None = None  # stamp of the newest processed frame
+        self.calibration: Calibration | None = None  # of sensor and odometry at the newest frame, in every state
         self._hints = hints
         self._counters = counters
         self._lost = False  # and no fix has restored the place yet
@@ -182,29 +177,17 @@ class RobotState:
 
 @dataclass(frozen=True)
 class OdomCorrection:
-    """Correction of odometry: the newest verified ``T_map_odom``, and the odometry's way up to its frame.
+    """Correction of odometry: the newest verified ``T_map_odom``, and the odometry's way up to its frame."""
 
-    Attributes:
-        T_map_odom: (4, 4) map <- odometry, source frame of the map.
-        T_map_body: (4, 4) map <- body at the frame that it comes from.
-        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame.
-        confidence: probability of the place, in [0, 1], of the search that accepted it.
-        verified_ns: stamp of the newest registration that supported it.
-        travelled: metres that odometry had driven at the frame.
-        turned: radians that it had turned.
-        drift: estimate of its drift.
-        doubt: factor on the protection level that the covariance alone gives.
-    """
-
-    T_map_odom: Pose
-    T_map_body: Pose
-    covariance: Floats
-    confidence: float
-    verified_ns: int
-    travelled: float
-    turned: float
-    drift: Drift
-    doubt: float
+    T_map_odom: Pose  # (4, 4) map <- odometry, source frame of the map
+    T_map_body: Pose  # (4, 4) map <- body at the frame that it comes from
+    covariance: Floats  # (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame
+    confidence: float  # probability of the place, in [0, 1], of the search that accepted it
+    verified_ns: int  # stamp of the newest registration that supported it
+    travelled: float  # metres that odometry had driven at the frame
+    turned: float  # radians that it had turned
+    drift: Drift  # estimate of its drift
+    doubt: float  # factor on the protection level that the covariance alone gives
 
     @classmethod
     def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> OdomCorrection:
@@ -252,55 +235,32 @@ class OdomCorrection:
         )
 
 
-@dataclass(frozen=True)
-class Transition:
-    """One change of the state, or LOST for another reason than before, which changes the search.
-
-    Attributes:
-        number: counted from 1 since the session began; a gap shows how many are missing.
-        stamp_ns: of the robot's newest processed frame, nanoseconds; None before the first.
-        before: the state that ended.
-        state: the state that began.
-        reason: one clause for people.
-        evidence: of the newest keyframe, if any.
-    """
-
-    number: int
-    stamp_ns: int | None
-    before: State
-    state: State
-    reason: str
-    evidence: KeyframeEvidence | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain data for the status."""
-        return {
-            "number": self.number,
-            "stamp_ns": self.stamp_ns,
-            "from": self.before.reported,
-            "to": self.state.reported,
-            "reason": self.reason,
-            "evidence": None if self.evidence is None else self.evidence.to_json(),
-        }
-
-
 class StateHistory:
-    """The newest changes of a robot's reported state, each with its reason and evidence."""
+    """The newest changes of a robot's reported state, with their reasons and evidence.
+
+    They are counted from 1 since the session began: a gap shows how many are missing.
+    """
 
     def __init__(self) -> None:
         self._state = State.SEARCHING
         self._reason = ""
-        self._newest: deque[Transition] = deque(maxlen=_MAX_TRANSITIONS)
+        self._newest: deque[tuple[dict[str, Any], KeyframeEvidence | None]] = deque(maxlen=_MAX_TRANSITIONS)
         self._count = 0
 
     def add(self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None) -> None:
-        """Record the present state: a transition if it is reported as another one, or lost for another reason."""
+        """Record the state at the newest processed frame: a change if it is reported as another one.
+
+        LOST for another reason counts as well, for that changes the search.
+        """
         lost_again = state is State.LOST and reason != self._reason
         if state.reported != self._state.reported or lost_again:
             self._count += 1
-            self._newest.append(Transition(self._count, stamp_ns, self._state, state, reason, evidence))
+            ends = {"from": self._state.reported, "to": state.reported}
+            change = {"number": self._count, "stamp_ns": stamp_ns, **ends, "reason": reason}
+            self._newest.append((change, evidence))
             self._state, self._reason = state, reason
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the newest ones, oldest first."""
-        return [transition.to_json() for transition in tuple(self._newest)]
+        newest = tuple(self._newest)
+        return [c | {"evidence": None if evidence is None else evidence.to_json()} for c, evidence in newest]

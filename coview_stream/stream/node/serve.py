@@ -47,19 +47,12 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class CodecOptions:
-    """Encodings of messages.
+    """Encodings of messages."""
 
-    Attributes:
-        cloud: of all clouds, in place of their own encoding; None believes them.
-        odometry: likewise.
-        pose: of the poses; None is the preset's.
-        geo: of the poses as places on Earth; None publishes none.
-    """
-
-    cloud: str | None = None
-    odometry: str | None = None
-    pose: str | None = None
-    geo: str | None = None
+    cloud: str | None = None  # of all clouds, in place of their own encoding; None believes them
+    odometry: str | None = None  # likewise
+    pose: str | None = None  # of the poses; None is the preset's
+    geo: str | None = None  # of the poses as places on Earth; None publishes none
 
 
 @dataclass(frozen=True)

@@ -44,16 +44,6 @@ class Session:
         parts: the maps of which the map is joined; None of one map.
         lidar: how odometry is computed from the clouds; None if the robot sends it.
         site_sha256: of the state of a site, common to all parts of it; None: the map is a single file.
-
-    Attributes:
-        lock: held while several of the following are read together.
-        counters: of its messages.
-        errors: of its input, for people.
-        history: of its state.
-        inputs: its clouds and odometry.
-        queue: frames and search requests for the engines, and their latencies.
-        robot_state: its state and the correction of its odometry.
-        hints: places that the engine is to try.
     """
 
     def __init__(
@@ -70,7 +60,7 @@ class Session:
         self.map_sha256, self.site_sha256 = map_sha256, site_sha256 or map_sha256
         self.config = config or NodeConfig()
         self.parts = parts
-        self.lock = threading.RLock()
+        self.lock = threading.RLock()  # held while several attributes are read together
         self._codecs = codecs
         self._lidar = lidar
         self._epoch = 0  # number of the odometry frame, counted through all resets

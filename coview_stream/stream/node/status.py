@@ -32,27 +32,15 @@ _TEXT, _SHORT_TEXT = 300, 100  # characters
 
 
 class Reporter:
-    """Publishes statuses. A robot's error silences no other robot.
-
-    Args:
-        sessions: one per robot.
-        transport: where statuses go to.
-        errors: logs errors.
-        identity: of this node.
-
-    Attributes:
-        changed: set it when a state may have changed.
-        rates: of each robot's poses; add to it when one goes out.
-        served: robots that this node serves: of all others nothing is published.
-    """
+    """Publishes the statuses of all robots. A robot's error silences no other robot."""
 
     def __init__(
         self, sessions: Sequence[Session], transport: Transport, errors: RateLimitedErrors, identity: NodeIdentity
     ) -> None:
         self.identity = identity
-        self.changed = threading.Event()
-        self.rates = {s.keys.robot: PoseRate() for s in sessions}
-        self.served: set[str] = set()
+        self.changed = threading.Event()  # to be set when a state may have changed
+        self.rates = {s.keys.robot: PoseRate() for s in sessions}  # of poses, which are added when they go out
+        self.served: set[str] = set()  # robots that this node serves: of all others nothing is published
         self._sessions = sessions
         self._transport = transport
         self._errors = errors
@@ -256,16 +244,11 @@ def _cut(text: str, length: int) -> str:
 
 
 class ConnectionMonitor:
-    """Routers and peers that the node is connected to, and their changes. Pure.
-
-    Attributes:
-        connection: at the last update.
-        reconnects: number of times that a router came back, or another took its place. Peers come and go.
-    """
+    """Routers and peers that the node is connected to, and their changes. Pure."""
 
     def __init__(self) -> None:
         self.connection = Connection()
-        self.reconnects = 0
+        self.reconnects = 0  # times that a router came back, or another took its place; peers come and go
         self._missing: set[str] = set()  # routers that have gone and have not been replaced
 
     def update(self, connection: Connection) -> None:

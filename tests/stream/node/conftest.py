@@ -1,9 +1,10 @@
-"""Nodes without threads, declared on a network in memory."""
+"""A robot, and nodes without threads, declared on a network in memory."""
 
 from __future__ import annotations
 
 import pytest
 from fake_node import Site
+from fake_robot import Robot
 
 
 @pytest.fixture
@@ -18,3 +19,8 @@ def pair():
     made = Site("r1", "r2")
     made.node.declare()
     return made
+
+
+@pytest.fixture
+def robot():
+    return Robot()

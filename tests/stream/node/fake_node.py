@@ -41,45 +41,27 @@ class Engine:
         pass
 
 
-class InlineRunner:
-    """Runs jobs on the caller's thread."""
-
-    def __init__(self, engine):
-        self.engine = engine
-
-    def run(self, job):
-        return unwrap(*attempt(self.engine, job))
+class Runner:
+    """Runs jobs on the caller's thread; its engine dies when it is told to."""
 
     pid, ready = None, True
 
-    def watch(self):
-        pass
-
-    def end_stopped(self):
-        pass
-
-    def close(self):
-        pass
-
-
-def publish_statuses(node, now, all_robots=True):
-    """Publish the status of every robot, or of those whose state has changed."""
-    node.reporter.publish(now, all_robots)
-
-
-class Runner(InlineRunner):
-    """An engine that dies when it is told to."""
-
-    def __init__(self, engine):
-        super().__init__(engine)
+    def __init__(self, engine, name="track"):
+        self.engine, self.name = engine, name
         self.dead = False
         self.closed = 0
 
     def run(self, job):
         if self.dead:
             self.dead = False
-            raise DiedError("the track engine died")
-        return super().run(job)
+            raise DiedError(f"the {self.name} engine died")
+        return unwrap(*attempt(self.engine, job))
+
+    def watch(self):
+        pass
+
+    def end_stopped(self):
+        pass
 
     def close(self):
         self.closed += 1
@@ -126,5 +108,5 @@ class Site:
         return [json.loads(s.payload) for s in self.net.samples(self.keys[name].status)]
 
     def status(self, name):
-        publish_statuses(self.node, time.monotonic())
+        self.node.reporter.publish(time.monotonic())
         return self.statuses(name)[-1]

@@ -20,40 +20,25 @@ from coview_stream.stream.client.client import RobotClient
 FALSE = 1.0  # metres: the world is 68 m wide and its poses are good to a few centimetres
 
 
-class Service:
-    """A process that serves a copy of a map, and a robot that goes to and fro on it, ten frames a second."""
+class Driver:
+    """A robot that goes to and fro, and the poses that it gets.
 
-    def __init__(self, world_file, drive, folder, router="", robots_router="", arguments=(), **environment):
-        """Listen, and be connected to, unless the endpoints of a router are given: the node's, and the robot's."""
-        self.folder, self.drive = folder, drive
-        self.map = folder / "site.coview"
-        self.map.write_bytes(Path(world_file).read_bytes())
-        self.endpoint, self.notices = robots_router or free_endpoint(), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.notices.bind(str(folder / "notify"))
-        self.notices.settimeout(30.0)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
-        self._log = []
-        notices = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000"}
-        where = ("--connect", router) if router else ("--listen", self.endpoint)
-        self.process = subprocess.Popen(
-            python_command(
-                "coview_stream", "serve", str(self.map), "--robot", "r1", *where,
-                "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json", *arguments,
-            ),
-            env=python_environment() | notices | environment,
-            stderr=subprocess.PIPE,
-        )  # fmt: skip
-        self.client = RobotClient("r1", self.endpoint)
+    Attributes:
+        pace: seconds between two frames.
+        stamp_of: the robot's clock.
+        poses: local times and poses.
+        truth: poses by their stamps.
+    """
+
+    def __init__(self, name, endpoint, drive, pace=0.1):
+        self.client, self.drive = RobotClient(name, endpoint), drive
         self.poses, self.truth = [], {}
-        self.pace, self.stamp_of = 0.1, lambda seconds: 1000.0 + seconds  # the robot's clock
+        self.pace, self.stamp_of = pace, lambda seconds: 1000.0 + seconds
         self._ending = threading.Event()
-        self.client.wait_for_node(30)
-        targets = (self._send, self._read, self._listen)
-        self._threads = [threading.Thread(target=run, daemon=True) for run in targets]
-        for thread in self._threads:
-            thread.start()
+
+    def start(self, *more):
+        for run in (self._send, self._read, *more):
+            threading.Thread(target=run, daemon=True).start()
 
     def _send(self):
         count = len(self.drive.clouds)
@@ -74,6 +59,63 @@ class Service:
             if self._ending.is_set():
                 return
 
+    def errors(self):
+        """Metres by which each pose is off; odometry is perfect, and every pose has a frame's stamp."""
+        assert self.poses
+        return [
+            float(np.linalg.norm(pose.T_map_body[:3, 3] - self.truth[pose.stamp_ns][:3, 3]))
+            for _, pose in list(self.poses)
+        ]
+
+    def end(self):
+        self._ending.set()
+        self.client.close()
+
+
+def health_at(address):
+    """Health of the node that serves its metrics there; None if there is none."""
+    try:
+        with urllib.request.urlopen(f"http://{address}/health", timeout=10) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as error:  # not ready
+        return json.load(error)
+    except OSError:
+        return None
+
+
+def free_address():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Service(Driver):
+    """A process that serves a copy of a map, and a robot on it, ten frames a second."""
+
+    def __init__(self, world_file, drive, folder, router="", robots_router="", arguments=(), **environment):
+        """Listen, and be connected to, unless the endpoints of a router are given: the node's, and the robot's."""
+        self.folder = folder
+        self.map = folder / "site.coview"
+        self.map.write_bytes(Path(world_file).read_bytes())
+        self.endpoint, self.notices = robots_router or free_endpoint(), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.notices.bind(str(folder / "notify"))
+        self.notices.settimeout(30.0)
+        self.metrics = free_address()
+        self._log = []
+        notices = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000"}
+        where = ("--connect", router) if router else ("--listen", self.endpoint)
+        self.process = subprocess.Popen(
+            python_command(
+                "coview_stream", "serve", str(self.map), "--robot", "r1", *where,
+                "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json", *arguments,
+            ),
+            env=python_environment() | notices | environment,
+            stderr=subprocess.PIPE,
+        )  # fmt: skip
+        super().__init__("r1", self.endpoint, drive)
+        self.client.wait_for_node(30)
+        self.start(self._listen)
+
     def _listen(self):
         for line in self.process.stderr:
             self._log.append(line)
@@ -83,11 +125,7 @@ class Service:
         return self.health()["robots"].get("r1")
 
     def health(self):
-        try:
-            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:  # not ready
-            return json.load(error)
+        return health_at(self.metrics)
 
     def engines(self):
         return {name: engine["pid"] for name, engine in self.health()["engines"].items()}
@@ -99,14 +137,6 @@ class Service:
         """Wait for a pose that comes from now on."""
         since = time.monotonic()
         until(lambda: self.poses and self.poses[-1][0] > since, seconds)
-
-    def errors(self):
-        """Metres by which each pose is off; odometry is perfect, and every pose has a frame's stamp."""
-        assert self.poses
-        return [
-            float(np.linalg.norm(pose.T_map_body[:3, 3] - self.truth[pose.stamp_ns][:3, 3]))
-            for _, pose in list(self.poses)
-        ]
 
     def end(self):
         self._ending.set()

@@ -13,12 +13,11 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
-from fake_node import InlineRunner
+from fake_node import Runner
 from fake_robot import tracking
 from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.errors import CloudError, CoViewError
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_process import (
     CancelledError,
@@ -52,28 +51,15 @@ class Engine:
         self.forgotten.append(robot)
 
 
-def test_completed_job_returns_its_result():
-    engine = Engine()
-    assert InlineRunner(engine).run(job()).fix.state is State.TRACKING
-    assert engine.forgotten == []
-
-
-def test_rejected_job_keeps_the_engine_state():
-    engine = Engine(CloudError("cloud has 3 finite points"))
-    with pytest.raises(RejectedError, match="3 finite points"):
-        InlineRunner(engine).run(job())
-    assert engine.forgotten == []
-
-
 def test_failed_engine_forgets_the_robot_and_returns_traceback():
     engine = Engine(ZeroDivisionError("by nothing"))
     with pytest.raises(FailedError) as caught:
-        InlineRunner(engine).run(job(robot="r7"))
+        Runner(engine).run(job(robot="r7"))
     assert engine.forgotten == ["r7"]
     assert str(caught.value).strip().splitlines()[-1] == "ZeroDivisionError: by nothing"
     assert "Traceback" in str(caught.value)
     engine.error = None
-    assert InlineRunner(engine).run(job()).fix.state is State.TRACKING
+    assert Runner(engine).run(job()).fix.state is State.TRACKING
 
 
 @contextlib.contextmanager
@@ -230,31 +216,6 @@ def test_child_ends_with_its_parent():
 
 
 @pytest.mark.slow
-def test_unreadable_map_fails_wait_ready(tmp_path):
-    broken = tmp_path / "broken.coview"
-    broken.write_bytes(b"no map at all")
-    process = EngineProcess("search", str(broken), "0" * 64)
-    try:
-        process.start()
-        with pytest.raises(CoViewError, match=r"broken\.coview"):
-            process.wait_ready()
-    finally:
-        process.close()
-    assert process.pid is None
-
-
-@pytest.mark.slow
-def test_replaced_map_is_reported_each_time(world_file):
-    process = EngineProcess("track", str(world_file), "0" * 64)
-    try:
-        for _ in range(2):
-            with pytest.raises(DiedError, match=r"has been replaced by another map; start the node \(serve\) again"):
-                process.run(job())
-    finally:
-        process.close()
-
-
-@pytest.mark.slow
 def test_hung_worker_is_killed_during_send(world_file, world_drive):
     process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, job_timeout=30.0)
     good = job(world_drive.clouds[0])
@@ -318,18 +279,6 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled():
         process.wait_ready(cancelled)
     with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
         process.wait_ready()
-    process.close()
-
-
-@pytest.mark.slow
-def test_wait_until_prepared_can_be_cancelled():
-    child = Program("pipe.send(('ready', None)); time.sleep(60)")
-    process = EngineProcess("track", "unused", "0" * 64, child=child)
-    process.start()
-    process.wait_ready()
-    assert not process.ready
-    with pytest.raises(CancelledError, match="track"):
-        process.wait_prepared(lambda: True)
     process.close()
 
 

@@ -60,12 +60,6 @@ def queue():
     return Queue()
 
 
-# ---- frames
-
-
-# ---- searches
-
-
 def test_newer_search_result_replaces_that_of_a_rejected_frame(queue):
     newer = search_result(0.1)
     queue.search_done(queue.search(), search_result(0.0), NOW)
@@ -89,19 +83,6 @@ def test_failed_search_keeps_an_accepted_result(queue):
     queue.search_failed(queue.search(0.1), "boom")
     assert queue.take(0.0).search_result is accepted
     assert queue.counted == {"searches": 1, "search_errors": 1}
-
-
-def test_search_result_of_an_old_epoch_is_only_counted(queue):
-    job = queue.search()
-    waiting = search_result()
-    queue.search_done(job, waiting, NOW)
-    queue.begin_epoch(EPOCH + 1)
-    queue.search_done(job, search_result(accepted="a place"), NOW)
-    assert queue.take(0.0).search_result is None
-    assert queue.counted == {"searches": 2}
-
-
-# ---- demand for searches
 
 
 def test_demand_lasts_from_the_first_keyframe_that_waits_to_its_search(queue):
@@ -135,14 +116,6 @@ def test_searches_are_counted_from_the_loss(queue):
     assert queue.search_demand == SearchDemand(NOW, 0, 0)
 
 
-def test_failed_search_makes_room_for_the_next(queue):
-    job = queue.search()
-    queue.ask(0.1, NOW + 1.0)
-    queue.search_failed(job, "boom")
-    assert queue.search_demand == SearchDemand(NOW + 1.0)
-    assert queue.longest_search_wait == 0.0
-
-
 def test_keyframes_from_before_the_place_was_found_are_not_searched_for(queue):
     job = queue.search()
     queue.ask(0.1)
@@ -166,40 +139,25 @@ def test_new_odometry_wants_nothing_until_its_first_keyframe(queue):
 KEYFRAMES = 1.33  # seconds between those of a robot: 2 m at 1.5 m/s
 
 
-def first(*demands):
-    """Robot that is searched for first."""
-    return search_order(demands, NOW)[0]
-
-
 def waiting(seconds, searches=0, support=0):
     return SearchDemand(NOW - seconds, searches, support)
 
 
-def test_robots_without_a_keyframe_are_left_out():
-    assert search_order([None, waiting(0.1), None], NOW) == [1]
-    assert search_order([None], NOW) == []
-
-
-def test_among_equals_who_has_waited_longest_is_first():
-    assert search_order([waiting(0.1), waiting(0.3), waiting(0.2)], NOW) == [1, 2, 0]
-
-
-def test_proposed_place_comes_first_then_the_newly_lost():
-    assert search_order([waiting(1.0, 100), waiting(0.5, 2), waiting(0.1, 50, 3)], NOW) == [2, 1, 0]
-
-
-def test_whose_place_was_proposed_most_often_in_a_row_comes_first():
-    assert first(waiting(0.5, 3, 1), waiting(0.1, 4, 2)) == 1
-
-
-def test_place_that_is_proposed_without_end_gives_no_precedence():
-    assert first(waiting(0.1, 40, 40), waiting(0.05, 4, 1)) == 1
-    assert first(waiting(0.1, 40, 40), waiting(0.2, 40)) == 1
-
-
-def test_keyframe_that_has_waited_too_long_comes_before_all():
-    assert first(waiting(1.6, 500), waiting(1.4, 4, 3)) == 0
-    assert first(waiting(1.6, 4, 3), waiting(1.7, 500)) == 1
+@pytest.mark.parametrize(
+    ("demands", "order"),
+    [
+        ([None, waiting(0.1), None], [1]),
+        ([waiting(0.1), waiting(0.3), waiting(0.2)], [1, 2, 0]),  # among equals the longest wait
+        ([waiting(1.0, 100), waiting(0.5, 2), waiting(0.1, 50, 3)], [2, 1, 0]),  # proposed, newly lost, long lost
+        ([waiting(0.5, 3, 1), waiting(0.1, 4, 2)], [1, 0]),  # proposed most often in a row
+        ([waiting(0.1, 40, 40), waiting(0.05, 4, 1)], [1, 0]),  # proposed without end gives no precedence
+        ([waiting(0.1, 40, 40), waiting(0.2, 40)], [1, 0]),
+        ([waiting(1.6, 500), waiting(1.4, 4, 3)], [0, 1]),  # has waited too long
+        ([waiting(1.6, 4, 3), waiting(1.7, 500)], [1, 0]),
+    ],
+)
+def test_order_of_searches(demands, order):
+    assert search_order(demands, NOW) == order
 
 
 class Robots:
@@ -274,17 +232,7 @@ def served(turns, count, ready=ROBOTS):
     return names
 
 
-def test_robots_are_served_in_order():
-    assert served(RoundRobin(4), 8) == "abcdabcd"
-
-
 def test_idle_robot_keeps_its_turn():
     turns = RoundRobin(4)
     assert served(turns, 2, ready="bd") == "bd"
     assert served(turns, 4) == "acbd"
-
-
-def test_no_jobs_keep_the_order():
-    turns = RoundRobin(4)
-    assert turns.order() == turns.order() == [0, 1, 2, 3]
-    assert served(turns, 1) == "a"

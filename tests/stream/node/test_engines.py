@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_world import pose_error
 
 import coview_kernels
 from coview_kernels import runtime
@@ -145,13 +144,6 @@ def test_track_and_search_engines_equal_localizer_one_frame_late(alone, world_fi
         same(alone[k], world_fixes[k])
 
 
-def test_engine_poses_are_correct(alone, world_drive):
-    assert alone[-1].T_map_body is not None
-    for fix, truth in zip(alone, world_drive.T_map_body, strict=False):
-        if fix.T_map_body is not None:
-            assert pose_error(fix.T_map_body, truth)[0] < 0.08
-
-
 @pytest.mark.slow
 def test_two_robots_give_same_results_as_each_alone(engines, alone, world_drive):
     other_drive = world_drive.seen_from(OTHER_ODOMETRY)
@@ -250,10 +242,8 @@ def test_points_with_times_are_deskewed(engines, world_drive):
         swept[times == t] = transform(inverse(pose_from(np.eye(3), [speed * t, 0, 0])), points[times == t])
     along = [T @ pose_from(np.eye(3), [speed * t, 0, 0]) for t in (-0.1, 0.0)]
     segment = Segment(np.array([900_000_000, 1_000_000_000], np.int64), np.array(along))
-    engine = engines[0]
-    engine.run(FrameJob("moving", 1, 1_000_000_000, swept, T, times, segment))
-    cloud = engine._robots["moving"][2]._newest.cloud
-    np.testing.assert_allclose(cloud, points, atol=0.01)
+    request = engines[0].run(FrameJob("moving", 1, 1_000_000_000, swept, T, times, segment)).request
+    np.testing.assert_allclose(request.cloud, points, atol=0.01)
 
 
 def test_job_of_the_other_engine_is_refused(engines, world_drive):

@@ -6,19 +6,16 @@ import itertools
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 
 import numpy as np
 import pytest
 from fake_node import Site
 from fake_robot import SHA, T_MAP_ODOM, Robot, pose
 from nightly import nightly
-from serving import FALSE, Service
+from serving import FALSE, Service, free_address, health_at
 from sockets import until
 from zenoh_routers import Router
 
@@ -193,9 +190,7 @@ class Other:
     """Another process that serves the robot of a service."""
 
     def __init__(self, service, router, *arguments):
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
+        self.metrics = free_address()
         command = ("serve", str(service.map), "--robot", "r1", "--connect", router, "--no-state")
         self.process = subprocess.Popen(
             python_command("coview_stream", *command, "--metrics", self.metrics, *arguments),
@@ -203,17 +198,11 @@ class Other:
             stderr=subprocess.DEVNULL,
         )
 
-    def health(self):
-        try:
-            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:  # not ready
-            return json.load(error)
-        except OSError:
-            return None
+    def ready(self):
+        return (document := health_at(self.metrics)) is not None and document["ready"]["ok"]
 
     def robot(self):
-        document = self.health()
+        document = health_at(self.metrics)
         return None if document is None else document["robots"].get("r1")
 
     def end(self):
@@ -233,7 +222,7 @@ def test_one_node_serves_and_another_goes_on_when_it_dies_or_hangs(world_file, s
         )
         other = Other(service, router.endpoint, *fleet)
         try:
-            until(lambda: (document := other.health()) is not None and document["ready"]["ok"], 60.0)
+            until(other.ready, 60.0)
             service.tracks(60.0)
             first = only_server(service, service, other)
             victim = (service, other)[first].process

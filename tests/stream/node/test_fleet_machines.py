@@ -12,18 +12,16 @@ import sys
 import threading
 import time
 
-import numpy as np
 import pytest
 from nightly import nightly
+from serving import FALSE, Driver
 from sockets import until
 from zenoh_routers import ROUTER_PROGRAM, router_config
 
 from coview_stream.clouds.python_child import python_command, python_environment
-from coview_stream.stream.client.client import RobotClient
 
 PORT = 7461
 MAX_GAP = 3.0  # seconds that docs/large.md promises
-FALSE = 1.0  # metres
 TRANSPORT = {"link": {"tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 1_500_000}}}}}}
 """As docs/large.md has it: or a machine that is silent holds all others up for five seconds."""
 
@@ -75,31 +73,13 @@ class Machine:
         ip("netns", "del", self.name)
 
 
-class Robot:
-    """A robot that goes to and fro, ten frames a second, and what it hears."""
+class Robot(Driver):
+    """A robot, five frames a second, and the nodes that serve it by the statuses that it hears."""
 
     def __init__(self, name, drive):
-        self.client, self.drive = RobotClient(name, f"tcp/127.0.0.1:{PORT}"), drive
-        self.poses, self.nodes, self.truth = [], [], {}
-        self._ending = threading.Event()
-        for run in (self._send, self._hear_poses, self._hear_statuses):
-            threading.Thread(target=run, daemon=True).start()
-
-    def _send(self):
-        count, due = len(self.drive.clouds), time.monotonic()
-        for k in range(1_000_000):
-            at = (count - 1) - abs((k % (2 * count - 2)) - (count - 1))
-            stamp = 1000.0 + 0.2 * k
-            self.truth[round(stamp * 1e9)] = self.drive.T_map_body[at]
-            self.client.send_odometry(self.drive.T_odom_body[at], stamp)
-            self.client.send_cloud(self.drive.clouds[at], stamp)
-            due += 0.2
-            if self._ending.wait(max(0.0, due - time.monotonic())):
-                return
-
-    def _hear_poses(self):
-        for pose in self.client.poses(timeout=None):
-            self.poses.append((time.monotonic(), pose))
+        super().__init__(name, f"tcp/127.0.0.1:{PORT}", drive, pace=0.2)
+        self.nodes = []
+        self.start(self._hear_statuses)
 
     def _hear_statuses(self):
         for status in self.client.statuses(timeout=None):
@@ -107,10 +87,6 @@ class Robot:
 
     def served_by(self, other_than, since):
         return next((at for at, node in list(self.nodes) if at > since and node not in other_than), None)
-
-    def close(self):
-        self._ending.set()
-        self.client.close()
 
 
 def ip(*words):
@@ -156,11 +132,9 @@ def test_cable_that_is_pulled_moves_robots_and_plugged_in_again_gives_no_false_p
         for robot in robots:  # one node each
             nodes = {node for at, node in list(robot.nodes) if at > now}
             assert len(nodes) <= 1
-            poses = list(robot.poses)
-            off = [np.linalg.norm(p.T_map_body[:3, 3] - robot.truth[p.stamp_ns][:3, 3]) for _, p in poses]
-            assert max(off) < FALSE
-            stamps = [p.stamp_ns for at, p in poses if at > now]
+            assert max(robot.errors()) < FALSE
+            stamps = [p.stamp_ns for at, p in list(robot.poses) if at > now]
             assert stamps == sorted(stamps)
     finally:
         for robot in robots:
-            robot.close()
+            robot.end()

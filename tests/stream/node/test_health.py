@@ -11,7 +11,6 @@ import threading
 import time
 
 import pytest
-from fake_node import STEP
 from sockets import until
 
 from coview_stream.errors import ConfigError
@@ -21,6 +20,20 @@ from coview_stream.stream.transport.transport import Connection
 
 SAMPLE = re.compile(r'coview_[a-z_]+(\{[a-z_0-9]+="(\\.|[^"\\\n])*"(,[a-z_0-9]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')
 KEYS = node_keys("coview", "n1")
+
+
+@contextlib.contextmanager
+def running(run, *more):
+    """Run a service on a thread of its own."""
+    stopping = threading.Event()
+    thread = threading.Thread(target=run, args=(stopping, *more), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(10.0)
+    assert not thread.is_alive()
 
 
 def test_tracking_node_is_live_and_ready(site):
@@ -71,12 +84,8 @@ def test_health_is_published_and_answered(site):
     health.answer(KEYS)
     assert site.net.query(KEYS.ask_health)["ready"]["ok"]
     assert site.net.query(KEYS.reload)["ok"] is False  # this node cannot
-    stopping = threading.Event()
-    thread = threading.Thread(target=health.run, args=(stopping, KEYS))
-    thread.start()
-    until(lambda: site.net.samples(KEYS.health))
-    stopping.set()
-    thread.join(10.0)
+    with running(health.run, KEYS):
+        until(lambda: site.net.samples(KEYS.health))
     assert json.loads(site.net.samples(KEYS.health)[0].payload)["live"]["ok"]
 
 
@@ -91,13 +100,8 @@ def test_keys_of_a_node_match_no_wildcard():
 def server():
     document = {"ok": True}
     made = metrics_server("127.0.0.1:0", lambda: {"ready": document})
-    stopping = threading.Event()
-    thread = threading.Thread(target=made.run, args=(stopping,))
-    thread.start()
-    yield made, document
-    stopping.set()
-    thread.join(10.0)
-    assert not thread.is_alive()
+    with running(made.run):
+        yield made, document
 
 
 def asked(server, method, page):
@@ -135,19 +139,6 @@ def test_slow_endless_and_vanishing_readers_are_cut_off(server):
     flood.close()
 
 
-def test_metrics_of_a_real_node_are_served(site):
-    site.frame("r1", STEP)
-    made = metrics_server("127.0.0.1:0", NodeHealth(site.node).document)
-    stopping = threading.Event()
-    thread = threading.Thread(target=made.run, args=(stopping,))
-    thread.start()
-    status, body = asked(made, "GET", "/metrics")
-    stopping.set()
-    thread.join(10.0)
-    assert status == 200
-    assert b'coview_robot_state{robot="r1",state="TRACKING"} 1\n' in body
-
-
 @pytest.mark.parametrize("address", ["", "nonsense", "127.0.0.1:", "127.0.0.1:99999999", "192.0.2.7:9464"])
 def test_bad_address_is_refused(address):
     with pytest.raises(ConfigError, match="--metrics"):
@@ -164,27 +155,15 @@ def test_telling_goes_on_after_something_could_not_be_told(site):
         return Connection(routers=("r",))
 
     site.net.connection = connection
-    stopping = threading.Event()
-    health = NodeHealth(site.node, needs_connection=True)
-    thread = threading.Thread(target=health.run, args=(stopping, KEYS), daemon=True)
-    thread.start()
-    until(lambda: len(calls) > 1)
-    stopping.set()
-    thread.join(5.0)
+    with running(NodeHealth(site.node, needs_connection=True).run, KEYS):
+        until(lambda: len(calls) > 1)
 
 
 def test_a_page_that_cannot_be_made_is_reported(caplog):
     def document():
         raise KeyError("engines")
 
-    server = metrics_server("127.0.0.1:0", document)
-    stopping = threading.Event()
-    thread = threading.Thread(target=server.run, args=(stopping,), daemon=True)
-    thread.start()
-    with contextlib.suppress(http.client.HTTPException, OSError):
-        connection = http.client.HTTPConnection(*server.url[7:-1].split(":"), timeout=5)
-        connection.request("GET", "/health")
-        connection.getresponse()
+    made = metrics_server("127.0.0.1:0", document)
+    with running(made.run), contextlib.suppress(http.client.HTTPException, OSError):
+        asked(made, "GET", "/health")
     until(lambda: "metrics" in caplog.text and "engines" in caplog.text)
-    stopping.set()
-    thread.join(5.0)

@@ -15,8 +15,7 @@ from se3 import exp_se3
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, forget, load, remove_parts, save
+from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, load, remove_parts, save
 
 SHA = "0123456789abcdef" * 4
 UTM = [512_345.678_901, 5_403_210.123_456, 287.4]
@@ -42,13 +41,6 @@ def test_calibration_comes_back_with_the_pose(tmp_path):
     assert load(tmp_path, "r1", SHA).calibration == known
     save(tmp_path, "r1", LAST)
     assert load(tmp_path, "r1", SHA).calibration is None
-
-
-def test_calibration_of_a_robot_whose_sensor_cannot_lean_comes_back(tmp_path):
-    """Lidar odometry knows the tilt for sure: its sigma is zero."""
-    known = CalibrationEstimator(sensor_leans=False).calibration
-    save(tmp_path, "r1", replace(LAST, calibration=known))
-    assert load(tmp_path, "r1", SHA).calibration == known
 
 
 @pytest.mark.parametrize(
@@ -209,15 +201,6 @@ def test_what_a_power_cut_left_behind_is_removed(tmp_path):
     remove_parts(tmp_path, "r1", SHA)
     same(load(tmp_path, "r1", SHA), LAST)
     assert {p.name for p in tmp_path.iterdir()} == {path.name, other.name}
-
-
-def test_forget_deletes_the_file_of_one_robot(tmp_path):
-    save(tmp_path, "r1", LAST)
-    save(tmp_path, "r2", LAST)
-    for _ in range(2):
-        forget(tmp_path, "r1", SHA)
-    assert load(tmp_path, "r1", SHA) is None
-    assert load(tmp_path, "r2", SHA) is not None
 
 
 @pytest.mark.parametrize(

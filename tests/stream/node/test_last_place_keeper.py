@@ -17,10 +17,9 @@ from sockets import until
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.state import State
-from coview_stream.stream.node import last_place_keeper
 from coview_stream.stream.node.engine_queue import FrameJob
 from coview_stream.stream.node.engines import TrackEngine
-from coview_stream.stream.node.last_place import LastPlace, file_of, load, save
+from coview_stream.stream.node.last_place import LastPlace, load, save
 from coview_stream.stream.node.last_place_keeper import LastPlaceKeeper
 
 BEFORE = pose_from(rot_z(1.0), [30.0, 40.0, 1.5])
@@ -57,25 +56,6 @@ def test_calibration_goes_with_the_pose_hint_alone(robot):
     assert robot.frame(0.5, unknown).calibration is None
 
 
-def test_calibration_is_kept_with_the_pose_and_begins_the_next_start(robot, tmp_path):
-    known = Calibration(pitch=0.05, sigma_tilt=0.002)
-
-    def calibrated(job):
-        result = tracking(job)
-        return replace(result, fix=replace(result.fix, calibration=known))
-
-    robot.frame(0.1, calibrated)
-    assert robot.session.robot_state.calibration == known
-    robot.frame(0.2, unknown)
-    assert robot.session.robot_state.calibration == known  # of the robot, not of the place
-    robot.frame(0.3, calibrated)
-    LastPlaceKeeper(tmp_path, [robot.session]).keep()
-    later = Robot()
-    LastPlaceKeeper(tmp_path, [later.session]).hint()
-    later.moved(0.0)
-    assert later.frame(0.1, unknown).calibration == known
-
-
 def test_calibration_of_a_robot_without_a_place_is_told_but_not_kept(robot, tmp_path):
     """What is corrected is learnt anew while it searches; only a place that was accepted vouches for it."""
     known, relearnt = Calibration(pitch=0.05), Calibration(pitch=-0.03)
@@ -97,16 +77,21 @@ def test_calibration_of_a_robot_without_a_place_is_told_but_not_kept(robot, tmp_
     assert robot.session.robot_state.calibration == relearnt
     keeper.keep()
     assert load(tmp_path, robot.session.keys.robot, SHA).calibration == known
+    later = Robot()
+    LastPlaceKeeper(tmp_path, [later.session]).hint()
+    later.moved(0.0)
+    assert later.frame(0.1, unknown).calibration == known
     robot.session.reset()
     assert robot.session.robot_state.calibration is None
 
 
-def test_calibration_is_offered_again_with_each_odometry_frame(robot):
-    known = Calibration(pitch=0.05)
-    robot.session.offer(LastPlace(SHA, 5, BEFORE, calibration=known))
-    assert robot.frame(0.1, unknown).calibration == known
-    robot.session.engine_restarted()
-    assert robot.frame(0.3, unknown).calibration == known
+@pytest.mark.parametrize(("rejected", "hint"), [(True, BEFORE), (False, None)])
+def test_pose_hint_is_kept_when_frame_is_rejected_and_dropped_when_engine_fails(robot, rejected, hint):
+    robot.session.offer(LastPlace(SHA, 5, BEFORE))
+    robot.saw(0.0)
+    robot.moved(0.05)
+    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=rejected)
+    assert jobs_of(robot) == [hint, None, None]
 
 
 def test_pose_hint_waits_while_a_frame_is_running(robot):
@@ -116,22 +101,6 @@ def test_pose_hint_waits_while_a_frame_is_running(robot):
     robot.session.offer(LastPlace(SHA, 5, BEFORE))
     robot.session.handle_result(job, unknown(job), robot.now)
     assert jobs_of(robot) == [BEFORE, None, None]
-
-
-def test_pose_hint_is_kept_when_frame_is_rejected(robot):
-    robot.session.offer(LastPlace(SHA, 5, BEFORE))
-    robot.saw(0.0)
-    robot.moved(0.05)
-    robot.session.handle_failure(robot.session.take_job("track"), "cloud has 3 finite points", rejected=True)
-    assert jobs_of(robot) == [BEFORE, None, None]
-
-
-def test_pose_hint_is_dropped_when_engine_fails(robot):
-    robot.session.offer(LastPlace(SHA, 5, BEFORE))
-    robot.saw(0.0)
-    robot.moved(0.05)
-    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=False)
-    assert jobs_of(robot) == [None, None, None]
 
 
 def test_pose_hint_is_sent_again_after_engine_restart(robot):
@@ -245,28 +214,6 @@ def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     assert again.status("r1")["state"] == "SEARCHING"  # it is never trusted
 
 
-def test_last_pose_of_another_map_is_ignored(tmp_path):
-    save(tmp_path, "r1", LastPlace("cd" * 32, 5, BEFORE))
-    site, kept = remembering(tmp_path, "r1")
-    kept.hint()
-    site.sees("r1", 0.0)
-    assert site.sessions["r1"].take_job("track").hint is None
-
-
-def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
-    file_of(tmp_path, "r1", SHA).write_text("{")
-    save(tmp_path, "r2", LastPlace(SHA, 5, BEFORE))
-    site, kept = remembering(tmp_path, "r1", "r2")
-    kept.hint()
-    (line,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
-    assert str(file_of(tmp_path, "r1", SHA)) in line
-    site.sees("r2", 0.0)
-    assert site.sessions["r2"].take_job("track").hint is not None
-    site.frame("r1", 0.0)
-    kept.keep()
-    assert load(tmp_path, "r1", SHA) is not None
-
-
 def test_standing_robot_is_saved_once(tmp_path):
     site, kept = remembering(tmp_path, "r1")
     site.frame("r1", 0.0)
@@ -351,17 +298,24 @@ def test_running_node_saves_periodically_and_at_close(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("access", ["load", "save"])
-def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch, access):
-    hanging, released = threading.Event(), threading.Event()
+def test_hanging_disk_does_not_block_the_node(tmp_path, access):
+    hangs, hanging, released = threading.Event(), threading.Event(), threading.Event()
 
-    def hang(*args):
-        hanging.set()
-        released.wait(30.0)
+    class Folder(type(tmp_path)):
+        """A directory whose files hang."""
 
-    monkeypatch.setattr(last_place_keeper, access, hang)
+        def __truediv__(self, name):
+            if hangs.is_set():
+                hanging.set()
+                released.wait(30.0)
+            return super().__truediv__(name)
+
     site = Site("r1")
-    running(site, LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
+    if access == "load":
+        hangs.set()
+    running(site, LastPlaceKeeper(Folder(tmp_path), list(site.sessions.values()), interval=0.02))
     try:
+        hangs.set()
         site.sees("r1", 0.0)
         until(hanging.is_set)
         before = len(site.net.samples("coview/r1/out/pose"))
@@ -372,12 +326,3 @@ def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch, access):
         assert time.monotonic() - begin < 4.0
     finally:
         released.set()
-
-
-def test_last_pose_is_hinted_after_engine_death(tmp_path):
-    site, _ = remembering(tmp_path, "r1")
-    site.frame("r1", 0.0)
-    site.track.dead = True
-    site.frame("r1", STEP)
-    site.sees("r1", 2 * STEP)
-    np.testing.assert_allclose(site.sessions["r1"].take_job("track").hint, T_MAP_ODOM @ pose(0.0), atol=1e-9)

@@ -6,10 +6,11 @@ import json
 import os
 import signal
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_node import publish_statuses
+from fake_node import Runner
 from fake_robot import KEYS, SHA, cloud, message, ns, odometry, tracking
 from sockets import until
 
@@ -17,7 +18,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import inverse
-from coview_stream.stream.node.engine_process import DiedError, EngineProcess, RejectedError
+from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.node.engine_queue import OdometryJob, OdometryResult
 from coview_stream.stream.node.node import Node, OpenedMap
 from coview_stream.stream.node.session import Session
@@ -61,28 +62,8 @@ def sweep(points, seconds, times=None, config=LEVEL):
     return OdometryJob("r1", 1, ns(seconds), points, times, config)
 
 
-class Runner:
-    """Plays an engine; dies when it is told to."""
-
-    def __init__(self, answer):
-        self.answer, self.dead = answer, False
-
-    def run(self, job):
-        if self.dead:
-            self.dead = False
-            raise DiedError("the odometry engine died")
-        return self.answer(job)
-
-    pid, ready = None, True
-
-    def watch(self):
-        pass
-
-    def end_stopped(self):
-        pass
-
-    def close(self):
-        pass
+def playing(answer):
+    return Runner(SimpleNamespace(run=answer), "odometry")
 
 
 def placing(job):
@@ -96,7 +77,7 @@ def quiet():
     session = Session(
         KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0), lidar=LidarOdometryConfig()
     )
-    track, engine = Runner(tracking), Runner(placing)
+    track, engine = playing(tracking), playing(placing)
     made = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, session.config)
     made.declare()
     return made, net, engine
@@ -104,13 +85,12 @@ def quiet():
 
 def worked(node, *engines):
     for name in engines:
-        found = node.feeds[0].next_job(name)
-        if found is not None:
-            node.feeds[0].work(name, *found)
+        if (turn := node.feeds[0].next_job(name)) is not None:
+            node.feeds[0].work(name, *turn)
 
 
 def status(node, net):
-    publish_statuses(node, 0.0)
+    node.reporter.publish(0.0)
     return json.loads(net.samples(KEYS.status)[-1].payload)
 
 
@@ -147,39 +127,12 @@ def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
     assert status(node, net)["state"] == "TRACKING"
 
 
-def test_reset_request_resets_lidar_odometry(quiet):
-    node, net, _ = quiet
-    net.publish(cloud(0.0))
-    worked(node, "odometry", "track")
-    assert net.query(KEYS.reset)["state"] == "SEARCHING"
-    net.publish(cloud(0.0))
-    _, job = node.feeds[0].next_job("odometry")
-    assert job.epoch == 2
-
-
-@pytest.mark.slow
-def test_aborted_odometry_engine_is_restarted(stand_in):
-    engine = EngineProcess("odometry", "unused", "")
-    try:
-        assert engine.run(sweep(CLOUD, 0.0)).restarted
-        assert not engine.run(sweep(CLOUD, 0.1)).restarted
-        first = engine.pid
-        with pytest.raises(RejectedError, match="does not come after"):
-            engine.run(sweep(CLOUD, 0.1))
-        with pytest.raises(DiedError, match="odometry engine died"):
-            engine.run(sweep(FATAL, 0.2))
-        assert engine.run(sweep(CLOUD, 0.3)).restarted
-        assert engine.pid not in (None, first)
-    finally:
-        engine.close()
-
-
 @pytest.mark.slow
 def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
     net = MemoryTransport()
     config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
     session = Session(KEYS, SHA, config, lidar=LEVEL)
-    track, engine = Runner(tracking), EngineProcess("odometry", "unused", "")
+    track, engine = playing(tracking), EngineProcess("odometry", "unused", "")
     node = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, config)
     node.start()
     stamps = iter(0.1 * k for k in range(100_000))

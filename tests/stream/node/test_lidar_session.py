@@ -9,7 +9,6 @@ from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, sta
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.localization.state import State
-from coview_stream.messages.types import Sample
 from coview_stream.stream.node.engine_queue import OdometryResult
 from coview_stream.stream.node.session import Session
 
@@ -82,15 +81,6 @@ def test_sweep_is_forwarded_deskewed():
     plain.saw(0.0, times=TIMES)
     assert plain.placed().times is None
     assert np.allclose(plain.tracked().points, POINTS)
-
-
-def test_poses_are_published_between_clouds():
-    robot = Robot().drive(0.0, 1.0)
-    stamps = []
-    for k in range(4):
-        robot.session.tick(robot.now + 0.1 * k)
-        stamps.append(robot.session.pose().stamp_ns)
-    assert stamps == [ns(1.0)] * 4
 
 
 def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
@@ -217,17 +207,3 @@ def test_stray_stamps_are_counted_and_restarted_clock_is_followed():
     job = robot.session.take_job("odometry")
     assert job.epoch == 2
     assert job.stamp_ns < ns(2.0)
-
-
-def test_long_pause_restarts_lidar_odometry():
-    robot = Robot().drive(0.0, 1.0)
-    robot.frame(9.0, restarted=True)  # as lidar odometry says after a gap
-    assert counted(robot)["losses"] == 1
-    assert state(robot) is State.TRACKING
-
-
-def test_undecodable_cloud_is_only_counted():
-    robot = Robot()
-    robot.session.on_cloud(Sample(KEYS.cloud, b"rubbish", "video/raw"), 1000.0)
-    assert robot.session.take_job("odometry") is None
-    assert counted(robot) == {"received": 1, "unknown_encoding": 1}

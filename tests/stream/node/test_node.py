@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from fake_node import STEP, THREADS, Site, publish_statuses
+from fake_node import STEP, THREADS, Site
 from fake_robot import SHA, ns
 from sockets import until
 
@@ -75,57 +75,28 @@ def test_status_tells_what_is_corrected_and_stays_small(site):
     assert len(site.net.samples("coview/r1/out/status")[-1].payload) < 3500
 
 
-def test_status_is_plain_json(site):
-    site.status("r1")
-    (sample,) = site.net.samples("coview/r1/out/status")
-    assert sample.encoding == "application/json"
-    json.loads(sample.payload, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
-
-
 def test_pose_rate_in_status(site):
     site.frame("r1", 0.0)
     begin = time.monotonic()
     for k in range(1, 6):
         site.moves("r1", STEP * k)
         site.node.publish_poses(begin + 0.1 * k)
-    publish_statuses(site.node, begin + 0.6)
+    site.node.reporter.publish(begin + 0.6)
     assert site.statuses("r1")[-1]["pose"]["rate_hz"] == pytest.approx(10.0)
-    publish_statuses(site.node, begin + 10.0)
+    site.node.reporter.publish(begin + 10.0)
     assert site.statuses("r1")[-1]["pose"]["rate_hz"] == 0.0
 
 
 def test_only_state_changes_are_published_between_regular_statuses(pair):
     now = time.monotonic()
-    publish_statuses(pair.node, now)
-    publish_statuses(pair.node, now, all_robots=False)
+    pair.node.reporter.publish(now)
+    pair.node.reporter.publish(now, all_robots=False)
     assert (len(pair.statuses("r1")), len(pair.statuses("r2"))) == (1, 1)
     pair.frame("r1", 0.0)
-    publish_statuses(pair.node, now, all_robots=False)
-    publish_statuses(pair.node, now, all_robots=False)
+    pair.node.reporter.publish(now, all_robots=False)
+    pair.node.reporter.publish(now, all_robots=False)
     assert [s["state"] for s in pair.statuses("r1")] == ["SEARCHING", "TRACKING"]
     assert len(pair.statuses("r2")) == 1
-
-
-def test_router_reconnection_is_counted(site):
-    assert site.status("r1")["connection"]["reconnects"] == 0
-    site.frame("r1", 0.0)
-    for times in (1, 2):
-        site.net.go_away()
-        publish_statuses(site.node, time.monotonic())
-        publish_statuses(site.node, time.monotonic())
-        site.net.come_back()
-        status = site.status("r1")
-        assert status["connection"] == {"routers": ["memory"], "peers": [], "reconnects": times}
-    assert status["state"] == "TRACKING"  # what was known is still known
-
-
-def test_late_first_router_is_not_a_reconnection():
-    site = Site("r1")
-    site.net.go_away()
-    site.node.declare()
-    publish_statuses(site.node, time.monotonic())
-    site.net.come_back()
-    assert site.status("r1")["connection"]["reconnects"] == 0
 
 
 def test_relocalize_request_restarts_one_robot(pair):
@@ -229,7 +200,7 @@ def test_pause_explained_by_network_outage_keeps_the_place(away, losses):
     site.frame("r1", 0.0)
     if away:
         site.net.go_away()
-        publish_statuses(site.node, time.monotonic())
+        site.node.reporter.publish(time.monotonic())
         site.net.come_back()
     site.frame("r1", 4.0)
     assert site.status("r1")["counters"]["losses"] == losses

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from fake_node import STEP, Site, publish_statuses
+from fake_node import STEP, Site
 from fake_robot import ns, search_request, tracking, unknown
 from sockets import until
 
@@ -210,7 +210,7 @@ def test_failing_status_of_one_robot_does_not_affect_others(pair):
     pair.engine.answer = lambda job: unwritable(job, UnwritableEvidence())
     pair.frame("r1", 0.0)
     for _ in range(3):
-        publish_statuses(pair.node, time.monotonic())
+        pair.node.reporter.publish(time.monotonic())
     assert len(pair.statuses("r2")) == 3
     assert pair.statuses("r1") == []
     pair.engine.answer = good
@@ -256,21 +256,3 @@ def test_unencodable_pose_of_one_robot_does_not_affect_others():
         site.frame(name, 0.0)
     site.node.publish_poses(time.monotonic())
     assert len(site.net.samples("coview/r2/out/pose")) == 1
-
-
-def test_unexpected_engine_error_does_not_stop_the_node():
-    site = Site("r1")
-    run = site.track.run
-    errors = [RuntimeError("unforeseen")]
-    site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
-    site.node.start()
-    try:
-        clock = iter(range(100_000))
-
-        def localized():
-            site.sees("r1", 0.02 * next(clock))
-            return site.net.samples("coview/r1/out/pose")
-
-        until(localized, 3.0)
-    finally:
-        site.node.close()

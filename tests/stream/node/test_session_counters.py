@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from fake_robot import (
     KEYS,
     POINTS,
@@ -15,7 +14,6 @@ from fake_robot import (
     odometry,
     search_request,
     search_result,
-    state,
     tracking,
     unknown,
 )
@@ -25,41 +23,9 @@ from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 
 
-@pytest.fixture
-def robot():
-    return Robot()
-
-
 def test_processed_frame_is_counted(robot):
     robot.frame(0.0, unknown)
     assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 2}
-
-
-def test_rejected_frame_is_counted(robot):
-    robot.drive(-0.1, 0.1)
-    robot.saw(0.0)
-    robot.session.handle_failure(robot.session.take_job("track"), "cloud has 3 finite points", rejected=True)
-    assert counted(robot) == {"received": 1, "rejected": 1, "odometry_received": 5}
-    assert list(robot.session.errors.texts) == ["r1: frames of no use; the first: cloud has 3 finite points"]
-
-
-def test_engine_error_is_reported_by_its_last_line(robot):
-    robot.drive(-0.1, 0.1)
-    robot.saw(0.0)
-    trace = "Traceback:\n  somewhere\nValueError: boom\n"
-    robot.session.handle_failure(robot.session.take_job("track"), trace, rejected=False)
-    assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
-    assert list(robot.session.errors.texts) == ["r1: frames that the engine failed at; the first: ValueError: boom"]
-
-
-def test_frame_replaced_by_a_newer_one_is_dropped(robot):
-    robot.drive(0.0, 1.0)
-    for t in (0.2, 0.3, 0.4):
-        robot.saw(t, now=1001.0)
-    assert robot.counters.dropped == 2
-    job = robot.session.take_job("track")
-    assert job.stamp_ns == ns(0.4)
-    assert robot.session.take_job("track") is None
 
 
 def test_running_frame_is_not_dropped(robot):
@@ -91,12 +57,6 @@ def test_out_of_order_and_duplicate_frames_are_counted(robot):
     robot.saw(0.4, now=1001.0)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
     assert robot.session.take_job("track").stamp_ns == ns(0.5)
-
-
-def test_duplicate_of_a_waiting_frame_is_counted(robot):
-    robot.saw(0.5)
-    robot.saw(0.5)
-    assert robot.counters.duplicate == 1
 
 
 def test_waiting_frames_are_sorted_by_stamp(robot):
@@ -204,14 +164,6 @@ def test_fixes_poses_and_losses_are_counted(robot):
     assert robot.counters.losses == 1
     robot.frame(0.4)
     assert robot.counters.fixes == 2
-
-
-def test_engine_restarts_are_counted(robot):
-    robot.localized()
-    robot.session.engine_restarted()
-    assert (robot.counters.engine_restarts, robot.counters.losses) == (1, 1)
-    assert robot.session.pose() is None
-    assert state(robot) is State.LOST
 
 
 def test_frame_without_odometry_is_not_counted_missing():

@@ -12,11 +12,6 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.node.session import Session
 
 
-@pytest.fixture
-def robot():
-    return Robot()
-
-
 def test_frame_is_paired_with_odometry_at_its_stamp(robot):
     robot.drive(0.0, 0.5, rate=10.0)
     robot.saw(0.325, now=1000.5)
@@ -131,8 +126,7 @@ def test_error_log_is_deduplicated_and_bounded(robot):
 def test_latency_is_measured_from_cloud_to_result(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.2)
-    job = robot.session.take_job("track")
-    robot.session.handle_result(job, tracking(job), 1000.26)
+    robot.answered(tracking, 1000.26)
     assert robot.session.queue.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
     assert robot.session.queue.engine_latency.to_json()["p50"] == 10.0
 
@@ -144,8 +138,7 @@ def test_longest_wait_excludes_sender_pauses(robot):
     robot.drive(60.1, 60.4)
     robot.saw(60.2)
     robot.saw(60.3)  # takes the place of the other, which has waited since 60.2
-    job = robot.session.take_job("track")
-    robot.session.handle_result(job, tracking(job), 1061.0)
+    robot.answered(tracking, 1061.0)
     assert robot.session.queue.longest_wait == pytest.approx(0.8, abs=0.01)
 
 
@@ -162,8 +155,7 @@ def test_frame_that_replaced_another_defers_registration():
     robot.drive(-0.1, 0.5)
     robot.saw(0.0)
     robot.saw(0.1)
-    job = robot.session.take_job("track")
+    job = robot.answered()
     assert (job.stamp_ns, job.defer) == (ns(0.1), True)
-    robot.session.handle_result(job, tracking(job), robot.now)
     robot.saw(0.2)
     assert not robot.session.take_job("track").defer

@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking, unknown
+from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.localization.state import State
-
-
-@pytest.fixture
-def robot():
-    return Robot()
 
 
 def age(robot):
@@ -24,17 +19,6 @@ def age(robot):
 
 def level(robot):
     return robot.session.robot_state.protection_level(robot.session.inputs.odometry)
-
-
-def test_no_pose_before_the_first_fix(robot):
-    robot.drive(0.0, 1.0)
-    assert robot.session.pose() is None
-    robot.frame(1.1, unknown)
-    assert robot.session.pose() is None
-    assert age(robot) is None
-    robot.frame(1.2, unknown, state=State.AMBIGUOUS)
-    assert robot.session.pose() is None
-    assert robot.counters.poses == 0
 
 
 def test_pose_is_corrected_newest_odometry(robot):
@@ -118,14 +102,6 @@ def test_correction_does_not_change_published_stamps(robot):
     assert stamps[-1] == ns(1.95)
 
 
-def test_new_correction_replaces_the_old(robot):
-    robot.localized(0.0)
-    robot.frame(0.1, tracking, T_map_odom=T_MAP_ODOM @ pose(1.0), sigma=0.5)
-    sent = robot.session.pose()
-    np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(1.0) @ pose(0.22), atol=1e-9)
-    assert sent.covariance[0, 0] == pytest.approx(0.25, rel=0.01)
-
-
 def test_doubted_state_has_no_pose(robot):
     robot.localized(0.0)
     robot.frame(0.1, doubted, reason="rays pass through the map")
@@ -154,14 +130,12 @@ def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     robot.saw(0.19, now=silent + 0.02)
-    job = robot.session.take_job("track")
+    job = robot.answered(doubted, silent + 0.05)
     assert job.require_verification
-    robot.session.handle_result(job, doubted(job), silent + 0.05)
     assert robot.session.pose() is None
     robot.moved(0.3, now=silent + 0.1)
     robot.saw(0.29, now=silent + 0.1)
-    job = robot.session.take_job("track")
-    robot.session.handle_result(job, tracking(job), silent + 0.15)
+    robot.answered(tracking, silent + 0.15)
     assert state(robot) is State.TRACKING
     assert robot.session.pose() is not None
     robot.moved(0.4, now=silent + 0.2)
@@ -223,9 +197,8 @@ def test_odometry_gap_ends_pose_until_a_frame_is_verified(robot):
     assert "pause" in reason(robot)
     robot.moved(0.9, x=0.0, now=1000.2)
     robot.saw(0.85, now=1000.2)
-    job = robot.session.take_job("track")
+    job = robot.answered(tracking, 1000.3)
     assert job.require_verification
-    robot.session.handle_result(job, tracking(job), 1000.3)
     assert robot.session.pose() is not None
 
 
@@ -249,8 +222,7 @@ def test_restarted_sender_clock_may_publish_older_stamps():
         robot.session.tick(robot.now)
     assert robot.session.state() == (State.LOST, "the sender's clock started anew")
     robot.saw(1.42, now=1102.0)
-    job = robot.session.take_job("track")
-    robot.session.handle_result(job, tracking(job), 1102.0)
+    robot.answered(tracking, 1102.0)
     assert robot.session.pose().stamp_ns == ns(1.45)
 
 
@@ -276,7 +248,6 @@ def test_late_cloud_covariance_includes_odometry_since():
     robot = Robot()
     robot.drive(0.0, 3.0)  # 2 m/s
     robot.saw(1.0, now=1003.0)  # two seconds in the network
-    job = robot.session.take_job("track")
-    robot.session.handle_result(job, tracking(job, drift=drift, covariance=known), 1003.0)
+    robot.answered(tracking, 1003.0, drift=drift, covariance=known)
     grown = robot.session.pose().covariance - known
     np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)

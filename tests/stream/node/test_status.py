@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_node import publish_statuses
 from fake_robot import SHA, Robot, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -105,56 +104,29 @@ def test_node_is_read_as_it_was_written():
     assert NodeIdentity.read(json.dumps({"node": node.to_json(ending=True)}).encode()).ending
 
 
-def looks(link, *connections):
-    for routers, peers in connections:
-        link.update(Connection(tuple(routers), tuple(peers)))
-    return link.reconnects
+GONE = ("WARNING", "router A is gone: no subscriber can be reached")
 
 
-@pytest.fixture
-def said(caplog):
+@pytest.mark.parametrize(
+    ("connections", "reconnects", "lines"),
+    [
+        ((" ", "A", "A"), 0, [("INFO", "connected to router A")]),
+        (("A", " ", "A", " ", "A"), 2, [GONE, ("INFO", "connected to router A again")]),
+        (("A", "B", "B"), 1, [("INFO", "connected to router B instead of A")]),  # between two looks
+        (("A", " ", "B", "BC"), 1, [("INFO", "connected to router C")]),  # no router was missed
+        (("AB", "A", "AB"), 1, [("WARNING", "router B is gone"), ("INFO", "connected to router B again")]),
+        ((" p", " ", " pq", " q"), 0, [("INFO", "peer p is gone")]),
+        (("A p", " p", "A p"), 1, [GONE, ("INFO", "connected to router A again")]),
+    ],
+)
+def test_a_router_that_comes_back_or_is_replaced_is_a_reconnection(caplog, connections, reconnects, lines):
     caplog.set_level(logging.INFO, "coview_stream.node")
-    return lambda: [(r.levelname, r.getMessage()) for r in caplog.records]
-
-
-def test_first_router_is_not_a_reconnection(said):
-    assert looks(ConnectionMonitor(), ("", ""), ("A", ""), ("A", "")) == 0
-    assert said() == [("INFO", "connected to router A")]
-
-
-def test_returning_router_is_a_reconnection(said):
-    assert looks(ConnectionMonitor(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
-    assert said()[1:3] == [
-        ("WARNING", "router A is gone: no subscriber can be reached"),
-        ("INFO", "connected to router A again"),
-    ]
-
-
-def test_router_replaced_between_two_polls_is_a_reconnection(said):
-    assert looks(ConnectionMonitor(), ("A", ""), ("B", ""), ("B", "")) == 1
-    assert said()[-1] == ("INFO", "connected to router B instead of A")
-
-
-def test_router_replaced_after_outage_and_additional_router():
-    link = ConnectionMonitor()
-    assert looks(link, ("A", ""), ("", ""), ("B", "")) == 1
-    assert looks(link, ("BC", "")) == 1  # no router was missed
-
-
-def test_losing_one_of_two_routers_is_a_reconnection(said):
-    link = ConnectionMonitor()
-    assert looks(link, ("AB", ""), ("A", ""), ("AB", "")) == 1
-    assert said()[-2:] == [("WARNING", "router B is gone"), ("INFO", "connected to router B again")]
-
-
-def test_peers_are_not_reconnections(said):
-    assert looks(ConnectionMonitor(), ("", "p"), ("", ""), ("", "pq"), ("", "q")) == 0
-    assert {level for level, _ in said()} == {"INFO"}
-    assert said()[-1][1] == "peer p is gone"
-
-
-def test_connected_peer_does_not_hide_router_loss():
-    assert looks(ConnectionMonitor(), ("A", "p"), ("", "p"), ("A", "p")) == 1
+    monitor = ConnectionMonitor()
+    for text in connections:
+        routers, _, peers = text.partition(" ")
+        monitor.update(Connection(tuple(routers), tuple(peers)))
+    assert monitor.reconnects == reconnects
+    assert [(record.levelname, record.getMessage()) for record in caplog.records][-len(lines) :] == lines
 
 
 PLACES = Considered(1.5, np.array([[1.0, 2.0, 3.0, 0.5, 0.7, 9.0], [4.0, 5.0, 6.0, -0.5, 0.1, 2.0]]), 0.2)
@@ -172,7 +144,7 @@ def searched(site):
 
 
 def published(site, all_robots=True):
-    publish_statuses(site.node, time.monotonic(), all_robots)
+    site.node.reporter.publish(time.monotonic(), all_robots)
     return [decode_hypotheses(s) for s in site.net.samples(site.keys["r1"].hypotheses)]
 
 

@@ -1,18 +1,41 @@
-"""A node that has a key: engines that start again and a reload take signed maps only, of that key."""
+"""The start of a node: an error leaves nothing running; a node that has a key takes only maps signed with that key."""
 
 from __future__ import annotations
 
 import os
+import threading
 import time
 
 import pytest
+from sockets import free_endpoint, until
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, Trust, make_keys, read_verify_key
-from coview_stream.errors import CoViewError, MapError
+from coview_stream.errors import ConfigError, CoViewError, MapError, TransportError
 from coview_stream.stream.node import serve
-from coview_stream.stream.node.engine_process import EngineProcess
+from coview_stream.stream.node.engine_process import EngineProcess, start_children
 from coview_stream.stream.transport.keys import robot_keys
+
+KEYS = [robot_keys("native", "coview", "r1")]
+
+
+@pytest.mark.parametrize(
+    ("error", "cause", "options"),
+    [
+        (MapError, "site.coview", lambda path: {"map_path": path}),
+        (TransportError, "site.coview", lambda path: {"network": serve.NetworkOptions(zenoh_config=path)}),
+        pytest.param(ConfigError, "--metrics", lambda path: {"metrics": "192.0.2.7:9464"}, marks=pytest.mark.slow),
+    ],
+    ids=["map", "network", "services"],
+)
+def test_opening_that_fails_names_the_cause_and_leaves_nothing_running(world_file, tmp_path, error, cause, options):
+    before, children = set(threading.enumerate()), start_children(False)
+    (tmp_path / "site.coview").write_bytes(b"{")
+    given = {"map_path": world_file, "keys": KEYS, "network": serve.NetworkOptions(listen=[free_endpoint()])}
+    with pytest.raises(error, match=cause):
+        serve.open_node(serve.ServeOptions(**given | options(tmp_path / "site.coview")), children=children)
+    assert {child.process.poll() for child in children.values()} == {-9}
+    until(lambda: not [t for t in set(threading.enumerate()) - before if t.name.startswith("coview")])
 
 
 @pytest.fixture
@@ -30,9 +53,8 @@ def save(world_map, folder, key, **more):
 
 
 def options_of(site):
-    keys = [robot_keys("native", "coview", "r1")]
     verify = read_verify_key(site / "ours.pub")
-    return serve.ServeOptions(site / "site.coview", keys, verify_key=verify)
+    return serve.ServeOptions(site / "site.coview", KEYS, verify_key=verify)
 
 
 @pytest.mark.parametrize(("key", "said"), [(None, "not signed"), ("theirs", "another key")])
