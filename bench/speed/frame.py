@@ -11,15 +11,14 @@ co-visibility serves us too, since one grid takes it less than a launch.
 
 from __future__ import annotations
 
-import tracemalloc
 from argparse import Namespace
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
-from bench.harness.rows import REPEAT, Row, against, bounded, medians
-from coview_kernels import VoxelFilter, polar_bin, reference
+from bench.harness.rows import REPEAT, Row, against, medians
+from coview_kernels import polar_bin, reference, transform_unique
 from coview_stream.config import DescriptorConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
@@ -73,24 +72,15 @@ def best_numpy(points: Floats32, T: Floats) -> Floats32:
 
 
 def _intake(repeat: int) -> Iterator[Row]:
-    """Ratios, and what a frame allocates (its points have 786 kB)."""
-    points, ours = frame(), VoxelFilter(*LIMITS)
+    points = frame()
+    ours = partial(transform_unique, points, STANDING, *LIMITS)
     plain = partial(reference.transform_unique, points, STANDING, *LIMITS)
-    found = ours(points, STANDING)[0]
+    found = ours()[0]
     if not (np.array_equal(found, plain()[0]) and np.array_equal(found, best_numpy(points, STANDING))):
         raise AssertionError("ours and NumPy disagree")
-    taken, slow, best = medians(
-        partial(ours, points, STANDING), plain, partial(best_numpy, points, STANDING), repeat=repeat
-    )
+    taken, slow, best = medians(ours, plain, partial(best_numpy, points, STANDING), repeat=repeat)
     yield against("intake, 64k points, beside the best NumPy", taken, best, "ms", 4.0)
     yield against("intake, 64k points, beside the reference", taken, slow, "ms", None)
-    tracemalloc.start()
-    before, _ = tracemalloc.get_traced_memory()
-    for _ in range(100):
-        ours(points, STANDING)
-    most = (tracemalloc.get_traced_memory()[1] - before) / 1e3
-    tracemalloc.stop()
-    yield bounded("intake, memory allocated in 100 frames, at most", most, "kB", 16.0)
 
 
 def _virtual_scan() -> Floats32:

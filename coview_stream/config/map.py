@@ -44,6 +44,7 @@ class DescriptorConfig:
         positive(self, "radius", "voxel")
         require(self.radius <= 1000, self, "radius", "at most 1000 m")
         counts(self, "rings", "sectors", minimum=4)
+        require(self.rings * self.sectors <= 100_000, self, "sectors", "at most 100,000 bins in all rings")
         known = get_args(Channel)
         require(bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}")
         require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")

@@ -39,10 +39,8 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
         centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
         config: bins and channels.
     """
-    grid, context, _ = kernels.describe_points(
-        points, centre, config.rings, config.sectors, config.radius, vertical=_VERTICAL
-    )
-    return {name: context if name == "coview" else channel(name, grid) for name in config.channels}
+    grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
+    return {name: channel(name, grid) for name in config.channels}
 
 
 def ground_below(points: Points, position: Floats) -> float:

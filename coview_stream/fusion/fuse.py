@@ -228,13 +228,12 @@ def _surfaces(
     """Collect the voxels of all runs, and count the frames that were taken of each."""
     table, taken = VoxelTable(config.voxel), []
     for source, run in enumerate(runs, start=1):
-        thin = kernels.VoxelFilter(config.voxel)
         count = 0
         for done, frame in enumerate(run.frames(), start=1):
             if frame is not None:
                 far = np.linalg.norm(frame.points - frame.eye.astype(np.float32), axis=1)
                 near = frame.points[(far >= config.range_min) & (far < config.range_max)]
-                table.add(thin(near, frame.T_map_body)[0], frame.stamp, source)
+                table.add(kernels.transform_unique(near, frame.T_map_body, config.voxel)[0], frame.stamp, source)
                 count += 1
             if progress:
                 progress(f"run {source}", done, len(run))

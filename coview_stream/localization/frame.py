@@ -54,7 +54,7 @@ class FramePreparation:
         self._odometry = OdometryCorrection()
         self._motion = FrameMotion(config.registration, config.keyframe.distance)
         self._newest: float | None = None  # stamp of the newest frame
-        self._voxel_filter = kernels.VoxelFilter(config.keyframe.voxel, config.keyframe.range_min)
+        self._limits = config.keyframe.voxel, config.keyframe.range_min
 
     @property
     def calibration(self) -> Calibration:
@@ -117,7 +117,7 @@ class FramePreparation:
         return T_map_cloud @ inverse(T_odom_body @ self.calibration.T_body_cloud)
 
     def _voxels(self, cloud: Points, T: Pose) -> Points:
-        return self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
+        return kernels.transform_unique(cloud, T, *self._limits)[0]
 
 
 class OdometryCorrection:

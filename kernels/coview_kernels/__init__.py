@@ -15,11 +15,11 @@ from coview_kernels.field import FieldMap, FieldScan, FieldScores, Move, field_s
 from coview_kernels.icp import SCATTER, Prior, Registration, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
-from coview_kernels.polar import describe_points, polar_bin, station_bins
+from coview_kernels.polar import polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
 from coview_kernels.station_codes import CodedQuery, StationCodes
-from coview_kernels.voxel_filter import VoxelFilter, transform_unique
+from coview_kernels.voxel_filter import transform_unique
 from coview_kernels.warm_up import warm_up
 from coview_kernels.windows import WindowImages, WindowRaster, window_products
 
@@ -40,7 +40,6 @@ __all__ = [
     "Registration",
     "Scale",
     "StationCodes",
-    "VoxelFilter",
     "WindowImages",
     "WindowRaster",
     "align_planes",
@@ -49,7 +48,6 @@ __all__ = [
     "column_spectra",
     "coview",
     "crop_points",
-    "describe_points",
     "distinct_poses",
     "field_scores",
     "height_columns",

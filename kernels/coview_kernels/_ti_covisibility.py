@@ -4,21 +4,16 @@
 from coview_kernels import launch, runtime
 
 ti = runtime.library()
+i32 = ti.i32
 
 Floats = ti.types.ndarray(ti.f32, 1)
-Integers = ti.types.ndarray(ti.i32, 1)
+Integers = ti.types.ndarray(i32, 1)
 SPAN = launch.SPAN
 
 
 @ti.func
 def describe_grid(
-    at: ti.i32,
-    rings: ti.i32,
-    sectors: ti.i32,
-    vertical: ti.i32,
-    highest: ti.template(),
-    count: ti.template(),
-    value: ti.template(),
+    at: i32, rings: i32, sectors: i32, vertical: i32, highest: ti.template(), count: ti.template(), value: ti.template()
 ):
     """Write the context of the grid that begins at ``at``.
 
@@ -52,14 +47,7 @@ def describe_grid(
 
 @ti.kernel
 def coview(
-    grids: ti.i32,
-    chunks: ti.i32,
-    rings: ti.i32,
-    sectors: ti.i32,
-    vertical: ti.i32,
-    highest: Floats,
-    count: Integers,
-    value: Floats,
+    grids: i32, chunks: i32, rings: i32, sectors: i32, vertical: i32, highest: Floats, count: Integers, value: Floats
 ):
     """Write the contexts of all grids."""
     for q in range(chunks * SPAN):

@@ -6,17 +6,13 @@ from coview_kernels import runtime
 ti = runtime.library()
 f32, i32 = ti.f32, ti.i32
 
+FLOATS = ti.types.ndarray(f32, 1)
+WHOLES = ti.types.ndarray(i32, 1)
+
 
 @ti.kernel
 def distinct(
-    poses: ti.types.ndarray(f32, 1),
-    kept: ti.types.ndarray(f32, 1),
-    chosen: ti.types.ndarray(i32, 1),
-    found: ti.types.ndarray(i32, 1),
-    size: i32,
-    count: i32,
-    square: f32,
-    cosine: f32,
+    poses: FLOATS, kept: FLOATS, chosen: WHOLES, found: WHOLES, size: i32, count: i32, square: f32, cosine: f32
 ):
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -246,19 +246,9 @@ def advance(about, settings: ti.template(), state: ti.template(), system: ti.tem
 
 @ti.kernel
 def align(
-    settings: DOUBLES,
-    starts: WHOLES,
-    rows: WHOLES,
-    normals: FLOATS,
-    source: FLOATS,
-    kinds: WHOLES,
-    memory: DOUBLES,
-    partners: FLOATS,
-    bins: WHOLES,
-    system: ti.types.ndarray(ti.f64, 2),
-    state: DOUBLES,
-    chunks: ti.i32,
-):
+    settings: DOUBLES, starts: WHOLES, rows: WHOLES, normals: FLOATS, source: FLOATS, kinds: WHOLES, memory: DOUBLES,
+    partners: FLOATS, bins: WHOLES, system: ti.types.ndarray(ti.f64, 2), state: DOUBLES, chunks: ti.i32,
+):  # fmt: skip
     """Take a step from the state's pose; the status says whether another one should follow.
 
     Of the points the first ones take part in the coarse scales; ``kinds`` is 0 or 1.

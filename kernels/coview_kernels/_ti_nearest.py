@@ -5,7 +5,9 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 
-ROWS = ti.types.ndarray(ti.i32, 1)  # flat: with four to a row, known here, an index costs no look at the shape
+WHOLES = ti.types.ndarray(ti.i32, 1)  # rows are flat, four numbers each: an index costs no look at the shape
+DOUBLES = ti.types.ndarray(ti.f64, 1)
+POINTS, MATRIX = ti.types.ndarray(ti.f32, 2), ti.types.ndarray(ti.f64, 2)
 
 SLACK = 1e-9  # metres, and of the distance: more than rounding moves a face between two cells
 FAR = 1e18  # metres, stands for no face
@@ -106,15 +108,7 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
 
 
 @ti.kernel
-def nearest(
-    frame: ti.types.ndarray(ti.f64, 1),
-    starts: ti.types.ndarray(ti.i32, 1),
-    rows: ROWS,
-    queries: ti.types.ndarray(ti.f32, 2),
-    T: ti.types.ndarray(ti.f64, 2),
-    radius: ti.f64,
-    answer: ti.types.ndarray(ti.f64, 2),
-):
+def nearest(frame: DOUBLES, starts: WHOLES, rows: WHOLES, queries: POINTS, T: MATRIX, radius: ti.f64, answer: MATRIX):
     """Write distances and indices, the rows of ``answer``, where there is a point.
 
     ``frame``: the corner (3), edge, reciprocal edge and numbers (3) of the cells. Columns on the border stand for
@@ -136,13 +130,7 @@ def nearest(
 
 
 @ti.kernel
-def sort(
-    points: ti.types.ndarray(ti.f32, 2),
-    frame: ti.types.ndarray(ti.f64, 1),
-    cell: ti.types.ndarray(ti.i32, 1),
-    starts: ti.types.ndarray(ti.i32, 1),
-    rows: ROWS,
-):
+def sort(points: POINTS, frame: DOUBLES, cell: WHOLES, starts: WHOLES, rows: WHOLES):
     """Sort the points by cell into ``rows``, by counting; ``starts`` comes as zeros, one more than cells."""
     for n in range(points.shape[0]):
         nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)

@@ -44,7 +44,7 @@ def polar(dx: f32, dy: f32, rings: f32, sectors: f32, per_metre: f32):
 
 @ti.func
 def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges: ti.template()) -> i32:
-    """Bin of an offset by comparing it with the edges as in sectors.py; R S at and beyond ``r_max``.
+    """Bin of an offset by comparing it with the edges as in reference/polar.py; R S at and beyond ``r_max``.
 
     ``edges``: the R + 1 squared ring edges, then the S + 1 rays as x, y.
     """
@@ -72,17 +72,9 @@ def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges:
 
 @ti.func
 def add(
-    start: i32,
-    n: i32,
-    first: i32,
-    points: ti.template(),
-    rings: i32,
-    sectors: i32,
-    params: ti.template(),
-    edges: ti.template(),
-    highest: ti.template(),
-    count: ti.template(),
-):
+    start: i32, n: i32, first: i32, points: ti.template(), rings: i32, sectors: i32,
+    params: ti.template(), edges: ti.template(), highest: ti.template(), count: ti.template(),
+):  # fmt: skip
     """Add ``n`` points, at most BLOCK, to the bins that begin at ``first``; see ``bins``."""
     size = rings * sectors
     cx, cy, cz = params[0], params[1], params[2]
@@ -130,16 +122,9 @@ def add(
 
 @ti.kernel
 def bins(
-    points: Floats,
-    rows: i32,
-    chunks: i32,
-    rings: i32,
-    sectors: i32,
-    params: Doubles,
-    edges: Doubles,
-    highest: Floats,
-    count: Integers,
-):
+    points: Floats, rows: i32, chunks: i32, rings: i32, sectors: i32,
+    params: Doubles, edges: Doubles, highest: Floats, count: Integers,
+):  # fmt: skip
     """Add ``rows`` points to the bins of their chunks.
 
     A chunk has R S bins and three more: points beyond ``r_max``, points that are not finite, points near an edge.
@@ -161,18 +146,9 @@ def bins(
 
 @ti.kernel
 def station_bins(
-    stations: i32,
-    chunks: i32,
-    size: i32,
-    top: Floats,
-    points: Integers,
-    base: Integers,
-    ground: Floats,
-    starts: Integers,
-    offsets: Integers,
-    highest: Floats,
-    count: Integers,
-):
+    stations: i32, chunks: i32, size: i32, top: Floats, points: Integers, base: Integers, ground: Floats,
+    starts: Integers, offsets: Integers, highest: Floats, count: Integers,
+):  # fmt: skip
     """Bin b of a station gathers the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
 
     The cells are sorted by bin, so a bin is summed in registers and stored once.

@@ -16,6 +16,8 @@ LANES, LOW, HIGH = 16, 12, 4  # as in station_codes.py
 ROWS = LOW + HIGH
 SIZE = ROWS * LANES
 
+SHORTS, WHOLES, FLOATS = ti.types.ndarray(i16, 1), ti.types.ndarray(i32, 1), ti.types.ndarray(f32, 1)
+
 
 @ti.func
 def high(a, b):
@@ -32,14 +34,9 @@ def real_part(w):
 def _best(serial: bool):
     @ti.func
     def products(
-        codes: ti.template(),
-        query: ti.template(),
-        start,
-        first,
-        rows: ti.template(),
-        x: ti.template(),
-        y: ti.template(),
-    ):
+        codes: ti.template(), query: ti.template(), start, first, rows: ti.template(),
+        x: ti.template(), y: ti.template(),
+    ):  # fmt: skip
         for g in range(rows // 2):
             for b in range(LANES):
                 sx = ti.cast(0, i16)
@@ -55,13 +52,7 @@ def _best(serial: bool):
                 y[b] += sy
 
     @ti.kernel
-    def best(
-        codes: ti.types.ndarray(i16, 1),
-        query: ti.types.ndarray(i16, 1),
-        turn: ti.types.ndarray(i16, 1),
-        found: ti.types.ndarray(i32, 1),
-        length: i32,
-    ):
+    def best(codes: SHORTS, query: SHORTS, turn: SHORTS, found: WHOLES, length: i32):
         if ti.static(serial):
             ti.loop_config(serialize=True)
         for m in range(found.shape[0]):
@@ -123,13 +114,7 @@ def _best(serial: bool):
 
 
 @ti.kernel
-def products(
-    codes: ti.types.ndarray(i16, 1),
-    query: ti.types.ndarray(f32, 1),
-    stations: ti.types.ndarray(i32, 1),
-    found: ti.types.ndarray(f32, 1),
-    count: i32,
-):
+def products(codes: SHORTS, query: FLOATS, stations: WHOLES, found: FLOATS, count: i32):
     ti.loop_config(serialize=True)
     for k in range(count):
         start = stations[k] * SIZE
@@ -149,14 +134,7 @@ def products(
 
 
 @ti.kernel
-def at(
-    codes: ti.types.ndarray(i16, 1),
-    table: ti.types.ndarray(f32, 1),
-    stations: ti.types.ndarray(i32, 1),
-    shifts: ti.types.ndarray(i32, 1),
-    found: ti.types.ndarray(f32, 1),
-    count: i32,
-):
+def at(codes: SHORTS, table: FLOATS, stations: WHOLES, shifts: WHOLES, found: FLOATS, count: i32):
     ti.loop_config(serialize=True)
     for k in range(count):
         if stations[k] >= 0:

@@ -36,15 +36,9 @@ def voxel_of(p: f32, limit: f32, inverse: f64, middle: i32) -> i32:
 
 @ti.func
 def number_voxels(
-    start: i32,
-    points: ti.template(),
-    settings: ti.template(),
-    a: ti.template(),
-    b: ti.template(),
-    c: ti.template(),
-    plane: ti.template(),
-    rest: ti.template(),
-):
+    start: i32, points: ti.template(), settings: ti.template(),
+    a: ti.template(), b: ti.template(), c: ti.template(), plane: ti.template(), rest: ti.template(),
+):  # fmt: skip
     """Move a block to a, b, c and number their voxels; return how many are not finite and how many out of reach.
 
     ``plane`` is the cube's index along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
@@ -82,21 +76,10 @@ def number_voxels(
 
 @ti.func
 def keep_first(
-    call: i64,
-    bits: i32,
-    merge: i64,
-    out: i32,
-    at: i32,
-    last: i64,
-    seen: i64,
-    a: ti.template(),
-    b: ti.template(),
-    c: ti.template(),
-    plane: ti.template(),
-    rest: ti.template(),
-    table: ti.template(),
-    moved: ti.template(),
-):
+    call: i64, bits: i32, merge: i64, out: i32, at: i32, last: i64, seen: i64,
+    a: ti.template(), b: ti.template(), c: ti.template(), plane: ti.template(), rest: ti.template(),
+    table: ti.template(), moved: ti.template(),
+):  # fmt: skip
     """Append the first point of each voxel to ``moved``; return its new end, the cubes added, and the last cube.
 
     ``table`` has a key and 64 bits for each cube. A slot is free unless its key is of this ``call``: nothing is
@@ -131,16 +114,9 @@ def keep_first(
 
 @ti.kernel
 def voxel_filter(
-    points: Floats,
-    blocks: i32,
-    call: i64,
-    bits: i32,
-    merge: i64,
-    settings: Doubles,
-    table: Longs,
-    moved: Floats,
-    totals: Integers,
-):
+    points: Floats, blocks: i32, call: i64, bits: i32, merge: i64,
+    settings: Doubles, table: Longs, moved: Floats, totals: Integers,
+):  # fmt: skip
     """Append the kept rows to ``moved``.
 
     ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min

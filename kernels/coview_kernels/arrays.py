@@ -93,14 +93,8 @@ def check_same_shape(name: str, array: npt.NDArray[Any], other: str, shape: tupl
 
 
 def check_grid_size(rings: int, sectors: int, r_max: float) -> None:
-    """Raise ValueError unless there is at least one ring and sector and ``r_max`` is finite and positive."""
-    if rings < 1 or sectors < 1:
-        raise ValueError(f"rings and sectors must be at least 1, got {rings} and {sectors}")
+    """Raise ValueError unless ``r_max`` is finite and positive, with 1 to 100,000 bins: float32 resolves so many."""
+    if rings < 1 or sectors < 1 or rings * sectors > 100_000:
+        raise ValueError(f"rings and sectors must be at least 1, with 100,000 bins at most, got {rings} and {sectors}")
     if not (math.isfinite(r_max) and r_max > 0):
         raise ValueError(f"r_max must be finite and positive, got {r_max}")
-
-
-def check_vertical(vertical: str) -> None:
-    """Raise ValueError unless ``vertical`` is an option of co-visibility."""
-    if vertical not in VERTICALS:
-        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")

@@ -25,8 +25,9 @@ class Cells(NamedTuple):
     """(4 K,) row by row, the bits of x, y, z as float32 and the point's index in the cloud: one cache line for all."""
 
 
-def grid_frame(low: F64, high: F64, edge: float) -> F64:
-    """Return the frame (8,) of cells for points between two corners (3,), of a larger ``edge`` if needed."""
+def grid_frame(low: F64, high: F64) -> F64:
+    """Return the frame (8,) of cells for points between two corners (3,), of a larger edge if needed."""
+    edge = CELL
     while True:
         shape = np.floor((high - low) / edge) + 1
         shape[2] = min(shape[2], _MAX_LAYERS)

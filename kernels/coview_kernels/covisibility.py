@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, I32, VERTICALS, Vertical, check_same_shape, check_vertical
+from coview_kernels.arrays import F32, I32, VERTICALS, Vertical, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import compiled_by
 
@@ -43,8 +43,13 @@ def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical =
     Raises:
         ValueError: shapes disagree, there are fewer than two axes, or ``vertical`` is unknown.
     """
-    height, points = _grids(max_height, count)
-    check_vertical(vertical)
+    height: npt.NDArray[Any] = np.ascontiguousarray(max_height, dtype=np.float32)
+    points: npt.NDArray[Any] = np.ascontiguousarray(count, dtype=np.int32)
+    if np.ndim(max_height) < 2:
+        raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
+    check_same_shape("count", points, "max_height", height.shape)
+    if vertical not in VERTICALS:
+        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")
     if points.size < _MIN_BINS:
         return reference.coview(height, points, vertical)
     return runtime.dispatch(_coview, reference.coview, height, points, vertical)
@@ -60,15 +65,6 @@ def _coview(max_height: F32, count: I32, vertical: Vertical) -> F32:
         *(a.reshape(-1) for a in (max_height, count, value)),
     )()
     return value
-
-
-def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
-    height: npt.NDArray[Any] = np.ascontiguousarray(max_height, dtype=np.float32)
-    points: npt.NDArray[Any] = np.ascontiguousarray(count, dtype=np.int32)
-    if np.ndim(max_height) < 2:
-        raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
-    check_same_shape("count", points, "max_height", height.shape)
-    return height, points
 
 
 compiled_by("coview", lambda: coview(*np.ones((2, 100, 20, 60))))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, I8, I32
-from coview_kernels.cells import CELL, Cells, grid_frame
+from coview_kernels.cells import Cells, grid_frame
 from coview_kernels.launch import Launch
 from coview_kernels.reference.crop import Crop, Cut
 from coview_kernels.warm_up import compiled_by
@@ -73,7 +73,7 @@ def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
     if not number:
         return None
     low, high = bounds[:3].astype(np.float64), bounds[3:].astype(np.float64)
-    frame = grid_frame(low, high, CELL)
+    frame = grid_frame(low, high)
     starts, rows, planes = _arena(
         (int(frame[5:].prod()) + 1, np.int32), (4 * number, np.int32), (3 * number, np.float32)
     )

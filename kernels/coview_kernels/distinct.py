@@ -39,41 +39,22 @@ def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, dis
     poses[:, :3] = place - place[0]  # float32 near its own zero
     poses[:, 3], poses[:, 4] = np.cos(heading), np.sin(heading)
     square, cosine = float(distance) ** 2, math.cos(turn)
-
-    def ready() -> bool:
-        return _kernel is not None and _kernel.fits(len(poses), count) and _kernel.launch.ready()
-
-    return runtime.dispatch_here(ready, _native, reference.distinct_poses, poses, count, square, cosine)
+    return runtime.dispatch_here(_launch.ready, _native, reference.distinct_poses, *(poses, count, square, cosine))
 
 
-class _Distinct:
-    """The kernel's launch for so many poses, and the memory that it shares with NumPy."""
-
-    def __init__(self, size: int, count: int) -> None:
-        self.poses = np.zeros((size, 5), dtype=np.float32)
-        self.chosen = np.zeros(count, dtype=np.int32)
-        self.found = np.zeros(1, dtype=np.int32)
-        kept = np.zeros(5 * count, dtype=np.float32)
-        arrays = self.poses.reshape(-1), kept, self.chosen, self.found
-        self.launch = Launch("distinct", "distinct", *arrays, 0, count, 0.0, 0.0)
-
-    def fits(self, size: int, count: int) -> bool:
-        return size <= len(self.poses) and count == len(self.chosen)
-
-
-_kernel: _Distinct | None = None
+_REALS, _WHOLES = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.int32)
+_launch = Launch("distinct", "distinct", _REALS, _REALS, _WHOLES, _WHOLES, 0, 0, 0.0, 0.0)
+"""One is enough: only one call of native code runs at a time."""
 
 
 def _native(poses: F32, count: int, square: float, cosine: float) -> I64:
-    global _kernel
-    kernel = _kernel
-    if kernel is None or not kernel.fits(len(poses), count):
-        kernel = _kernel = _Distinct(2 * len(poses), count)
-    kernel.poses[: len(poses)] = poses
-    for index, value in ((4, len(poses)), (6, square), (7, cosine)):
-        kernel.launch.put(index, value)
-    kernel.launch()
-    return kernel.chosen[: int(kernel.found[0])].astype(np.int64)
+    kept = np.zeros(5 * count, dtype=np.float32)
+    chosen, number = np.zeros(count, dtype=np.int32), np.zeros(1, dtype=np.int32)
+    arguments = poses.reshape(-1), kept, chosen, number, len(poses), count, square, cosine
+    for index, value in enumerate(arguments):
+        _launch.put(index, value)
+    _launch()
+    return chosen[: int(number[0])].astype(np.int64)
 
 
 compiled_by("distinct_poses", lambda: distinct_poses(SAMPLE, np.zeros(2), 1, 1.0, 1.0))

@@ -113,12 +113,10 @@ def align_planes(
     if not len(grid.points) or len(points) < min_pairs:
         return None
     return runtime.dispatch_here(
-        lambda: "cells" in vars(grid) and _launch.ready(), _align, _plain, grid, planes, points, of, plan
+        lambda: "cells" in vars(grid) and _launch.ready(),
+        lambda: _align(grid, planes, points, of, plan),
+        lambda: reference.align_planes(grid.tree, planes, points, of, plan),
     )
-
-
-def _plain(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Registration | None:
-    return reference.align_planes(grid.tree, normals, source, kind, plan)
 
 
 _WHOLES = np.zeros(1, dtype=np.int32)

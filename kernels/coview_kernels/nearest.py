@@ -33,36 +33,40 @@ class PointGrid:
 
     Attributes:
         points: (K, 3) float32, metres.
-        cell: edge of the cells, metres; they are larger where the cloud would need more than 4 million.
 
     Raises:
-        ValueError: the points have another shape or hold NaN or inf, or ``cell`` is not finite and positive.
+        ValueError: the points have another shape or hold NaN or inf.
     """
 
     points: F32
-    cell: float = CELL
 
     def __post_init__(self) -> None:
         cloud = as_float32("points", self.points, None, 3)
         if not np.isfinite(cloud).all():
             raise ValueError("points hold NaN or inf")
-        if not (math.isfinite(self.cell) and self.cell > 0):
-            raise ValueError(f"cell must be finite and positive, got {self.cell}")
         object.__setattr__(self, "points", cloud)
 
     @classmethod
     def sorted(cls, points: F32, cells: Cells) -> PointGrid:
         """Return the grid of finite points (K, 3) that have been sorted already."""
         grid = cls.__new__(cls)
-        for name, value in (("points", points), ("cell", float(cells.frame[3]))):
-            object.__setattr__(grid, name, value)
-        vars(grid)["cells"] = cells
+        vars(grid).update(points=points, cells=cells)
         return grid
 
     @cached_property
     def cells(self) -> Cells:
         """The points by cell, for the kernel; read it on the owner thread."""
-        return _sort_by_cell(self.points, self.cell)
+        points = self.points
+        if not len(points):
+            return Cells(np.array([0.0, 0, 0, CELL, 1 / CELL, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32))
+        # by columns: twenty times as fast as along the first axis
+        low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
+        frame = grid_frame(low, high)
+        starts = np.zeros(int(frame[5:].prod()) + 1, dtype=np.int32)
+        cell = np.empty(len(points), dtype=np.int32)
+        rows = np.empty(4 * len(points), dtype=np.int32)
+        runtime.kernels("nearest").sort(points, frame, cell, starts, rows)
+        return Cells(frame, starts, rows)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -95,7 +99,9 @@ def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.Array
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be finite and positive, got {radius}")
     return runtime.dispatch_here(
-        lambda: "cells" in vars(grid) and _launch.ready(), _nearest, _plain, grid, cloud, float(radius), pose
+        lambda: "cells" in vars(grid) and _launch.ready(),
+        lambda: _nearest(grid, cloud, float(radius), pose),
+        lambda: reference.nearest(grid.tree, cloud, radius, pose),
     )
 
 
@@ -112,24 +118,6 @@ def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tup
         _launch.put(index, value)
     _launch()
     return answer[0], answer[1].astype(np.int64)
-
-
-def _plain(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
-    return reference.nearest(grid.tree, queries, radius, T)
-
-
-def _sort_by_cell(points: F32, edge: float) -> Cells:
-    """Sort the points into cells, of a larger ``edge`` if there would be too many."""
-    if not len(points):
-        return Cells(np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32))
-    # by columns: twenty times as fast as along the first axis
-    low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
-    frame = grid_frame(low, high, edge)
-    starts = np.zeros(int(frame[5:].prod()) + 1, dtype=np.int32)
-    cell = np.empty(len(points), dtype=np.int32)
-    rows = np.empty(4 * len(points), dtype=np.int32)
-    runtime.kernels("nearest").sort(points, frame, cell, starts, rows)
-    return Cells(frame, starts, rows)
 
 
 SAMPLE_GRID = PointGrid.sorted(SAMPLE, Cells(np.ones(8), np.array([0, 2], np.int32), np.zeros(8, np.int32)))

@@ -9,25 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import (
-    F32,
-    F64,
-    I32,
-    PolarGrid,
-    Vertical,
-    as_finite64,
-    as_float32,
-    as_int32,
-    check_grid_size,
-    check_vertical,
-)
+from coview_kernels.arrays import F32, F64, I32, PolarGrid, as_finite64, as_float32, as_int32, check_grid_size
 from coview_kernels.launch import Launch
-from coview_kernels.reference.polar import cell_table
-from coview_kernels.sectors import ring_edges2, sector_edges
+from coview_kernels.reference.polar import cell_table, ring_edges2, sector_edges
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-_MAX_SIDE = 100_000  # rings or sectors that float32 resolves
-_MAX_BINS = 1 << 20
 _POINTS_PER_CHUNK = 8192  # fewer are done before another thread is awake
 _EXTRA = 3  # bins behind those of the grid: points outside, not finite, near an edge
 _EMPTY: F32 = np.empty(0, dtype=np.float32)
@@ -41,8 +27,8 @@ def polar_bin(
     Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r, points at or
     beyond ``r_max`` excluded; sector ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi),
     counter-clockwise from the x axis. A point on a ring edge belongs to the outer ring, on a sector edge to
-    the sector counter-clockwise of it, at the centre to ring 0, sector 0; :mod:`coview_kernels.sectors` says
-    how that is decided exactly (offsets from the centre are rounded to float32).
+    the sector counter-clockwise of it, at the centre to ring 0, sector 0; :mod:`coview_kernels.reference.polar`
+    says how that is decided exactly (offsets from the centre are rounded to float32).
 
     Args:
         points: (N, 3) float32, metres.
@@ -60,34 +46,11 @@ def polar_bin(
     cloud = as_float32("points", points, None, 3)
     origin = as_finite64("centre", centre, 3)
     check_grid_size(rings, sectors, r_max)
-    native = _polar_bin if _fits_kernel(rings, sectors) else reference.polar_bin
-    return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
-
-
-def _fits_kernel(rings: int, sectors: int) -> bool:
-    """Tell whether the kernel can bin into so many rings and sectors."""
-    return max(rings, sectors) <= _MAX_SIDE and rings * sectors <= _MAX_BINS
-
-
-def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
-    return _bins(rings, sectors, r_max)(points, centre)
-
-
-def describe_points(
-    points: npt.ArrayLike, centre: npt.ArrayLike, rings: int, sectors: int, r_max: float, vertical: Vertical = "max"
-) -> tuple[PolarGrid, F32, int]:
-    """Bin points as :func:`polar_bin` does and describe the grid as :func:`coview` does.
-
-    Returns:
-        The grid, (R, S) each; the co-view context (R, S) float32, metres; the number of rows dropped because
-        they hold NaN or inf.
-
-    Raises:
-        ValueError: a shape, a number or an option is out of its range.
-    """
-    check_vertical(vertical)
-    grid, dropped = polar_bin(points, centre, rings, sectors, r_max)
-    return grid, reference.coview(*grid, vertical=vertical), dropped
+    reach = float(r_max)
+    return runtime.dispatch(
+        lambda: _bins(rings, sectors, reach)(cloud, origin),
+        lambda: reference.polar_bin(cloud, origin, rings, sectors, reach),
+    )
 
 
 class _PolarBins:
@@ -117,9 +80,6 @@ class _PolarBins:
             self._launch.put(index, value)
         self._launch()
         self._launch.put(0, _EMPTY)  # keeps no cloud alive
-        return self._merged()
-
-    def _merged(self) -> tuple[PolarGrid, int]:
         shape, size = self._shape, self._size
         top = np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0)
         count = np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, dtype=np.int32)
@@ -183,16 +143,9 @@ def station_bins(
 
 
 def _station_bins(
-    raster_max: F32,
-    raster_count: I32,
-    cell: float,
-    rows: I32,
-    cols: I32,
-    ground: F32,
-    rings: int,
-    sectors: int,
-    r_max: float,
-) -> PolarGrid:
+    raster_max: F32, raster_count: I32, cell: float, rows: I32, cols: I32, ground: F32,
+    rings: int, sectors: int, r_max: float,
+) -> PolarGrid:  # fmt: skip
     d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
     starts = np.searchsorted(bins, np.arange(rings * sectors + 1)).astype(np.int32)
     reach = math.ceil(r_max / cell)
@@ -216,6 +169,5 @@ def _station_bins(
 
 
 _CENTRE, _ONE, _INDEX = (0.0, 0.0, 0.0), np.ones((1, 1)), np.zeros(1, dtype=np.int32)
-compiled_by("describe_points", lambda: describe_points(SAMPLE, _CENTRE, 2, 4, 8.0))
 compiled_by("polar_bin", lambda: polar_bin(SAMPLE, _CENTRE, 2, 4, 8.0))
 compiled_by("station_bins", lambda: station_bins(_ONE, _ONE, 1.0, _INDEX, _INDEX, _INDEX, 2, 4, 2.0))

@@ -146,7 +146,6 @@ class StationCodes:
         self.step = step
         self.norm = norm
         self.sectors = sectors
-        self._kernels: _Kernels | None = None
 
     @classmethod
     def of(cls, descriptors: Sequence[npt.NDArray[Any]]) -> StationCodes:
@@ -236,7 +235,7 @@ class StationCodes:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what may be copied or sent to another process: all but the prepared launches."""
-        return self.__dict__ | {"_kernels": None}
+        return {name: value for name, value in self.__dict__.items() if name != "_kernels"}
 
     def query(self, columns: npt.ArrayLike) -> CodedQuery:
         """Transform a query: its unit columns (D, S), the channels stacked in the stations' order and weighted.
@@ -250,14 +249,21 @@ class StationCodes:
 
     def best(self, query: CodedQuery) -> F32:
         """Return the greatest correlation (M,) with each station over 60 angles; of 60 sectors, all shifts."""
-        found = runtime.dispatch_here(self._ready(_BEST), self._native_best, self._plain_best, query)
-        return found * np.float32(query.screen.unit)
+        numbers, turn, unit = query.screen
+        best = runtime.dispatch_here(
+            self._ready(_BEST),
+            lambda: self._kernels.best(numbers, turn),
+            lambda: reference.best_codes(self.codes, numbers, turn),
+        )
+        return best * np.float32(unit)
 
     def all_shifts(self, query: CodedQuery, stations: npt.ArrayLike) -> F32:
         """Return the correlations (K, S) with stations (K,) at all shifts."""
         index = np.ascontiguousarray(stations, dtype=np.int32)
         products = runtime.dispatch_here(
-            self._ready(_PRODUCTS), self._native_products, self._plain_products, query, index
+            self._ready(_PRODUCTS),
+            lambda: self._kernels.products(query.factors, index),
+            lambda: reference.code_products(self.codes, query.factors, index),
         )
         return np.asarray(products.reshape(len(index), -1) @ self._rotations)
 
@@ -271,7 +277,11 @@ class StationCodes:
         for query, stations, shifts in requests:
             index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
             plain.append((query, index, np.broadcast_to(turned, index.shape)))
-        return runtime.dispatch_here(self._ready(_AT), self._native_at, self._plain_at, plain)
+        return runtime.dispatch_here(
+            self._ready(_AT),
+            lambda: self._kernels.at(plain),
+            lambda: [reference.codes_at(self.codes, query.table, *pairs) for query, *pairs in plain],
+        )
 
     @cached_property
     def _rotations(self) -> F32:
@@ -280,34 +290,15 @@ class StationCodes:
         return np.stack([np.cos(angle), -np.sin(angle)], axis=1).reshape(4 * _LANES, -1).astype(np.float32)
 
     def _ready(self, launch: int) -> Callable[[], bool]:
-        return lambda: self._kernels is not None and self._kernels.ready(launch)
+        return lambda: "_kernels" in vars(self) and self._kernels.launches[launch].ready()
 
-    def _prepared(self) -> _Kernels:
-        if self._kernels is None:
-            self._kernels = _Kernels(self.codes)
-        return self._kernels
-
-    def _native_best(self, query: CodedQuery) -> I32:
-        return self._prepared().best(query.screen.integers, query.screen.turn)
-
-    def _plain_best(self, query: CodedQuery) -> I32:
-        return reference.best_codes(self.codes, query.screen.integers, query.screen.turn)
-
-    def _native_products(self, query: CodedQuery, stations: I32) -> F32:
-        return self._prepared().products(query.factors, stations)
-
-    def _plain_products(self, query: CodedQuery, stations: I32) -> F32:
-        return reference.code_products(self.codes, query.factors, stations)
-
-    def _native_at(self, requests: Sequence[_Request]) -> list[F32]:
-        return self._prepared().at(requests)
-
-    def _plain_at(self, requests: Sequence[_Request]) -> list[F32]:
-        return [reference.codes_at(self.codes, query.table, *asked) for query, *asked in requests]
+    @cached_property
+    def _kernels(self) -> _Kernels:
+        return _Kernels(self.codes)
 
 
 class _Kernels:
-    """The kernels' launches and the memory that they share with NumPy; to be used as :meth:`ready` says."""
+    """The kernels' launches and the memory that they share with NumPy; one call at a time."""
 
     def __init__(self, codes: I16) -> None:
         self._codes, flat = codes, codes.reshape(-1)
@@ -322,7 +313,7 @@ class _Kernels:
         serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
         name = "best_serial" if serial else "best_parallel"
         common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
-        self._launches = (
+        self.launches = (
             Launch("station_codes", name, flat, *common),
             Launch(
                 *("station_codes", "products", flat, self._factors.reshape(-1), self._stations),
@@ -334,13 +325,9 @@ class _Kernels:
             ),
         )
 
-    def ready(self, launch: int) -> bool:
-        """Tell whether a launch may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
-        return self._launches[launch].ready()
-
     def best(self, query: I16, turn: I16) -> I32:
         self._query[:], self._turn[:] = query, turn
-        launch = self._launches[_BEST]
+        launch = self.launches[_BEST]
         for part in self._windows:
             launch.put(0, self._codes[part].reshape(-1))
             launch.put(3, self._best[part])
@@ -351,7 +338,7 @@ class _Kernels:
     def products(self, factors: F32, stations: I32) -> F32:
         self._factors[:] = factors
         found = np.empty((len(stations), 2, 2, _LANES), dtype=np.float32)
-        launch, chosen = self._launches[_PRODUCTS], _ByWindow(stations, self._windows)
+        launch, chosen = self.launches[_PRODUCTS], _ByWindow(stations, self._windows)
         for part in self._windows:
             launch.put(0, self._codes[part].reshape(-1))
             for own in chosen.chunks(part):
@@ -362,7 +349,7 @@ class _Kernels:
         return found
 
     def at(self, requests: Sequence[_Request]) -> list[F32]:
-        launch = self._launches[_AT]
+        launch = self.launches[_AT]
         found = [np.zeros(len(stations), dtype=np.float32) for _, stations, _ in requests]
         chosen = [_ByWindow(stations, self._windows) for _, stations, _ in requests]
         for part in self._windows:

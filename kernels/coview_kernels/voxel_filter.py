@@ -7,7 +7,6 @@ both threads have met would have to be merged afterwards.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,7 @@ from coview_kernels.arrays import F32, F64, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-_MAX_KEPT_BYTES = 1 << 23  # of the table and results that transform_unique keeps from call to call
+_MAX_KEPT_BYTES = 1 << 23  # of table and results that stay from call to call
 _MAX_SENSOR = 1 << 29  # voxels between the sensor and the origin
 _MAX_COORDINATE = 1 << 30  # voxels from the origin
 _MAX_FLOAT32 = float(np.finfo(np.float32).max)
@@ -58,85 +57,39 @@ def transform_unique(
         ValueError: an array has the wrong shape, ``T`` or ``centre`` is not finite, or a range is negative or NaN.
     """
     cloud, pose = as_float32("points", points, None, 3), as_finite64("T", T, 4, 4)
-    limits = _checked_limits(voxel, r_min, r_max)
-    middle = tuple(as_finite64("centre", centre, 3).tolist())
-    return runtime.dispatch_here(
-        lambda: _shared_pass is not None and _shared_pass.ready(), _transform_unique, reference.transform_unique,
-        cloud, pose, *limits, middle,
-    )  # fmt: skip
-
-
-class VoxelFilter:
-    """:func:`transform_unique` for a stream of frames, which allocates nothing once it is warm.
-
-    **The points of a result are a view of a buffer that the next call overwrites: copy what you keep.** Buffers
-    grow, by doubling, with a frame that is larger than all before. Without Taichi, and for points more than 32,767
-    voxels from the sensor, NumPy computes the same result, and allocates.
-
-    An object belongs to one caller at a time; different objects may be used from different threads.
-
-    Args:
-        voxel: edge of the voxels in the target frame, metres; zero or negative: keep every point.
-        r_min: least range in the source frame that is kept, metres (inclusive).
-        r_max: range in the source frame from which on points are dropped, metres (exclusive).
-
-    Raises:
-        ValueError: a number is out of its range.
-    """
-
-    def __init__(self, voxel: float, r_min: float = 0.0, r_max: float = math.inf) -> None:
-        self._limits = _checked_limits(voxel, r_min, r_max)
-        self._pass: _KernelPass | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what may be copied or sent to another process: all but buffers and prepared launches."""
-        return self.__dict__ | {"_pass": None}
-
-    def __call__(self, points: npt.ArrayLike, T: npt.ArrayLike) -> tuple[F32, int]:
-        """Filter a frame; arguments, results and errors are those of :func:`transform_unique`."""
-        cloud, pose = as_float32("points", points, None, 3), as_finite64("T", T, 4, 4)
-        return runtime.dispatch_here(self._ready, self._native, reference.transform_unique, cloud, pose, *self._limits)
-
-    def _ready(self) -> bool:
-        return self._pass is not None and self._pass.ready()
-
-    def _native(self, points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int]:
-        if self._pass is None:
-            self._pass = _KernelPass()
-        found = self._pass(points, T, voxel, r_min, r_max)
-        return reference.transform_unique(points, T, voxel, r_min, r_max) if found is None else found
-
-
-def _checked_limits(voxel: float, r_min: float, r_max: float) -> tuple[float, float, float]:
     if not (r_min >= 0 and r_max >= 0):
         raise ValueError(f"r_min and r_max must not be negative, got {r_min} and {r_max}")
     if not math.isfinite(voxel):
         raise ValueError(f"voxel must be finite, got {voxel}")
-    return float(voxel), float(r_min), float(r_max)
+    middle = tuple(as_finite64("centre", centre, 3).tolist())
+    return runtime.dispatch_here(
+        lambda: _pass is not None and _pass.launch.ready(), _transform_unique, reference.transform_unique,
+        cloud, pose, float(voxel), float(r_min), float(r_max), middle,
+    )  # fmt: skip
 
 
-_shared_pass: _KernelPass | None = None  # of one caller at a time: only one call of native code runs
+_pass: _KernelPass | None = None  # one is enough: only one call of native code runs at a time
 
 
 def _transform_unique(
     points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...]
 ) -> tuple[F32, int]:
-    global _shared_pass
-    shared, _shared_pass = _shared_pass or _KernelPass(), None
-    found = shared(points, T, voxel, r_min, r_max, centre)
-    if shared.nbytes <= _MAX_KEPT_BYTES:
-        _shared_pass = shared
-    if found is None:
+    global _pass
+    current, _pass = _pass or _KernelPass(), None
+    result = current(points, T, voxel, r_min, r_max, centre)
+    if current.moved.nbytes + current.table.nbytes <= _MAX_KEPT_BYTES:
+        _pass = current
+    if result is None:
         return reference.transform_unique(points, T, voxel, r_min, r_max, centre)
-    moved, dropped = found
+    moved, dropped = result
     return moved.copy(), dropped
 
 
 class _KernelPass:
     """One pass of the kernel over a cloud, with its hash table and results; for native code only.
 
-    Table and results stay from call to call and grow, by doubling, when they have to. The table is never cleared: its
-    entries carry the number of their call.
+    Both stay from call to call and double when they are full. The table is never cleared: entries carry the number of
+    their call.
     """
 
     def __init__(self) -> None:
@@ -144,20 +97,11 @@ class _KernelPass:
         self._settings = np.zeros(22)
         self._totals = np.zeros(4, dtype=np.int32)
         self._tail = np.empty((_BLOCK, 3), dtype=np.float32)
-        self._moved: F32 = np.empty((_MIN_ROWS, 3), dtype=np.float32)
+        self.moved: F32 = np.empty((_MIN_ROWS, 3), dtype=np.float32)
         self._allocate(_MIN_BITS)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of table and results."""
-        return self._moved.nbytes + (16 << self._bits)
-
-    def ready(self) -> bool:
-        """Tell whether any thread may call it, by :func:`coview_kernels.runtime.dispatch_here`."""
-        return self._launch.ready()
-
     def __call__(
-        self, points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self, points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...]
     ) -> tuple[F32, int] | None:
         """Return the points kept, in a buffer that the next call overwrites, and the number of rows not finite.
 
@@ -167,8 +111,8 @@ class _KernelPass:
         sensor = T[:3, 3] * inverse
         if not np.abs(sensor).max() < _MAX_SENSOR:
             return None
-        if len(points) > len(self._moved):
-            self._moved = np.empty((1 << (len(points) - 1).bit_length(), 3), dtype=np.float32)
+        if len(points) > len(self.moved):
+            self.moved = np.empty((1 << (len(points) - 1).bit_length(), 3), dtype=np.float32)
             self._allocate(self._bits)
         farthest = min(_MAX_COORDINATE / inverse, _MAX_FLOAT32) if inverse else _MAX_FLOAT32
         self._settings[:12] = T[:3].reshape(-1)
@@ -180,7 +124,7 @@ class _KernelPass:
             if far:
                 return None
             if cubes + _BLOCK <= 1 << (self._bits - 1):
-                return self._moved[:kept], infinite
+                return self.moved[:kept], infinite
             self._allocate(self._bits + 1)
 
     def _allocate(self, bits: int) -> None:
@@ -188,20 +132,20 @@ class _KernelPass:
         size = (2 << bits) + 2
         table = np.zeros(size + 8, dtype=np.int64)
         to_cache_line = -table.__array_interface__["data"][0] // 8 % 8
-        self._table = table[to_cache_line : to_cache_line + size]
-        self._launch = Launch(
+        self.table = table[to_cache_line : to_cache_line + size]
+        self.launch = Launch(
             *("voxel_filter", "voxel_filter", _EMPTY, 0, 1, bits, -1),
-            *(self._settings, self._table, self._moved.reshape(-1), self._totals),
+            *(self._settings, self.table, self.moved.reshape(-1), self._totals),
         )
 
     def _run(self, points: F32, merge: int) -> list[int]:
         self._call += 1
         if self._call == _MAX_CALLS:
-            self._table.fill(0)
+            self.table.fill(0)
             self._call = 1
         self._totals.fill(0)
-        self._launch.put(_CALL, self._call)
-        self._launch.put(_MERGE, merge)
+        self.launch.put(_CALL, self._call)
+        self.launch.put(_MERGE, merge)
         blocks, rows = divmod(len(points), _BLOCK)
         self._add(points, blocks)
         if rows:
@@ -213,10 +157,10 @@ class _KernelPass:
         return totals
 
     def _add(self, points: F32, blocks: int) -> None:
-        self._launch.put(_POINTS, points.reshape(-1))
-        self._launch.put(_BLOCKS, blocks)
-        self._launch()
-        self._launch.put(_POINTS, _EMPTY)  # keeps no cloud alive
+        self.launch.put(_POINTS, points.reshape(-1))
+        self.launch.put(_BLOCKS, blocks)
+        self.launch()
+        self.launch.put(_POINTS, _EMPTY)  # keeps no cloud alive
 
 
 compiled_by("transform_unique", lambda: transform_unique(SAMPLE, np.eye(4), 1.0))

@@ -30,8 +30,7 @@ def warm_up(*names: str) -> None:
     """Start the backend and compile kernels now rather than at first use.
 
     Args:
-        names: of the public functions that will be called, all of them by default. ``transform_unique`` stands for
-            :class:`coview_kernels.VoxelFilter` too.
+        names: of the public functions that will be called, all of them by default.
 
     Raises:
         ValueError: a name is unknown.

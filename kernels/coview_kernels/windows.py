@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import I8, I32, Mask, as_int32
+from coview_kernels.arrays import I8, I32, as_int32
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import compiled_by
 
@@ -42,8 +42,9 @@ class WindowImages:
         stride = -(-side * DIMENSIONS // _LANES) * _LANES
         self.padded = np.zeros((count, side, stride), dtype=np.int8)
         self.padded[..., : side * DIMENSIONS] = images.reshape(count, side, -1)
-        used = np.asarray(self.padded != 0).reshape(count, side, -1, _LANES)
-        self.spans = np.stack(_span(np.asarray(used.any(axis=(0, 3)))), axis=1)
+        used = np.asarray((self.padded != 0).reshape(count, side, -1, _LANES).any(axis=(0, 3)))
+        first, last = used.argmax(axis=1), used.shape[1] - used[:, ::-1].argmax(axis=1)
+        self.spans = np.stack([first, np.where(used.any(axis=1), last, 0)], axis=1).astype(np.int32)
 
     def __len__(self) -> int:
         """Return the number of images K."""
@@ -63,13 +64,6 @@ class WindowImages:
     def images(self) -> I8:
         """(K, h, h, 8) without what fills the registers."""
         return self.padded[..., : self.side * DIMENSIONS].reshape(len(self), self.side, self.side, DIMENSIONS)
-
-
-def _span(used: Mask) -> tuple[I32, I32]:
-    """Return first used column of each row of a mask (h, n), and the one behind the last; equal where none is."""
-    some, columns = used.any(axis=1), used.shape[1]
-    first, last = used.argmax(axis=1), columns - used[:, ::-1].argmax(axis=1)
-    return np.where(some, first, 0).astype(np.int32), np.where(some, last, 0).astype(np.int32)
 
 
 class WindowRaster:
@@ -134,22 +128,19 @@ def window_products(raster: WindowRaster, images: WindowImages, corners: npt.Arr
         raise ValueError("a window leaves the raster's margin")
     if image.min() < 0 or image.max() >= len(images):
         raise ValueError(f"images {image.min()} to {image.max()} of {len(images)}")
-    return runtime.dispatch_here(_ready, _native, _plain, raster, images, at, image)
+    return runtime.dispatch_here(
+        _launch.ready,
+        lambda: _native(raster, images, at, image),
+        lambda: reference.window_products(raster.padded, images.images, at, image),
+    )
 
 
-def _plain(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
-    return reference.window_products(raster.padded, images.images, at, which)
-
-
-_launch: Launch | None = None
-
-
-def _ready() -> bool:
-    return _launch is not None and _launch.ready()
+_BYTES, _WHOLES = np.zeros(1, dtype=np.int8), np.zeros(1, dtype=np.int32)
+_launch = Launch("windows", "products", _BYTES, 0, _BYTES, 0, _WHOLES, _WHOLES, _WHOLES, _WHOLES)
+"""One is enough: only one call of native code runs at a time."""
 
 
 def _native(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
-    global _launch
     width = raster.padded.shape[1]
     first = (at[:, 0] * width + at[:, 1]) * DIMENSIONS
     out = np.zeros((len(at), DIMENSIONS), dtype=np.int32)
@@ -157,11 +148,8 @@ def _native(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> 
         raster.flat, width * DIMENSIONS, images.padded.reshape(-1), images.padded.shape[2], images.spans.reshape(-1),
         first, which, out.reshape(-1),
     )  # fmt: skip
-    if _launch is None:
-        _launch = Launch("windows", "products", *arguments)
-    else:
-        for index, value in enumerate(arguments):
-            _launch.put(index, value)
+    for index, value in enumerate(arguments):
+        _launch.put(index, value)
     _launch()
     return out
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import coview_kernels as ck
-from coview_kernels import reference, runtime
+from coview_kernels import reference
 
 
 @pytest.mark.parametrize(("size", "count"), [(1, 5), (300, 40), (300, 1000), (2000, 256)])
@@ -32,18 +32,6 @@ def test_kernel_agrees_with_numpy():
         poses = np.column_stack([rng.integers(-9, 9, (size, 3)), np.cos(n := rng.normal(size=size)), np.sin(n)])
         expected = reference.distinct_poses((poses - [*poses[0, :3], 0, 0]).astype(np.float32), 50, 9.0, np.cos(0.5))
         np.testing.assert_array_equal(ck.distinct_poses(poses[:, :3], n, 50, 3.0, 0.5), expected)
-
-
-def test_more_poses_than_before_are_prepared_on_the_owners_thread(monkeypatch):
-    here = []
-    dispatch_here = runtime.dispatch_here
-    monkeypatch.setattr(
-        runtime, "dispatch_here", lambda ready, *rest: (here.append(ready()), dispatch_here(ready, *rest))[1]
-    )
-    for size in (3, 3, 5000):
-        assert ck.distinct_poses(np.zeros((size, 3)), np.zeros(size), 77, 1.0, 1.0).tolist() == [0]
-    assert here[0] is False
-    assert here[2] is False
 
 
 def test_headings_are_compared_around_the_circle():

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_cases import clouds, parallel_parts
 
-from coview_kernels import coview, describe_points, polar_bin, reference, station_bins
-from coview_kernels.sectors import polar_index
+from coview_kernels import polar_bin, reference, station_bins
+from coview_kernels.reference.polar import polar_index
 
 SIZES = st.sampled_from([(1, 1), (1, 2), (3, 4), (20, 60), (20, 61), (7, 360)])
 
@@ -28,19 +28,6 @@ def test_polar_bin_agrees_with_numpy(points, size, r_max, centre):
     expected, expected_dropped = reference.polar_bin(points, np.array(centre, dtype=float), *size, r_max)
     assert_same(grid, expected)
     assert dropped == expected_dropped == np.count_nonzero(~np.isfinite(points).all(axis=1))
-
-
-@given(clouds(), SIZES, st.sampled_from(["max", "off"]))
-def test_describe_points_is_polar_bin_and_coview(points, size, vertical):
-    centre = np.array([2.5, -7.5, 1.0])
-    grid, context, dropped = describe_points(points, centre, *size, 50.0, vertical)
-    expected, expected_dropped = polar_bin(points, centre, *size, 50.0)
-    assert_same(grid, expected)
-    assert dropped == expected_dropped
-    np.testing.assert_array_equal(context, coview(*expected, vertical=vertical))
-    plain = reference.describe_points(points, centre, *size, 50.0, vertical)
-    np.testing.assert_array_equal(context, plain[1])
-    assert context.dtype == plain[1].dtype
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -115,12 +102,6 @@ def test_polar_index_rotates_with_the_cloud(seed):
     np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
 
 
-def test_more_sectors_than_the_kernel_supports():
-    points = np.random.default_rng(7).normal(0, 15, (2_000, 3)).astype(np.float32)
-    grid, _ = polar_bin(points, (0, 0, 0), 2, 400_000, 30.0)
-    assert_same(grid, reference.polar_bin(points, np.zeros(3), 2, 400_000, 30.0)[0])
-
-
 def test_empty_cloud_and_cloud_in_one_bin():
     grid, dropped = polar_bin(np.empty((0, 3)), (0, 0, 0), 20, 60, 50.0)
     assert dropped == 0
@@ -188,12 +169,11 @@ def test_errors_name_the_argument():
     cloud, raster = np.zeros((1, 3)), np.zeros((4, 5))
     with pytest.raises(ValueError, match="centre"):
         polar_bin(cloud, (0, np.nan, 0), 20, 60, 50.0)
-    with pytest.raises(ValueError, match="vertical"):
-        describe_points(cloud, (0, 0, 0), 20, 60, 50.0, "highest")
     with pytest.raises(ValueError, match="r_max"):
         polar_bin(cloud, (0, 0, 0), 20, 60, 0.0)
-    with pytest.raises(ValueError, match="rings"):
-        polar_bin(cloud, (0, 0, 0), 0, 60, 50.0)
+    for rings, sectors in ((0, 60), (2, 60_000)):
+        with pytest.raises(ValueError, match="rings"):
+            polar_bin(cloud, (0, 0, 0), rings, sectors, 50.0)
     with pytest.raises(ValueError, match="raster_count"):
         station_bins(raster, raster[:2], 1.0, [0], [0], [0], 2, 4, 5.0)
     with pytest.raises(ValueError, match="inside the raster"):

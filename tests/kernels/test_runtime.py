@@ -37,7 +37,6 @@ def succeeds(code: str, **environment: str) -> str:
 def test_public_names():
     assert set(coview_kernels.__all__) == {
         *("SCATTER", "Prior", "Registration", "Scale", "align_planes"),
-        *("VoxelFilter", "describe_points"),
         *("Raster", "Crop", "Cut", "crop_points"),
         *("WindowImages", "WindowRaster", "window_products"),
         *("OverheadGrid", "height_columns", "lowest_heights", "offsets_near"),

@@ -1,15 +1,22 @@
 from __future__ import annotations
 
-import gc
-import tracemalloc
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_cases import clouds, poses, run_python
 
-from coview_kernels import VoxelFilter, backend, reference, shutdown, transform_unique, voxel_filter
+from coview_kernels import reference, transform_unique, voxel_filter
+
+
+def assert_filtered(points, T, *limits):
+    """Compare the kernel with its twin; return the points kept and the rows dropped."""
+    moved, dropped = transform_unique(points, T, *limits)
+    expected, expected_dropped = reference.transform_unique(points, T, *limits)
+    np.testing.assert_array_equal(moved, expected)
+    assert moved.dtype == np.float32
+    assert dropped == expected_dropped
+    return moved, dropped
 
 
 @given(
@@ -21,11 +28,7 @@ from coview_kernels import VoxelFilter, backend, reference, shutdown, transform_
     st.sampled_from([(0.0, 0.0, 0.0), (7.5, -20.0, 3.1)]),
 )
 def test_transform_unique_agrees_with_numpy(points, T, voxel, r_min, r_max, centre):
-    moved, dropped = transform_unique(points, T, voxel, r_min, r_max, centre)
-    expected, expected_dropped = reference.transform_unique(points, T, voxel, r_min, r_max, centre)
-    np.testing.assert_array_equal(moved, expected)
-    assert dropped == expected_dropped
-    assert moved.dtype == np.float32
+    assert_filtered(points, T, voxel, r_min, r_max, centre)
 
 
 @given(clouds(max_points=60), poses(), st.sampled_from([0.5, 2.5]))
@@ -70,10 +73,7 @@ def test_transform_unique_of_two_million_points():
     points[::1000] = np.nan
     T = np.eye(4)
     T[:3, 3] = [1.0, -2.0, 0.5]
-    moved, dropped = transform_unique(points, T, 0.5, 1.0, 90.0)
-    expected, expected_dropped = reference.transform_unique(points, T, 0.5, 1.0, 90.0)
-    np.testing.assert_array_equal(moved, expected)
-    assert dropped == expected_dropped == 2000
+    assert assert_filtered(points, T, 0.5, 1.0, 90.0)[1] == 2000
 
 
 @pytest.mark.parametrize(
@@ -91,43 +91,24 @@ def test_errors_name_the_argument(arguments, name):
         transform_unique(*arguments)
 
 
-def assert_filtered(found, points, T, limits):
-    expected, dropped = reference.transform_unique(points, T, *limits)
-    np.testing.assert_array_equal(found[0], expected)
-    assert found[0].dtype == np.float32
-    assert found[1] == dropped
-
-
-@given(
-    st.lists(st.tuples(clouds(), poses()), min_size=1, max_size=4),
-    st.sampled_from([-1.0, 0.0, 0.1, 0.5, 2.5]),
-    st.sampled_from([(0.0, np.inf), (5.0, 30.0)]),
-)
-def test_voxel_filter_agrees_with_numpy_frame_after_frame(frames, voxel, limits):
-    take = VoxelFilter(voxel, *limits)
-    for points, T in frames:
-        assert_filtered(take(points, T), points, T, (voxel, *limits))
-
-
-def test_voxel_filter_of_voxels_with_many_points():
+def test_voxels_with_many_points():
     rng = np.random.default_rng(3)
     points = np.tile(rng.uniform(-10, 10, (5_000, 3)), (8, 1)).astype(np.float32)
     points += rng.uniform(-0.2, 0.2, points.shape).astype(np.float32)
     points[::999] = np.nan
     T = np.eye(4)
     T[:3, 3] = 3.0, -4.0, 0.5
-    take = VoxelFilter(0.5, 2.0, 12.0)
     for n in (40_000, 5_000, 0, 39_999):
-        assert_filtered(take(points[:n], T), points[:n], T, (0.5, 2.0, 12.0))
+        assert_filtered(points[:n], T, 0.5, 2.0, 12.0)
 
 
 @pytest.mark.parametrize("spread", [0.1, 3.0, 400.0])
-def test_hash_table_grows_with_the_volume_of_the_cloud(spread):
+def test_hash_table_grows_with_the_volume_of_the_cloud(spread, monkeypatch):
     """From few cubes of 4 x 4 x 4 voxels to one for each point."""
+    monkeypatch.setattr(voxel_filter, "_pass", None)
     points = np.random.default_rng(9).normal(0, spread, (20_000, 3)).astype(np.float32)
-    take = VoxelFilter(0.1)
     for n in (1, 20_000, 63, 64, 65):
-        assert_filtered(take(points[:n], np.eye(4)), points[:n], np.eye(4), (0.1,))
+        assert_filtered(points[:n], np.eye(4), 0.1)
 
 
 def test_farthest_voxels_within_reach():
@@ -138,92 +119,36 @@ def test_farthest_voxels_within_reach():
     T = np.eye(4)
     for sensor in (0.0, 1000.0):
         T[:3, 3] = sensor
-        take = VoxelFilter(1.0)
-        assert_filtered(take(points, T), points, T, (1.0,))
-        assert len(take(points, T)[0]) == 64
+        assert len(assert_filtered(points, T, 1.0)[0]) == 64
         for step in (least - 1, most + 1):
-            far = np.append(points, np.full((1, 3), step, np.float32), axis=0)
-            assert_filtered(take(far, T), far, T, (1.0,))
-
-
-def scan(rng, n=30_000):
-    return (rng.normal(0.0, 15.0, (n, 3)) * [1.0, 1.0, 0.1]).astype(np.float32)
-
-
-def test_stream_of_frames_allocates_no_arrays():
-    rng = np.random.default_rng(4)
-    frames = [scan(rng) for _ in range(5)]
-    take = VoxelFilter(0.3, 0.5, 80.0)
-    T = np.eye(4)
-    if backend() == "numpy":
-        pytest.skip("NumPy allocates")
-    for frame in frames:
-        take(frame, T)
-    homes = {take(frame, T)[0].__array_interface__["data"][0] for frame in frames}
-    assert len(homes) == 1
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        for k in range(100):
-            T[0, 3] = k
-            taken = take(frames[k % 5], T)
-        _, peak = tracemalloc.get_traced_memory()
-        gc.collect()  # launches of quadrants leave cycles
-        after, _ = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert len(taken[0]) > 10_000
-    # a frame has 360 kB; views, numbers and the job in the queue are all there is, and 20 kB of a quadrants launch
-    assert peak - before < 32_000
-    assert after - before < 8_000
-
-
-def test_next_call_overwrites_the_points_of_the_last():
-    rng = np.random.default_rng(5)
-    take = VoxelFilter(0.3)
-    if backend() == "numpy":
-        pytest.skip("NumPy returns arrays of its own")
-    first = take(scan(rng), np.eye(4))[0]
-    kept = first.copy()
-    take(scan(rng), np.eye(4))
-    assert not np.array_equal(first, kept)
+            assert_filtered(np.append(points, np.full((1, 3), step, np.float32), axis=0), T, 1.0)
 
 
 def test_table_is_cleared_when_the_call_number_overflows(monkeypatch):
     monkeypatch.setattr(voxel_filter, "_MAX_CALLS", 4)
+    monkeypatch.setattr(voxel_filter, "_pass", None)
     rng = np.random.default_rng(6)
-    take = VoxelFilter(0.5)
     for _ in range(10):
-        points = scan(rng, 3_000)
-        assert_filtered(take(points, np.eye(4)), points, np.eye(4), (0.5,))
+        assert_filtered(rng.normal(0.0, 15.0, (3_000, 3)).astype(np.float32), np.eye(4), 0.5)
 
 
 def test_points_out_of_reach_are_filtered_in_numpy():
     T = np.eye(4)
     T[0, 3] = 1e6  # the sensor may be anywhere, its points are what must be near it
     near = np.array([[1, 0, 0], [1, 0, 0], [70, 0, 0]], dtype=np.float32)
-    take = VoxelFilter(0.5)
-    assert_filtered(take(near, T), near, T, (0.5,))
     far = np.array([[1e6, 0, 0], [1e6, 0, 0], [-1e30, 0, 0], [0, 0, 0]], dtype=np.float32)
-    assert_filtered(take(far, T), far, T, (0.5,))
-    assert_filtered(take(near, T), near, T, (0.5,))
-
-
-def test_voxel_filter_after_a_shutdown():
-    points = scan(np.random.default_rng(8), 2_000)
-    take = VoxelFilter(0.5)
-    for _ in range(2):
-        assert_filtered(take(points, np.eye(4)), points, np.eye(4), (0.5,))
-        shutdown()
+    for points in (near, far, near):
+        assert_filtered(points, T, 0.5)
 
 
 @pytest.mark.parametrize("name", ["quadrants", "numpy"])
 def test_other_backends_agree(name):
     done = run_python(
-        "import numpy as np; from coview_kernels import VoxelFilter, polar_bin, reference\n"
-        "take = VoxelFilter(0.5, 1.0, 30.0); rng = np.random.default_rng(1)\n"
+        "import numpy as np; from coview_kernels import polar_bin, reference, transform_unique\n"
+        "rng = np.random.default_rng(1)\n"
         "for _ in range(3):\n"
-        "    points = rng.normal(0, 10, (9000, 3)).astype(np.float32); found, _ = take(points, np.eye(4))\n"
+        "    points = rng.normal(0, 10, (9000, 3)).astype(np.float32)\n"
+        "    found, _ = transform_unique(points, np.eye(4), 0.5, 1.0, 30.0)\n"
         "    expected = reference.transform_unique(points, np.eye(4), 0.5, 1.0, 30.0)[0]\n"
         "    assert np.array_equal(found, expected)\n"
         "    ours, plain = (f(expected, np.zeros(3), 20, 60, 50.0)[0] for f in (polar_bin, reference.polar_bin))\n"
@@ -233,17 +158,3 @@ def test_other_backends_agree(name):
     if "unset it" in done.stderr:
         pytest.skip(f"{name} is not installed")
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize(("arguments", "name"), [((np.nan,), "voxel"), ((1.0, -1.0), "r_min")])
-def test_voxel_filter_errors_name_the_limit(arguments, name):
-    with pytest.raises(ValueError, match=name):
-        VoxelFilter(*arguments)
-
-
-def test_voxel_filter_errors_name_the_argument():
-    take = VoxelFilter(1.0)
-    with pytest.raises(ValueError, match="points"):
-        take(np.zeros((3, 2)), np.eye(4))
-    with pytest.raises(ValueError, match="T has"):
-        take(np.zeros((3, 3)), np.eye(3))

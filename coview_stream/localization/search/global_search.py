@@ -36,7 +36,7 @@ class GlobalSearch:
     """
 
     KERNELS = (
-        "transform_unique", "describe_points", "distinct_poses", "field_scores", "align_planes",
+        "transform_unique", "polar_bin", "distinct_poses", "field_scores", "align_planes",
         "crop_points",
     )  # fmt: skip
     """Names of the kernels that it runs, for :func:`coview_kernels.warm_up`."""

@@ -13,7 +13,7 @@ from coview_kernels.reference.field import field_scores, structure_at
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.overhead import height_columns, lowest_heights, offsets_near
-from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
+from coview_kernels.reference.polar import polar_bin, station_bins
 from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
 from coview_kernels.reference.voxel_filter import transform_unique
 from coview_kernels.reference.windows import window_products
@@ -25,7 +25,6 @@ __all__ = [
     "codes_at",
     "coview",
     "crop_points",
-    "describe_points",
     "distinct_poses",
     "field_scores",
     "height_columns",

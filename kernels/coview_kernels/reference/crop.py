@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coview_kernels.arrays import F32, I8, I32
-from coview_kernels.cells import CELL, Cells, cell_numbers, grid_frame
+from coview_kernels.cells import Cells, cell_numbers, grid_frame
 
 
 class Cut(NamedTuple):
@@ -39,7 +39,7 @@ def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
     if not len(near):
         return None
     low, high = near.min(axis=0).astype(np.float64), near.max(axis=0).astype(np.float64)
-    frame = grid_frame(low, high, CELL)
+    frame = grid_frame(low, high)
     number = cell_numbers(near, frame)
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(int(frame[5:].prod()) + 1)).astype(np.int32)
