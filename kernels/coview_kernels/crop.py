@@ -1,7 +1,7 @@
 """Points around a place, cut out of a map and sorted for searching in the same pass.
 
-A crop is some 250,000 points, 10 MB with what belongs to them: memory that the system hands out page by page, at a
-millisecond for each 4 MB. So all of it is one piece, for which it has larger pages.
+A crop of 250,000 points takes 10 MB, which the system hands out page by page, at a millisecond for 4 MB. One piece of
+memory for all arrays gets larger pages.
 """
 
 from __future__ import annotations
@@ -23,16 +23,13 @@ __all__ = ["Crop", "Cut", "crop_points"]
 
 
 def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Crop | None:
-    """Cut the points around a place out of a map.
+    """Cut the points around a place out of a map; None where there is no point.
 
     Args:
         points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
-        normals: (N, 3) int8, contiguous, normals, as long as the planarity around each point, times 127.
-        spans: (S, 2) first row and row after the last of each stretch of the map to look at.
+        normals: (N, 3) int8, contiguous, normals as long as the planarity around each point, times 127.
+        spans: (S, 2) first row of each stretch of the map to look at, and the row after the last.
         cut: the circle to cut out.
-
-    Returns:
-        The crop, or None where there is no point.
 
     Raises:
         ValueError: an array has the wrong shape or type, a span leaves the map, or a setting is out of its range.
@@ -46,11 +43,9 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
         raise ValueError(f"spans must lie in the map's {len(points)} points and not end before they begin")
     if not (all(math.isfinite(v) for v in cut) and cut.radius > 0):
         raise ValueError(f"cut must be finite with a positive radius, got {cut}")
-
-    def ready() -> bool:
-        return _measure.ready() and _sort.ready()
-
-    return runtime.dispatch_here(ready, _crop, reference.crop_points, points, normals, stretches, cut)
+    return runtime.dispatch_here(
+        lambda: _measure.ready() and _sort.ready(), _crop, reference.crop_points, *(points, normals, stretches, cut)
+    )
 
 
 _NO: dict[type, npt.NDArray[Any]] = {kind: np.zeros(1, dtype=kind) for kind in (np.float32, np.int32, np.int8)}
@@ -88,7 +83,7 @@ def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
 
 
 def _arena(*parts: tuple[int, Any]) -> list[npt.NDArray[Any]]:
-    """Return arrays of so many numbers of a kind of four bytes each, all in one piece of memory."""
+    """Return arrays of so many numbers of a four-byte kind, in one piece of memory."""
     ends = np.cumsum([-(-number // 16) * 16 for number, _ in parts])  # each begins a cache line
     memory = np.empty(int(ends[-1]), dtype=np.int32)
     begins = (0, *ends[:-1])

@@ -1,14 +1,14 @@
 """Scores of hypotheses against a map's likelihood field, each moved to the best pose around it first.
 
-A hypothesis says where a scan stands: position and heading of a pivot in it. For each of them the kernel looks for the
-best shift and heading, coarse to fine, and for the height at which the scan's ground lies on the map's; then it counts
-what of the scan the map explains there (:class:`FieldScores`). All is looking up: no point is searched for.
+A hypothesis is the pose of a scan: position and heading of a pivot in it. The kernel looks for the best shift and
+heading near each, coarse to fine, and for the height at which the scan's ground lies on the map's; then it counts the
+points that the map explains there (:class:`FieldScores`). It only looks up: no point is searched for.
 
 1. coarse: some of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
-   to six degrees off: one pass over the points for each heading, as the shifts are neighbouring cells.
+   to six degrees off: one pass over the points for each heading, since shifts are neighbouring cells.
 2. height: the mean difference of the map's ground and the scan's, twice.
-3. fine: the eight neighbours half a metre away, and at the best two headings a degree off; then the same at half these
-   steps. A point counts twice on cells of half a metre that have structure, once within half a metre of it.
+3. fine: the eight neighbours half a metre away, and two headings a degree off at the best; then the same at half these
+   steps. A point counts twice on half-metre cells with structure, once within half a metre of one.
 4. counts, with all points.
 """
 
@@ -31,22 +31,16 @@ from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
-"""Points of the coarse level, of a fine one, and for the height; fine levels. docs/results.md has how
-often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
+"""Points of the coarse level, of a fine one, and for the height; fine levels. With a third fewer points one of 24
+places was lost on one world; docs/results.md says how often the right place comes first."""
 
 _MAX_TABLE = 1 << 21  # tiles of the rectangle that holds a map, 537 km2: kernels count in int32
-_MIDDLE = 1 << 31
-"""Words of bits that an index of 32 bits, with its sign, counts from their first; of more it counts from the middle."""
-
-_BATCH = 512  # tiles at a time, so that intermediate arrays stay small
+_MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches from the first; beyond, it counts from the middle
+_BATCH = 512  # tiles at a time: intermediate arrays stay small
 _BAND = 16  # rows of tiles at a time, likewise
 
 Zeros = Callable[[str, tuple[int, ...], type[np.generic]], npt.NDArray[Any]]
-"""Returns a writable array of zeros by name, shape and type: where a layer is made."""
-
-
-def _in_memory(name: str, shape: tuple[int, ...], kind: type[np.generic]) -> npt.NDArray[Any]:
-    return np.zeros(shape, dtype=kind)
+"""Makes a writable array of zeros for a layer, by name, shape and type."""
 
 
 class Move(Enum):
@@ -60,39 +54,36 @@ class Move(Enum):
 
 
 class FieldScores(NamedTuple):
-    """Numbers of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
+    """Counts of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
 
     pose: F64
     """(H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians."""
     structure: I32
-    """(H,) structure points on surveyed cells."""
+    """(H,) structure points on surveyed cells; the next two are subsets of them."""
     near: I32
-    """(H,) of them, those within about half a metre of map structure."""
+    """(H,) within about half a metre of map structure."""
     covered: I32
-    """(H,) of them, those that are near or below a roof edge."""
+    """(H,) near, or below a roof edge."""
     low: I32
     """(H,) ground points on surveyed cells."""
     grounded: I32
-    """(H,) of them, those on the map's ground."""
+    """(H,) low points on the map's ground."""
     passed: I32
     """(H,) free points on map structure."""
     on: I32
-    """(H,) of the structure points, those in a cell of half a metre that has map structure."""
+    """(H,) structure points in a half-metre cell with map structure."""
 
 
 @dataclass(frozen=True)
 class FieldScan:
-    """A scan as the field compares it: level, relative to the pivot, metres, neighbours one after the other.
-
-    Attributes:
-        structure: (N, 3) float32 points above the ground.
-        low: (G, 3) float32 points on the ground.
-        free: (F, 3) float32 points that rays have passed through.
-    """
+    """A level scan, relative to the pivot, metres; neighbours follow one another."""
 
     structure: F32
+    """(N, 3) points above the ground."""
     low: F32
+    """(G, 3) points on the ground."""
     free: F32
+    """(F, 3) points that rays have passed through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +93,9 @@ class FieldMap:
     Attributes:
         tiles: (T, 3) int32 row and column of each tile, and the height in metres that its heights count from.
         occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set where the cell has a point at height z.
-        ground: (T, 32, 32) int16 centimetres above the tile's height, or one of the two values below.
+        ground: (T, 32, 32) int16 centimetres above the tile's height, ``NO_GROUND`` or ``NOT_SURVEYED``.
         edge: (T, 32, 32) uint8 quarter metres above the tile's height, 0 for none.
-        stored: the layers, if they have been made before, say memory-mapped; None makes them at first use.
+        stored: layers made before, perhaps memory-mapped; None makes them at first use.
 
     Raises:
         ValueError: an array has another shape or type, the layers are not those of the tiles, or the map is too large
@@ -137,7 +128,7 @@ class FieldMap:
             self._check(self.stored)
 
     def _check(self, layers: FieldLayers) -> None:
-        """Compare layers with the tiles, as kernels go by the numbers in their table; their rasters are believed."""
+        """Compare layers with the tiles: a wrong table would make the kernel read elsewhere."""
         table, base = self._table()
         tiles, (rows, columns) = len(base), table.shape
         for name, kind, shape in (
@@ -160,15 +151,15 @@ class FieldMap:
 
     @cached_property
     def layers(self) -> FieldLayers:
-        """The rasters as they are looked up; 22 bytes a cell, made at first use unless they are stored."""
+        """The rasters that are looked up; 22 bytes a cell, made at first use unless they are stored."""
         return self.made_layers() if self.stored is None else self.stored
 
-    def made_layers(self, zeros: Zeros = _in_memory, done: Callable[[], object] = lambda: None) -> FieldLayers:
-        """Make the rasters, batch by batch.
+    def made_layers(
+        self, zeros: Zeros = lambda _, shape, kind: np.zeros(shape, kind), done: Callable[[], object] = lambda: None
+    ) -> FieldLayers:
+        """Make the rasters, batch by batch, in arrays by ``zeros``; ``done`` is called after each batch.
 
-        Args:
-            zeros: makes the arrays that they are written to.
-            done: called after each batch; may release their memory where they are mapped from files.
+        Where the arrays are mapped from files, ``done`` may release their memory.
         """
         table, base = self._table()
         tiles = len(base)
@@ -186,7 +177,7 @@ class FieldMap:
         return FieldLayers(table, base, bits, surface, coarse)
 
     def _table(self) -> tuple[I32, F32]:
-        """Return the number of each tile (R, C), 0 for none, and the height (T + 1,) that each counts from."""
+        """(R, C) number of each tile, 0 for none; (T + 1,) height that each counts from."""
         shape = self.tiles[:, :2].max(axis=0, initial=0).astype(np.int64) - self.corner + 2
         table = np.zeros(np.maximum(shape, 2), dtype=np.int32)
         row, column = (self.tiles[:, :2] - self.corner).T
@@ -214,15 +205,15 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: M
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre a kilometre from the corner
     pose, counts = start - corner, np.zeros((len(start), 7), dtype=np.int32)
-    for some in _groups(layers, pose):
-        pose[some], counts[some] = runtime.dispatch(_native, reference.field_scores, layers, plan, pose[some])
+    for rows in _groups(layers, pose):
+        pose[rows], counts[rows] = runtime.dispatch(_native, reference.field_scores, layers, plan, pose[rows])
     return FieldScores(pose + corner, *np.ascontiguousarray(counts.T))
 
 
 def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
-    """Yield which hypotheses to score together: all, or in a large mapped field those on one window after another.
+    """Yield hypotheses to score together: all, or those of one window after another of a large mapped field.
 
-    What the scan reaches of neighbouring windows stays in memory until the last group is done.
+    Pages of neighbouring windows that the scan reaches stay in memory until the last group is done.
     """
     windows = Windows(layers.bits)
     if not windows.several:
@@ -243,16 +234,16 @@ def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
 
 
 def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
-    """Tell which structure points (N, 3) at a pose (4,) are surveyed and yet neither near structure nor below an edge.
+    """Mask structure points (N, 3) at a pose (4,) on surveyed cells, neither near structure nor below an edge.
 
-    Arguments are as for :func:`field_scores`. In NumPy, as it is asked for one pose and seldom.
+    Arguments are as for :func:`field_scores`. In NumPy: it is called for one pose, and seldom.
     """
     surveyed, _, covered, _ = _structure_at(field, structure, pose)
     return np.asarray(surveyed & ~covered)
 
 
 def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
-    """Tell which structure points (N, 3) at a pose (4,) lie within about half a metre of map structure, likewise."""
+    """Mask structure points (N, 3) at a pose (4,) within about half a metre of map structure, likewise."""
     return _structure_at(field, structure, pose)[1]
 
 
@@ -279,12 +270,12 @@ def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
 
 
 def _spread(points: F32, count: int) -> F32:
-    """Return ``count`` points, or all, that are spread evenly over all."""
+    """Return ``count`` points, evenly spread, or all."""
     return points[np.arange(count) * len(points) // count] if len(points) > count else points
 
 
 def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
-    """Set the first bits of (T + 1, 32, 32, 2) within half a metre of the second ones: also in the six neighbours."""
+    """Set the first bits of (T + 1, 32, 32, 2) at the second ones and at their six neighbours, half a metre away."""
     row, column = np.nonzero(table)
     for start in range(0, len(row), _BATCH):
         rows, columns = row[start : start + _BATCH], column[start : start + _BATCH]
@@ -309,30 +300,30 @@ def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object])
     one, rest = np.uint32(1), np.uint32(31)
     for start in range(0, rows, _BAND):
         stop = min(start + _BAND, rows)
-        seen = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band is enough, and a tile has that
-        metres = _folded(bits, table[seen], done).transpose(0, 2, 1, 3).reshape(-1, columns * half)
+        wide = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band would do, a tile has more
+        metres = _folded(bits, table[wide], done).transpose(0, 2, 1, 3).reshape(-1, columns * half)
         out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
         out[1:] |= metres[:-1]
         out[:-1] |= metres[1:]
         out[:, 1:] |= metres[:, :-1]
         out[:, :-1] |= metres[:, 1:]
-        own = out[(start - seen.start) * half : (stop - seen.start) * half]
+        band = out[(start - wide.start) * half : (stop - wide.start) * half]
         for level, plane in enumerate(planes[..., start * half : stop * half]):
-            packed = np.packbits((own >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
+            packed = np.packbits((band >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
             plane[:-1] = packed
             plane[:-2] |= packed[1:] << np.uint16(8)
         done()
 
 
 def _folded(bits: I64, table: I32, done: Callable[[], object]) -> npt.NDArray[np.uint32]:
-    """Return the structure (R, C, 16, 16) of a table's tiles in cells of a metre, a bit for each metre of height."""
+    """(R, C, 16, 16) structure of a table's tiles in cells of a metre, a bit for each metre of height."""
     half, tiles = TILE // 2, table.reshape(-1)
     folded = np.zeros((len(tiles), half, half), dtype=np.uint32)
     used = np.flatnonzero(tiles)
     for start in range(0, len(used), _BATCH):
-        some = used[start : start + _BATCH]
-        cells = bits[tiles[some], ..., 1].view(np.uint64).reshape(-1, half, 2, half, 2)
-        folded[some] = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
+        part = used[start : start + _BATCH]
+        cells = bits[tiles[part], ..., 1].view(np.uint64).reshape(-1, half, 2, half, 2)
+        folded[part] = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
         done()
     return folded.reshape(*table.shape, half, half)
 
@@ -343,7 +334,7 @@ def _coarse_shape(rows: int, columns: int) -> tuple[int, int, int]:
 
 
 def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
-    """Return 32 bits of 64: each is set where either of two neighbouring ones is."""
+    """Fold 64 bits into 32: a bit is set where either of two neighbours is."""
     both = (words | (words >> np.uint64(1))) & np.uint64(0x5555555555555555)
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF),

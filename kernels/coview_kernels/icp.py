@@ -1,12 +1,11 @@
 """Trimmed point-to-plane ICP (eq. 13), coarse to fine, with weights against outliers and a prior.
 
-Where the map's points form no surface, in a crown or a hedge, a normal says nothing, and a pair tells of all three
-directions instead, each less exactly. How much of either is what the length of the map's normals says.
+Where the map's points form no surface, in a crown or a hedge, a normal means nothing, and a pair constrains all three
+directions, each less exactly. The length of the map's normals weighs the two.
 
-An iteration is one prepared launch, of which the searches are spread over the threads. A point's partner is looked up,
-not searched for, where it cannot have changed: a search also tells how far all other map points are at least, and as
-long as the point has moved less than that leaves room for, the partner is the same (the triangle inequality; exact).
-Late iterations, which move the cloud by centimetres, hardly search at all.
+An iteration is one prepared launch, whose searches are spread over the threads. A search also returns a lower bound of
+the distances of all other map points: while the point has moved less than that bound allows, its partner is the same
+(the triangle inequality; exact) and is looked up. Late iterations, which move the cloud by centimetres, hardly search.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ def align_planes(
 ) -> Registration | None:
     """Register points to a map of points with normals.
 
-    Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
-    keeps the floor(keep * found) nearest pairs, at least one, and all that are as far as the last of them, to a
-    hundredth; and it takes a Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit
-    normal n, w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the
-    planarity. The share is such that both kinds weigh the same for any numbers of points, but 5 at most. A coarse scale
-    may make do with every so-many-th point of either kind, since the next one goes on from where it ends.
+    An iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it keeps
+    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth; and it takes
+    a Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit normal n,
+    w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the planarity. The
+    share makes both kinds weigh the same for any numbers of points, but is 5 at most. A coarse scale may take every
+    so-many-th point of either kind: the next scale goes on from its end.
 
     Args:
         grid: the map, (K, 3).
@@ -72,15 +71,15 @@ def align_planes(
         source: (N, 3) float32, source frame, metres. Rows with NaN or inf find no partner.
         kind: (N,) bool.
         T: (4, 4) ``T_map_source`` to begin with.
-        pivot: (3,) source-frame point that rotations are about.
+        pivot: (3,) source-frame centre of rotations.
         scales: coarse to fine.
         keep: share of the pairs in (0, 1].
-        iterations: at most, on each scale.
+        iterations: maximum on each scale.
         min_pairs: pairs that an answer needs, at least 1.
         prior: fused with the normal equations of the pairs.
 
     Returns:
-        The pose with its evidence (see :class:`Registration`), or None where too few points find a partner.
+        The pose with its evidence, or None where too few points find a partner.
 
     Raises:
         ValueError: a shape is wrong, a pose not finite, or a setting out of its range; the message names it.
@@ -155,7 +154,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
 
 
 def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
-    """Order (N,) of the points by the first scale that they take part in, and how many each scale has."""
+    """Order (N,) of the points by the first scale that they take part in, and the number of points of each scale."""
     first = np.full(len(kind), len(scales))
     groups = np.flatnonzero(kind), np.flatnonzero(~kind)
     for k in reversed(range(len(scales))):
@@ -166,7 +165,7 @@ def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
 
 
 def _settings(frame: F64, plan: Plan, numbers: I64) -> F64:
-    """Return all numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
+    """Return all constants of the kernel in one array: every argument costs 5 to 10 us."""
     values = np.zeros(64 + 5 * len(plan.scales))
     values[:8] = frame
     values[8:13] = plan.keep, plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None

@@ -1,4 +1,4 @@
-"""Large memory-mapped arrays, used window by window: pages that were read count as this process's until released."""
+"""Large memory-mapped arrays, used window by window: pages count as this process's memory until released."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ import numpy as np
 import numpy.typing as npt
 
 WINDOW = 1 << 25
-"""Bytes that are used before they are released, set by hand: 16 launches for half a gigabyte, and little to hold."""
+"""Bytes of a window: 16 launches for half a gigabyte."""
 
 LARGE = 1 << 26
-"""Bytes from which an array is used by windows, set by hand: each pass through it costs time, about an eighth of a
-second for a gigabyte (``python -m bench scale``)."""
+"""Bytes from which an array is used by windows: a pass takes an eighth of a second for a gigabyte
+(``python -m bench scale``)."""
 
 _CAN_RELEASE = hasattr(mmap.mmap, "madvise") and hasattr(mmap, "MADV_DONTNEED")
 
 
 class Windows:
-    """The windows of an array (N, ...): one of all rows, unless it is mapped from a file and large.
+    """Windows of an array (N, ...): one of all rows, unless it is mapped from a file and large.
 
-    Iterating yields slices of rows; what one of them has brought into memory is released when the next is asked for.
-    The system keeps the file's pages as long as it has room, so that reading them again takes no disk.
+    Iterating yields slices of rows, and releases the pages of one before the next. The system keeps the file's pages as
+    long as it has room: reading them again takes no disk.
     """
 
     def __init__(self, array: npt.NDArray[Any]) -> None:
-        """Take an array."""
         self._rows = len(array)
         self._size = array[:1].nbytes
         self._map = _map_of(array) if array.nbytes > LARGE and array.flags.c_contiguous else None
         self._step = self._rows if self._map is None else max(1, WINDOW // self._size)
-        self._offset = 0 if self._map is None else _offset(array, self._map)
+        start = 0 if self._map is None else np.frombuffer(self._map, dtype=np.uint8).ctypes.data
+        self._offset = int(array.ctypes.data - start)  # of the array in the map
 
     @property
     def several(self) -> bool:
-        """Whether there are more than one."""
+        """Whether there is more than one."""
         return self._step < self._rows
 
     def number(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-        """Return the numbers of the windows that rows are in."""
+        """Return the numbers of the windows of rows."""
         return rows.astype(np.int64) // max(1, self._step)
 
     def release(self) -> None:
-        """Release all of it."""
+        """Release all pages."""
         self._release(slice(0, self._rows))
 
     def __iter__(self) -> Iterator[slice]:
@@ -66,11 +66,7 @@ class Windows:
 
 
 def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-    """Return a copy (K, ...) of rows (K,) of an array; of a large mapped file, a window is in memory at a time.
-
-    Raises:
-        IndexError: there is no such row.
-    """
+    """Return a copy (K, ...) of rows (K,) of an array, window by window; IndexError if there is no such row."""
     if len(rows) and not 0 <= rows.min() <= rows.max() < len(array):
         raise IndexError(f"rows {rows.min()} to {rows.max()} of {len(array)}")
     out = np.empty((len(rows), *array.shape[1:]), dtype=array.dtype)
@@ -83,22 +79,17 @@ def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArr
 
 
 def release(array: npt.NDArray[Any]) -> None:
-    """Let the memory of an array that is mapped from a file go; it is read again when it is touched."""
+    """Release the memory of an array that is mapped from a file; it is read again on access."""
     whole = _map_of(array)
     if whole is not None:
         whole.madvise(mmap.MADV_DONTNEED)
 
 
 def _map_of(array: npt.NDArray[Any]) -> mmap.mmap | None:
-    """Return the file's map that an array lies in, None of one in memory or one that can be written to."""
+    """Return the file's map that an array lies in; None for an array in memory or a writable one."""
     base: Any = array
-    if not _CAN_RELEASE or array.flags.writeable:  # what was written to a private map would be lost
+    if not _CAN_RELEASE or array.flags.writeable:  # changes of a private map would be lost
         return None
     while base is not None and not isinstance(base, mmap.mmap):
         base = base.obj if isinstance(base, memoryview) else getattr(base, "base", None)
     return base
-
-
-def _offset(array: npt.NDArray[Any], whole: mmap.mmap) -> int:
-    """Return the byte of the map at which an array begins."""
-    return int(array.ctypes.data - np.frombuffer(whole, dtype=np.uint8).ctypes.data)

@@ -12,11 +12,7 @@ from coview_kernels.warm_up import SAMPLE, compiled_by
 
 
 def lowest_heights(points: npt.ArrayLike, grid: OverheadGrid) -> F32:
-    """Return the lowest height (H, W) of the points (N, 3) in each cell, metres; inf where there are none.
-
-    Raises:
-        ValueError: the points have another shape.
-    """
+    """Return the lowest height (H, W) of the points (N, 3) in each cell, metres; inf where there is no point."""
     return runtime.dispatch(_lowest, reference.lowest_heights, as_float32("points", points, None, 3), grid)
 
 
@@ -24,7 +20,7 @@ def offsets_near(points: npt.ArrayLike, grid: OverheadGrid, level: F32, band: fl
     """Count the points (N, 3) less than ``band`` metres from the level (H, W) of their cell.
 
     Returns:
-        The numbers (H, W), and the sums (H, W) of how far they are above it, metres.
+        Their numbers (H, W), and the sums (H, W) of their heights above it, metres.
 
     Raises:
         ValueError: an array has another shape.
@@ -40,15 +36,15 @@ def height_columns(
 
     Args:
         points: metres.
-        grid: its cells.
-        ground: (h, w) its height in cells ``ratio`` times as large, metres; bilinear between their middles.
-        ratio: cells of the grid along the edge of one of the ground.
+        grid: the cells.
+        ground: (h, w) height of the ground in cells ``ratio`` times as large, metres; bilinear between their middles.
+        ratio: cells of the grid along the edge of a ground cell.
         step: height of a level, metres.
-        bounds: lowest and highest height of what has a level, and height below which a point is of the ground.
+        bounds: lowest and highest height of the levels, and the height below which a point belongs to the ground.
 
     Returns:
         (levels, H * W) uint8, 1 where a level of a cell is occupied, from height 0 on; (H * W) greatest height in
-        [0, highest], metres; (H * W) uint8, 1 where ground was seen.
+        [0, highest], metres; (H * W) uint8, 1 where ground was observed.
 
     Raises:
         ValueError: an array has another shape or no cells, or the highest height is not a whole number of levels.

@@ -24,11 +24,9 @@ def polar_bin(
 ) -> tuple[PolarGrid, int]:
     """Greatest height and number of points in rings x sectors around ``centre``.
 
-    Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r, points at or
-    beyond ``r_max`` excluded; sector ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi),
-    counter-clockwise from the x axis. A point on a ring edge belongs to the outer ring, on a sector edge to
-    the sector counter-clockwise of it, at the centre to ring 0, sector 0; :mod:`coview_kernels.reference.polar`
-    says how that is decided exactly (offsets from the centre are rounded to float32).
+    Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r < ``r_max``; sector
+    ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi), counter-clockwise from the x axis.
+    :mod:`coview_kernels.reference.polar` says how edges are decided.
 
     Args:
         points: (N, 3) float32, metres.
@@ -54,7 +52,7 @@ def polar_bin(
 
 
 class _PolarBins:
-    """Bins, edges and results of one grid size, which stay from call to call; for the owner thread only."""
+    """Bins, edges and results of one grid size, kept from call to call; for the owner thread only."""
 
     def __init__(self, rings: int, sectors: int, r_max: float) -> None:
         self._chunks = runtime.workers()
@@ -105,10 +103,10 @@ def station_bins(
 ) -> PolarGrid:
     """Virtual reference scans (VRS) of M stations, gathered from a raster of the base map.
 
-    Station m stands at the centre of raster cell (rows[m], cols[m]) at height ground[m]; row runs along y,
-    column along x. Every raster cell counts as ``raster_count`` points at its centre, so one table of (dx,
-    dy) to bin, with the edges of :func:`polar_bin`, serves all stations. What lies outside the raster is
-    empty. Memory for the result is 12 R S bytes a station: hand over stations in portions.
+    Station m stands at the centre of raster cell (rows[m], cols[m]) at height ground[m]; rows run along y, columns
+    along x. A raster cell counts as ``raster_count`` points at its centre: one table of (dx, dy) to bin, with the edges
+    of :func:`polar_bin`, serves all stations. Outside the raster there is nothing. The result takes 12 R S bytes a
+    station: hand over stations in portions.
 
     Args:
         raster_max: (H, W) float32 greatest height of each cell, metres; ignored where the count is 0.

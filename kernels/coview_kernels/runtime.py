@@ -1,19 +1,16 @@
 """Start, choice and end of the backend, in the only module that imports Taichi (or quadrants, its maintained fork).
 
-Taichi is started at the first kernel, not at import, and belongs to one thread: a program must be initialised
-and first launched on the same thread, and concurrent launches fail now and then. So one daemon thread owns it
-and takes its work from a queue; callers, on any thread, wait for their result.
+Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
+launched on the same thread, and concurrent launches fail now and then. One daemon thread owns it and takes calls from
+a queue; callers, on any thread, wait for their result.
 
-* ``COVIEW_KERNELS`` = ``taichi``, ``quadrants`` or ``numpy`` forces a backend; unset, the first usable one
-  serves.
-* ``COVIEW_THREADS`` = 1, 2, ... bounds the threads that a kernel spreads over; unset, every core that the
-  process may use serves, up to 16.
-* A host program that has initialised Taichi itself keeps it: a second ``init`` would destroy its fields, and
-  its program accepts no other thread. We then take quadrants, if that is installed, or NumPy. The same if the
-  host initialises Taichi after us; it must not do so while one of our kernels runs.
-* A forked child inherits Taichi's state without its threads and would hang, so it computes in NumPy.
-* :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It runs at exit by
-  itself.
+* ``COVIEW_KERNELS`` = ``taichi``, ``quadrants`` or ``numpy`` forces a backend; unset, the first usable one serves.
+* ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; unset, all cores of the process serve, up to 16.
+* A host program that has initialised Taichi keeps it: a second ``init`` would destroy its fields. We then take
+  quadrants, if installed, or NumPy; likewise if the host initialises Taichi after us, which it must not do while one
+  of our kernels runs.
+* A forked child inherits Taichi's state without its threads and would hang: it computes in NumPy.
+* :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It runs at exit by itself.
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _BACKENDS = ("taichi", "quadrants", "numpy")
-_STALE_LOCK = 60.0  # seconds; the cache is locked for milliseconds; set by hand
+_STALE_LOCK = 60.0  # seconds; the cache is locked for milliseconds
 _MAX_WORKERS = 16  # the kernels are bound by memory; more threads only add private bins to merge
 
 
@@ -64,7 +61,9 @@ class _Backend:
 
     def _start(self) -> None:
         self.library = _import(self._name)
-        _forget_kernels(self.library)
+        for name, module in list(sys.modules.items()):  # kernels of another library
+            if name.startswith("coview_kernels._ti_") and vars(module).get("ti") is not self.library:
+                del sys.modules[name]
         _init(self.library)
         self._program = _program(self.library)
 
@@ -82,19 +81,14 @@ _backend: str | None = None
 
 
 def _import(name: str) -> ModuleType:
-    _ensure_home()
+    if os.name == "posix" and not os.environ.get("HOME"):  # as in a service: Taichi would end the process
+        os.environ.pop("HOME", None)  # an empty one would hide the password database's
+        home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
+        os.environ["HOME"] = home if os.access(home, os.W_OK) else tempfile.gettempdir()
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
     with front_end.lean_import(name):
         return importlib.import_module(name)
-
-
-def _ensure_home() -> None:
-    """Set ``HOME`` where it is missing, as in the environment of a service: Taichi would end the process."""
-    if os.name == "posix" and not os.environ.get("HOME"):
-        os.environ.pop("HOME", None)  # an empty one would hide what the password database says
-        home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
-        os.environ["HOME"] = home if os.access(home, os.W_OK) else tempfile.gettempdir()
 
 
 def _program(library: Any) -> Any:
@@ -122,9 +116,9 @@ def _init(library: Any) -> None:
 
 
 def _remove_stale_lock(library: Any) -> None:
-    """Remove the lock of the cache of compiled kernels where a process that was killed has left it.
+    """Remove the lock that a killed process has left on the cache of compiled kernels.
 
-    The library holds it for an instant, and goes without the cache where it finds one: every start would compile.
+    The library holds it for an instant, and does without the cache while it is there: every start would compile.
     """
     with contextlib.suppress(OSError, AttributeError):
         folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or library.lang.impl.default_cfg().offline_cache_file_path
@@ -139,11 +133,7 @@ def cores() -> int:
 
 
 def workers() -> int:
-    """Return the number of threads of a kernel: the cores of this process, at most ``COVIEW_THREADS`` of them.
-
-    Raises:
-        ValueError: ``COVIEW_THREADS`` is no whole number from 1 up.
-    """
+    """Return the number of threads of a kernel; ValueError if ``COVIEW_THREADS`` is no whole number from 1 up."""
     asked = os.environ.get("COVIEW_THREADS", "")
     if not asked:
         return min(_MAX_WORKERS, cores())
@@ -167,13 +157,6 @@ def program() -> Any:
 def kernels(name: str) -> Any:
     """Return the module ``_ti_<name>``, imported at first use; call on the owner thread."""
     return importlib.import_module(f"coview_kernels._ti_{name}")
-
-
-def _forget_kernels(library: Any) -> None:
-    """Drop kernel modules that are bound to another library than ``library``."""
-    for name, module in list(sys.modules.items()):
-        if name.startswith("coview_kernels._ti_") and vars(module).get("ti") is not library:
-            del sys.modules[name]
 
 
 def _usable(name: str) -> bool:
@@ -220,10 +203,9 @@ def backend() -> str:
 
 
 def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Run ``fn(*args, **kwargs)`` on the thread that may launch kernels; return or raise what it does.
+    """Run ``fn(*args, **kwargs)`` on the thread that may launch kernels, and return its result or raise its error.
 
-    Callable from any thread, the owner included. With the NumPy backend there is no such thread and ``fn``
-    runs on the caller's.
+    Callable from any thread, the owner included. With the NumPy backend ``fn`` runs on the caller's.
     """
     while True:
         backend()
@@ -263,8 +245,8 @@ def dispatch_here(
 ) -> R:
     """Dispatch as :func:`dispatch` does, but run ``native`` on the caller's thread if ``ready()``; the owner waits.
 
-    For short kernels: to wake the owner, and then the caller again, takes 0.25 ms where cores sleep. ``native`` must
-    only launch what :meth:`coview_kernels.launch.Launch.ready` has found prepared, and hand nothing to the owner.
+    For short kernels: waking the owner, and then the caller again, takes 0.25 ms where cores sleep. ``native`` may only
+    launch kernels that are prepared (:meth:`coview_kernels.launch.Launch.ready`), and hands nothing to the owner.
     """
     owner = _owner
     if owner is not None:
@@ -282,7 +264,7 @@ def dispatch_here(
 
 
 def shutdown() -> None:
-    """Finish the queued kernels, free Taichi and end its thread. Idempotent; the next kernel starts anew."""
+    """Finish the queued kernels, free Taichi and end its thread. Idempotent; the next kernel starts both again."""
     global _owner, _backend
     with _lock:  # held to the end: a new program would destroy the old one under a running kernel
         if _owner is not None:

@@ -1,9 +1,8 @@
 """Distance of a query to every candidate at every shift (eqs 7-9), exactly, by the correlation theorem.
 
-Descriptors are compared by the cosines of their columns (sectors). Turning one of them by n sectors shifts
-its columns, so all S shifts together are one circular correlation per ring: a product per frequency, summed
-over the rings, and one inverse FFT. The product is a matrix product per frequency and BLAS does it at the
-speed of memory; a Taichi version was several times slower, so this is the implementation on every backend.
+Descriptors are compared by the cosines of their columns (sectors). A turn by n sectors shifts the columns: all S shifts
+are one circular correlation per ring, i.e. a product per frequency, summed over the rings, and one inverse FFT. BLAS
+does the product at the speed of memory; a Taichi version was several times slower, so NumPy serves every backend.
 
 One query, 9,527 candidates of 20 x 60, two shared cores: ``python -m bench kernels``
 
@@ -37,11 +36,7 @@ def _fft() -> Any:
 
 
 def unit_columns(desc: npt.ArrayLike) -> F32:
-    """Each column of (..., R, S) descriptors divided by its Euclidean norm; columns of zeros stay zero.
-
-    Raises:
-        ValueError: fewer than two axes.
-    """
+    """Divide columns of (..., R, S) descriptors by their Euclidean norm, if any; ValueError for fewer than two axes."""
     columns = np.asarray(desc, dtype=np.float32)
     if columns.ndim < 2:
         raise ValueError(f"desc has shape {columns.shape}, expected (..., rings, sectors)")
@@ -52,14 +47,10 @@ def unit_columns(desc: npt.ArrayLike) -> F32:
 
 
 def column_spectra(desc: npt.ArrayLike) -> C64:
-    """Spectra over the sectors of the unit columns of (M, R, S) descriptors: what a map stores.
+    """Spectra over the sectors of the unit columns of (M, R, S) descriptors; ValueError unless there are three axes.
 
     Returns:
-        (F, M, R) complex64 with F = S // 2 + 1; frequency first, so that each frequency is one contiguous
-        matrix.
-
-    Raises:
-        ValueError: not three axes.
+        (F, M, R) complex64 with F = S // 2 + 1; each frequency is one contiguous matrix.
     """
     fft = _fft()
     candidates = as_float32("desc", desc, None, None, None)
@@ -77,9 +68,8 @@ def all_shift_distance(query: npt.ArrayLike, spectra: C64, sectors: int) -> F32:
     ``d[m, n] = 1 - (1 / S) sum_j q_unit[:, (j + n) % S] . c_unit[m][:, j]``; a column that is empty on either
     side costs 1, so a near-empty descriptor cannot win by default.
 
-    Shift n says: what the candidate sees in sector j, the query sees in sector j + n. With candidates binned
-    in the axes of the map and the query in those of the robot, the map heading (yaw) of the query's x axis is
-    **-2 pi n / S** radians.
+    At shift n sector j of the candidate meets sector j + n of the query. With candidates binned in the axes of the map
+    and the query in those of the robot, the map heading (yaw) of the query's x axis is **-2 pi n / S** radians.
 
     Args:
         query: (R, S) descriptor, or (Q, R, S); normalised here.
@@ -111,8 +101,8 @@ def all_shift_distance(query: npt.ArrayLike, spectra: C64, sectors: int) -> F32:
 def _products(spectra: C64, queries: C64) -> C64:
     """(F, M, R) times (F, R, Q), in blocks of candidates that BLAS multiplies on the calling thread.
 
-    Larger products wake OpenBLAS's threads once per frequency. On idle cores that gains a third (1.9 against
-    2.8 ms); where the cores are busy each wake-up waits for a time slice, and 31 of them took 300 ms.
+    Larger products wake OpenBLAS's threads once per frequency: a third faster on idle cores (1.9 against 2.8 ms), but
+    on busy ones 31 wake-ups took 300 ms.
     """
     frequencies, m, rings = spectra.shape
     block = max(1, _MAX_SERIAL // rings)

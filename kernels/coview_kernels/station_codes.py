@@ -1,18 +1,18 @@
 r"""Correlation of a query with all stations from 512 bytes each (eqs 7-9), however many channels and rings they have.
 
 The correlation at shift n is a sum over the frequencies f of :math:`Re(conj(c_f) . q_f e^{i 2 pi f n / S})`, where c
-and q are spectra of unit columns, all rings of all channels together. Of the lowest 32 frequencies those parts are
-kept that vary most: c_f is projected on the first 12 eigenvectors of its second moments over a sample of the
+and q are spectra of unit columns, all rings of all channels together. The codes keep the directions of most variance
+of the lowest 32 frequencies: c_f is projected on the first 12 eigenvectors of its second moments over a sample of the
 stations, 4 from frequency 16 on (Karhunen-Loeve transform), and stored as int8 with a step for each number. The query
-gets the same treatment, at higher precision; its channels may be weighted.
+is transformed likewise, at higher precision; its channels may be weighted.
 
-What is lost is the same at every shift: right places keep about nine tenths of what sets them apart, and ``python
--m bench scale`` counts how many right places the search loses by it.
+The loss is the same at every shift: right places keep nine tenths of their lead, and ``python -m bench scale`` counts
+the right places that the search loses by it.
 
-Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold the frequencies 0 to 15, rows 12 to 15 those
-from 16 on; the first 8 lanes the even ones, the others the odd ones, which change their sign half a turn on, so that
-one sum serves two angles. The lower byte is a real part, the whole in units of 256 an imaginary one: to multiply
-either takes no unpacking but one shift.
+Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold frequencies 0 to 15, rows 12 to 15 the higher
+ones; the first 8 lanes hold even frequencies, the others odd ones, which change their sign half a turn on: one sum
+serves two angles. The lower byte is the real part, the whole number in units of 256 the imaginary one: a product
+takes one shift at most, and no unpacking.
 """
 
 from __future__ import annotations
@@ -50,38 +50,29 @@ _CHUNK = 4096  # pairs of station and shift at a time
 
 
 class Screen(NamedTuple):
-    """A query in integers.
-
-    Attributes:
-        integers: (2, 16, 2, 16) int16 for real and imaginary products.
-        turn: (65, 16) int16 table of rotations.
-        unit: value of one unit of the turned products.
-    """
+    """A query in integers."""
 
     integers: I16
+    """(2, 16, 2, 16) for real and imaginary products."""
     turn: I16
+    """(65, 16) table of rotations."""
     unit: float
+    """Value of one unit of the turned products."""
 
 
 @dataclass(frozen=True)
 class CodedQuery:
-    """A query in the stations' terms.
-
-    Attributes:
-        numbers: (16, 16) complex64 its transform.
-        step: (16, 2, 16) float32, of the stations.
-        norm: (33,) float32, of the stations.
-        sectors: number of shifts S.
-    """
+    """A query in the stations' terms; ``step``, ``norm`` and ``sectors`` are those of :class:`StationCodes`."""
 
     numbers: C64
+    """(16, 16) its transform."""
     step: F32
     norm: F32
     sectors: int
 
     @cached_property
     def screen(self) -> Screen:
-        """The query in integers."""
+        """The query for :meth:`StationCodes.best`."""
         p, s = self.numbers.real, self.numbers.imag
         pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
         size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
@@ -104,8 +95,7 @@ class CodedQuery:
         """(16, 4, 16) of a station's numbers, for real and imaginary products without rounding."""
         p, s = self.numbers.real, self.numbers.imag
         real, whole = self.step[:, 0], self.step[:, 1] * np.float32(1.0 / 256.0)
-        each = p * real, s * whole, s * real, -p * whole
-        return np.ascontiguousarray(np.stack(each, axis=1), dtype=np.float32)
+        return np.ascontiguousarray(np.stack([p * real, s * whole, s * real, -p * whole], axis=1), dtype=np.float32)
 
     @cached_property
     def table(self) -> F32:
@@ -121,24 +111,26 @@ _Request = tuple[CodedQuery, I32, I32]
 
 
 class StationCodes:
-    """M stations in 512 bytes each, and what it takes to compare a query with them.
+    """M stations in 512 bytes each, to be compared with queries.
 
     Attributes:
-        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only a window is held in memory.
+        codes: (M, 16, 16) int16; a memory map stays one, and only a window of a large one is in memory.
         basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
-        step: (16, 2, 16) float32 what one unit of int8 stands for, real and imaginary.
+        step: (16, 2, 16) float32 value of one unit of int8, real and imaginary.
         norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
         sectors: number of shifts S.
+
+    Raises:
+        ValueError: more than ``MAX_STATIONS``.
     """
 
     LEARNED = _SAMPLE
-    """Stations from which codes are learned at most: of more, as many evenly."""
+    """Stations at most from which codes are learned."""
 
     MAX_STATIONS = 2**31 // (_ROWS * _LANES) - 1
-    """More could not be numbered by the kernels' 32 bits."""
+    """The kernels number codes by 32 bits."""
 
     def __init__(self, codes: I16, basis: C64, step: F32, norm: F32, sectors: int) -> None:
-        """Keep the codes (M, 16, 16) of stations and what queries are coded by; ValueError for too many stations."""
         if len(codes) > self.MAX_STATIONS:
             raise ValueError(f"{len(codes)} stations, {self.MAX_STATIONS} at most")
         self.codes = codes
@@ -149,49 +141,45 @@ class StationCodes:
 
     @classmethod
     def of(cls, descriptors: Sequence[npt.NDArray[Any]]) -> StationCodes:
-        """Code stations by their descriptors (M, R, S), float16 or float32, one array per channel.
-
-        Raises:
-            ValueError: the channels' shapes differ.
-        """
+        """Code stations by their descriptors as the first tier of :meth:`tiers`."""
         return cls.tiers(descriptors, 1)[0]
 
     @classmethod
     def tiers(cls, descriptors: Sequence[npt.NDArray[Any]], count: int) -> list[StationCodes]:
-        """Code stations several times, each time what the codes before leave out: the correlations add up.
+        """Code stations by their descriptors (M, R, S), float16 or float32, one array per channel.
+
+        A tier codes the remainder of the tiers before it: the correlations add up.
 
         Raises:
             ValueError: the channels' shapes differ.
         """
-        _check_shapes(descriptors)
         stations = len(descriptors[0])
-        made = cls.empty_tiers([each[cls.learned_from(stations)] for each in descriptors], count, stations)
-        for start in range(0, stations, _BATCH):
-            part = slice(start, min(start + _BATCH, stations))
-            cls.encode_tiers(made, part, [each[part] for each in descriptors])
+        made = cls.empty_tiers([channel[cls.learned_from(stations)] for channel in descriptors], count, stations)
+        cls.encode_tiers(made, slice(0, stations), descriptors)
         return made
 
     @staticmethod
     def learned_from(stations: int) -> I64:
-        """Return the numbers (K,) of the stations that codes of so many are learned from."""
+        """Return the numbers (K,) of the sample of so many stations, evenly spread."""
         return np.arange(0, stations, -(-stations // _SAMPLE) or 1)
 
     @classmethod
     def empty_tiers(
         cls, sample: Sequence[npt.NDArray[Any]], count: int, stations: int, into: Sequence[I16] | None = None
     ) -> list[StationCodes]:
-        """Return codes of which none is filled in yet, learned from the descriptors of a sample.
+        """Return ``count`` tiers for :meth:`encode_tiers` to fill, learned from the descriptors of a sample.
 
         Args:
             sample: descriptors (K, R, S) of :meth:`learned_from`, one array per channel.
-            count: of tiers, each of what those before leave out.
-            stations: that are to be coded.
+            count: number of tiers.
+            stations: number of stations M to be coded.
             into: arrays (M, 16, 16) for the codes of each tier; None makes them.
 
         Raises:
             ValueError: the channels' shapes differ.
         """
-        _check_shapes(sample)
+        if any(channel.shape != sample[0].shape for channel in sample):
+            raise ValueError(f"descriptors have shapes {[c.shape for c in sample]}, expected one for all")
         sectors, spectra = sample[0].shape[2], _spectra(_columns(sample))
         if into is None:
             into = [np.empty(cls.shape_of(stations), dtype=np.int16) for _ in range(count)]
@@ -209,14 +197,13 @@ class StationCodes:
     def encode_tiers(tiers: Sequence[StationCodes], part: slice, descriptors: Sequence[npt.NDArray[Any]]) -> None:
         """Fill in a part of the codes, by the descriptors (m, R, S) of these stations, one array per channel."""
         for start in range(part.start, part.stop, _BATCH):
-            some = slice(start, min(start + _BATCH, part.stop))
-            own = slice(some.start - part.start, some.stop - part.start)
-            spectra = _spectra(_columns([each[own] for each in descriptors]))
-            for each in tiers:
-                each._encode(some, spectra)
+            batch = slice(start, min(start + _BATCH, part.stop))
+            rows = slice(batch.start - part.start, batch.stop - part.start)
+            spectra = _spectra(_columns([channel[rows] for channel in descriptors]))
+            for tier in tiers:
+                tier._encode(batch, spectra)
 
     def _encode(self, part: slice, spectra: C64) -> None:
-        """Code some stations by their spectra (32, m, D)."""
         self.codes[part] = _pack(_parts(_projected(spectra, self.basis)) / self.step)
         whole = _unpack(self.codes[part])
         groups = whole[:, :_LOW], whole[:, _LOW:]
@@ -229,12 +216,12 @@ class StationCodes:
         return len(self.codes)
 
     def subset(self, stations: npt.ArrayLike) -> StationCodes:
-        """Return a copy of the codes of stations (K,), in memory; a query of these codes is one of those."""
+        """Return a copy of the codes of stations (K,), in memory; queries of these codes serve it too."""
         rows = take_rows(self.codes, np.asarray(stations, dtype=np.int64))
         return StationCodes(rows, self.basis, self.step, self.norm, self.sectors)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what may be copied or sent to another process: all but the prepared launches."""
+        """Return the state without the prepared launches."""
         return {name: value for name, value in self.__dict__.items() if name != "_kernels"}
 
     def query(self, columns: npt.ArrayLike) -> CodedQuery:
@@ -272,8 +259,8 @@ class StationCodes:
         return self.at_all([(query, stations, shifts)])[0]
 
     def at_all(self, requests: Sequence[tuple[CodedQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[F32]:
-        """Return what :meth:`at` does of each request; large memory maps are gone through once for all of them."""
-        plain = []
+        """Return the result of :meth:`at` for each request, in one pass over a large memory map."""
+        plain: list[_Request] = []
         for query, stations, shifts in requests:
             index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
             plain.append((query, index, np.broadcast_to(turned, index.shape)))
@@ -298,7 +285,7 @@ class StationCodes:
 
 
 class _Kernels:
-    """The kernels' launches and the memory that they share with NumPy; one call at a time."""
+    """The launches, and the memory that they share with NumPy; one call at a time."""
 
     def __init__(self, codes: I16) -> None:
         self._codes, flat = codes, codes.reshape(-1)
@@ -367,7 +354,7 @@ class _Kernels:
 
 
 class _ByWindow:
-    """Some stations (K,) by the window that they are in; stations of -1 are in none, or in the only one."""
+    """Stations (K,) by window; a station of -1 is in none, or in the only one."""
 
     def __init__(self, stations: I32, windows: Windows) -> None:
         self._several = windows.several
@@ -375,7 +362,7 @@ class _ByWindow:
         self._sorted = stations[self._order]
 
     def chunks(self, part: slice) -> Iterator[I64]:
-        """Yield which of the stations are in a window, not too many at a time."""
+        """Yield indices of the stations of a window, at most ``_CHUNK`` at a time."""
         begin, end = 0, len(self._order)
         if self._several:
             begin, end = np.searchsorted(self._sorted, [part.start, part.stop]).tolist()
@@ -384,7 +371,7 @@ class _ByWindow:
 
 
 def _frequencies() -> I64:
-    """Frequency of each lane of both groups (2, 16)."""
+    """(2, 16) frequency of each lane, by group."""
     return np.stack([_LANE, _LANE + _LANES])
 
 
@@ -396,14 +383,9 @@ def _turns(sectors: int) -> C64:
     return turns
 
 
-def _check_shapes(descriptors: Sequence[npt.NDArray[Any]]) -> None:
-    if any(each.shape != descriptors[0].shape for each in descriptors):
-        raise ValueError(f"descriptors have shapes {[each.shape for each in descriptors]}, expected one for all")
-
-
 def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:
-    """Stack the unit columns (m, D, S) of the channels' descriptors (m, R, S)."""
-    return np.concatenate([unit_columns(each) for each in descriptors], axis=1)
+    """(m, D, S) unit columns of the channels' descriptors (m, R, S)."""
+    return np.concatenate([unit_columns(channel) for channel in descriptors], axis=1)
 
 
 def _spectra(columns: F32) -> C64:
@@ -419,7 +401,7 @@ def _spectra(columns: F32) -> C64:
 
 
 def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
-    """(16, 16, D) each of the second moments of spectra (32, m, D), greatest first; beyond D there are zeros."""
+    """(16, 16, D) a tier, of the second moments of spectra (32, m, D), greatest first; zeros beyond D."""
     moments = np.matmul(sample.transpose(0, 2, 1).astype(np.complex128), sample.conj())
     vectors = np.linalg.eigh(moments)[1][:, :, ::-1]  # (32, D, D)
     found = np.zeros((tiers, _ROWS, _LANES, sample.shape[2]), dtype=np.complex64)
@@ -431,13 +413,13 @@ def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
 
 
 def _steps(sample: C64, basis: C64) -> F32:
-    """(16, 2, 16) what one unit of int8 stands for; what exceeds the range is clipped."""
+    """(16, 2, 16) value of one unit of int8; larger numbers are clipped."""
     if not sample.shape[1]:
         return np.ones((_ROWS, 2, _LANES), dtype=np.float32)
     parts = _parts(_projected(sample, basis))
     square = (parts * parts).mean(axis=0)
     least = 1e-3 * square.max(initial=0.0) + 1e-12  # numbers that are empty in the sample
-    # what never is far from its mean, as a column's sum, is spread over more of the integers
+    # a number that stays near its mean, as a column's sum does, is spread over more of the integers
     reach = np.minimum(_INT8_RANGE * np.sqrt(square), _MARGIN * np.abs(parts).max(axis=0))
     return np.asarray(np.maximum(reach, np.sqrt(least)) * (1.0 / 127.0), dtype=np.float32)
 
@@ -457,7 +439,7 @@ def _parts(numbers: C64) -> F32:
 
 
 def _pack(numbers: F32) -> I16:
-    """(..., L) int16 of (..., 2, L): the second in the upper byte, rounded with regard to the lower one."""
+    """(..., L) int16 of (..., 2, L): the second in the upper byte, rounded with the lower one in mind."""
     low = np.clip(np.rint(numbers[..., 0, :]), -127, 127).astype(np.int16) & 255
     high = np.clip(np.rint(numbers[..., 1, :] - low * np.float32(1.0 / 256.0)), -127, 127).astype(np.int16)
     packed: I16 = (high << 8) | low
@@ -465,7 +447,7 @@ def _pack(numbers: F32) -> I16:
 
 
 def _unpack(pair: I16) -> F32:
-    """(..., 2, L) numbers that (..., L) int16 stand for: the lower byte, and the whole of it in units of 256."""
+    """(..., 2, L) numbers of (..., L) int16: the lower byte, and the whole number in units of 256."""
     whole = np.empty((*pair.shape[:-1], 2, pair.shape[-1]), dtype=np.float32)
     whole[..., 0, :] = pair.astype(np.int8)
     np.multiply(pair, np.float32(1.0 / 256.0), out=whole[..., 1, :])

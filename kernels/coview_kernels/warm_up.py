@@ -1,10 +1,10 @@
-"""Compilation of the kernels before they are needed: each takes some hundredths of a second or more, cached or not.
+"""Compilation of the kernels before their first use: each takes some hundredths of a second or more, cached or not.
 
-A module of kernels names what is to be compiled before its function runs, beside the function::
+A module of kernels registers a call for each public function::
 
     compiled_by("nearest", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))
 
-and a caller whose first call must not wait calls ``warm_up("nearest")`` before.
+and a caller that must not wait later calls ``warm_up("nearest")`` first.
 """
 
 from __future__ import annotations
@@ -22,19 +22,12 @@ _calls: dict[str, Callable[[], object]] = {}
 
 
 def compiled_by(name: str, call: Callable[[], object]) -> None:
-    """Have ``call()``, cheap in itself, compile all kernels that the public function ``name`` launches."""
+    """Register a cheap call that compiles all kernels of the public function ``name``."""
     _calls[name] = call
 
 
 def warm_up(*names: str) -> None:
-    """Start the backend and compile kernels now rather than at first use.
-
-    Args:
-        names: of the public functions that will be called, all of them by default.
-
-    Raises:
-        ValueError: a name is unknown.
-    """
+    """Start the backend and compile the kernels of public functions, by default of all; ValueError for other names."""
     if unknown := sorted(set(names) - set(_calls)):
         raise ValueError(f"no kernel {', '.join(unknown)}; there are {', '.join(sorted(_calls))}")
     if runtime.backend() == "numpy":

@@ -1,8 +1,7 @@
-"""Products of small images with windows of a raster: a correlation, but only at the places that are asked for.
+"""Products of small images with windows of a raster: a correlation at given places.
 
-All are signed bytes, eight to a cell, and the eight dimensions are summed apart, so that one of them may be the weight
-of a mean of the others. A window of 33 x 33 cells takes a microsecond; all of them at once are a matter for a Fourier
-transform.
+Cells hold eight signed bytes, whose products are summed apart: one of them may be the weight of a mean of the others.
+A window of 33 x 33 cells takes a microsecond; for all places at once a Fourier transform is faster.
 """
 
 from __future__ import annotations
@@ -23,15 +22,17 @@ _MAX_CELLS = (2**31 - 1) // (128 * 128)  # whose sum of products an int32 holds
 
 
 class WindowImages:
-    """K images of one size, prepared to be compared with windows of a raster.
+    """K images (K, h, h, 8) of signed bytes, prepared to be compared with windows of a raster.
 
     Attributes:
         padded: (K, h, stride) int8, rows in whole registers.
         spans: (h, 2) int32 the first register of each row that any image uses, and the one behind the last.
+
+    Raises:
+        ValueError: another shape or type.
     """
 
     def __init__(self, images: I8) -> None:
-        """Prepare images (K, h, h, 8); ValueError for another shape or type."""
         if images.ndim != 4 or images.shape[1] != images.shape[2] or images.shape[3] != DIMENSIONS:
             raise ValueError(f"images have shape {images.shape}, expected (K, h, h, {DIMENSIONS})")
         if images.dtype != np.int8 or not 0 < images.shape[1] ** 2 <= _MAX_CELLS:
@@ -56,45 +57,33 @@ class WindowImages:
         return int(self.padded.shape[1])
 
     @property
-    def nbytes(self) -> int:
-        """Bytes that they take."""
-        return int(self.padded.nbytes)
-
-    @property
     def images(self) -> I8:
-        """(K, h, h, 8) without what fills the registers."""
+        """(K, h, h, 8) without the padding of the registers."""
         return self.padded[..., : self.side * DIMENSIONS].reshape(len(self), self.side, self.side, DIMENSIONS)
 
 
 class WindowRaster:
-    """A raster, prepared to be compared with images up to a size.
+    """A raster (H, W, 8) of signed bytes, prepared for windows that reach up to ``margin`` cells beyond it.
 
     Attributes:
         flat: int8, the raster with a margin of zeros, row by row, and zeros behind it.
         margin: cells.
+
+    Raises:
+        ValueError: another shape or type, or more than 2 GB.
     """
 
     def __init__(self, raster: I8, margin: int) -> None:
-        """Prepare a raster (H, W, 8) for windows that reach up to ``margin`` cells beyond it.
-
-        Raises:
-            ValueError: another shape or type, or more than 2 GB of it.
-        """
         if raster.ndim != 3 or raster.shape[2] != DIMENSIONS or raster.dtype != np.int8:
             raise ValueError(f"a raster of {raster.dtype} {raster.shape}, expected int8 (H, W, {DIMENSIONS})")
         height, width = (n + 2 * margin for n in raster.shape[:2])
         if height * width * DIMENSIONS >= 2**31 - _LANES:
             raise ValueError(f"a raster of {height} x {width} cells is too large")
-        # what fills the images' registers is multiplied with what follows the last row
+        # the images' padding is multiplied with the bytes behind the last row
         self.flat = np.zeros(height * width * DIMENSIONS + _LANES, dtype=np.int8)
         self.margin = margin
         self._shape = height, width
         self.padded[margin : height - margin, margin : width - margin] = raster
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that it takes."""
-        return int(self.flat.nbytes)
 
     @property
     def padded(self) -> I8:
@@ -107,10 +96,10 @@ def window_products(raster: WindowRaster, images: WindowImages, corners: npt.Arr
     """Sum the products of images with windows of a raster, each of the eight dimensions by itself.
 
     Args:
-        raster: to be looked at.
-        images: K of them.
-        corners: (N, 2) row and column of the raster's cell at a window's first one; within its margin or inside.
-        which: (N,) image to compare each window with.
+        raster: the raster.
+        images: K images.
+        corners: (N, 2) row and column of a window's first cell in the raster; in its margin or inside.
+        which: (N,) image of each window.
 
     Returns:
         (N, 8) int32.

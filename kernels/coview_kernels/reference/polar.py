@@ -1,16 +1,14 @@
 """Polar binning of points and of raster cells in plain NumPy, with ring and sector decided as in every kernel.
 
-An offset (dx, dy) is rounded to float32, so that its products are exact in float64. Both decisions then
-compare exact numbers with a table, and neither fused multiply-add nor a vectorised sine can move a point
-across an edge:
+An offset (dx, dy) is rounded to float32: its products are exact in float64. Both decisions compare exact numbers with a
+table, and neither fused multiply-add nor a vectorised sine can move a point across an edge:
 
 * ring k holds ``edge2[k] <= dx*dx + dy*dy < edge2[k + 1]``;
-* sector k lies counter-clockwise of, or on, the ray ``edges[k]`` and clockwise of ``edges[k + 1]``; the rays
-  are float32 directions, 6e-8 rad from 2 pi k / S at worst and exact on the axes.
+* sector k lies counter-clockwise of, or on, the ray ``edges[k]`` and clockwise of ``edges[k + 1]``; the rays are
+  float32 directions, 6e-8 rad from 2 pi k / S at worst and exact on the axes.
 
-So a point on a ring edge belongs to the outer ring, a point on a sector edge to the sector counter-clockwise
-of it, and the centre itself to ring 0, sector 0. Offsets below 1e-37 m may count as zero: Taichi's
-threads flush subnormal numbers.
+A point on a ring edge belongs to the outer ring, on a sector edge to the sector counter-clockwise of it, at the centre
+to ring 0, sector 0. Offsets below 1e-37 m may count as zero: Taichi's threads flush subnormal numbers.
 """
 
 from __future__ import annotations
