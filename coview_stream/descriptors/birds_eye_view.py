@@ -20,22 +20,22 @@ CELL = 0.5
 """Edge of an image's cell, metres."""
 
 SLABS = (0.5, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 40.0)
-"""Bounds of the height layers, metres above the ground; set by hand, and trained with."""
+"""Bounds of the height layers, metres above the ground."""
 
 LAYERS = len(SLABS) + 2
-"""One for each pair of bounds, then the greatest height, whether the ground was seen, and the ground's own relief."""
+"""One for each pair of bounds, then the greatest height, the cells with ground points, and the relief of the ground."""
 
 BIRDS_EYE_VIEW_VERSION = 1
-"""To be raised when the same cloud gives another image: features are comparable only between equal versions."""
+"""Raise it when the same cloud gives another image: features are comparable only between equal versions."""
 
-# set by hand, and trained with: other values need other weights
+# the networks are trained with these and SLABS: other values need other weights
 _LEVEL = 0.25  # metres: a layer counts its occupied levels, not its points, of which a denser scan has more
 _GROUND_CELL = 2.0  # metres
-_MAX_GROUND_HEIGHT = 0.4  # metres above the ground, below which a point is of the ground
-_GROUND_BAND = 0.8  # metres about the first estimate of the ground in which it is refined
+_MAX_GROUND_HEIGHT = 0.4  # metres above the ground, below which a point belongs to the ground
+_GROUND_BAND = 0.8  # metres about the first estimate of the ground; points in it refine the estimate
 _MAX_SLOPE = 0.7  # metres per metre: steeper surfaces stand on the ground
 _REACH = 10  # ground cells to either side that bound a cell's height from above: half a large building
-_RELIEF_SIGMA = 8.0  # metres: relief is measured from the ground's mean under a Gaussian of this width
+_RELIEF_SIGMA = 8.0  # metres of the Gaussian under which the ground's mean is the zero of relief
 _MAX_RELIEF = 1.5  # metres, at which the layer saturates
 _BOUNDS = SLABS[0], SLABS[-1], _MAX_GROUND_HEIGHT
 
@@ -49,9 +49,9 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         shape: rows and columns of the image, each a multiple of four cells (two metres).
 
     Returns:
-        (LAYERS, H, W). A height layer holds the square root of the share of its 0.25 m levels that are occupied,
-        times 255; the layer above them the greatest height, 255 at the last bound; then 255 where ground was seen;
-        then how far the ground lies above its surroundings' mean, 128 for not at all or unknown.
+        (LAYERS, H, W). A height layer holds 255 times the square root of the occupied share of its 0.25 m levels. Three
+        layers follow: the greatest height, 255 at the last bound; 255 at cells with ground points; and the height of
+        the ground above the mean of its surroundings, 128 for zero or unknown.
     """
     height, width = shape
     cloud = np.ascontiguousarray(points, dtype=np.float32)
@@ -64,28 +64,23 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         return nothing
     ground, relief = _ground(cloud, OverheadGrid(x, y, _GROUND_CELL, lowest.shape), lowest)
     image = np.zeros((LAYERS, height * width), dtype=np.float32)
-    _layers(image, *kernels.height_columns(cloud, OverheadGrid(x, y, CELL, shape), ground, ratio, _LEVEL, _BOUNDS))
-    u, v = ((np.arange(n) + 0.5) / ratio - 0.5 for n in (width, height))
-    curved = _interpolate(relief, np.tile(u, height), np.repeat(v, width))
-    image[-1] = np.clip(128.0 + curved * (127.0 / _MAX_RELIEF), 1.0, 255.0)
-    return image.astype(np.uint8).reshape(LAYERS, height, width)
-
-
-def _layers(image: Floats32, occupied: npt.NDArray[np.uint8], top: Floats32, ground: npt.NDArray[np.uint8]) -> None:
-    """Fill all layers of a flat image but the last from the columns above its cells."""
+    grid = OverheadGrid(x, y, CELL, shape)
+    occupied, top, on_ground = kernels.height_columns(cloud, grid, ground, ratio, _LEVEL, _BOUNDS)
     for k, (low, high) in enumerate(pairwise(SLABS)):
         slab = occupied[int(low / _LEVEL) : int(high / _LEVEL)]  # no more than 255 levels
         image[k] = 255.0 * np.sqrt(slab.sum(axis=0, dtype=np.uint8) * np.float32(1.0 / len(slab)))
     image[-3] = top * (255.0 / SLABS[-1])
-    image[-2] = ground * np.float32(255.0)
+    image[-2] = on_ground * np.float32(255.0)
+    image[-1] = np.clip(128.0 + _enlarged(relief, ratio) * (127.0 / _MAX_RELIEF), 1.0, 255.0)
+    return image.astype(np.uint8).reshape(LAYERS, height, width)
 
 
 def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Floats32, Floats32]:
-    """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen.
+    """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 for cells without ground points.
 
     ``lowest`` (h, w) is the lowest point of each cell, inf for none.
     """
-    from scipy import ndimage  # takes a quarter of a second, and not all who load a map draw images
+    from scipy import ndimage  # takes a quarter of a second, and most users of a map draw no images
 
     occupied = np.isfinite(lowest)
     # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
@@ -105,9 +100,10 @@ def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Float
     return ground, np.where(level & (weight > 1e-2), ground - mean, 0.0).astype(np.float32)
 
 
-def _interpolate(values: Floats32, column: Reals, row: Reals) -> Floats32:
-    """Interpolate an image (h, w) bilinearly at columns and rows (N,)."""
+def _enlarged(values: Floats32, ratio: int) -> Floats32:
+    """Interpolate an image (h, w) bilinearly in cells ``ratio`` times as small, row by row."""
     from scipy import ndimage
 
-    at = np.stack([row, column])
+    u, v = ((np.arange(n * ratio) + 0.5) / ratio - 0.5 for n in values.shape[::-1])
+    at = np.stack([np.repeat(v, len(u)), np.tile(u, len(v))])
     return np.asarray(ndimage.map_coordinates(values, at, order=1, mode="nearest", output=np.float32))

@@ -1,4 +1,4 @@
-"""Co-view descriptor: channels made from the polar bins of a virtual scan (paper, section 3.2, eqs 1-4)."""
+"""Co-view descriptor: channels of the polar bins of a virtual scan (paper, section 3.2, eqs 1-4)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
 _VERTICAL: Literal["max", "off"] = "max"  # ``off`` is the strict reading of eq. 2; bench ablation compares them
-_GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows the ground
+_GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
-    """Compute one descriptor channel (..., R, S) of polar bins; metres above the ground.
+    """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
 
-    Heights below the zero carry no shape (they are ground in a hollow) and count as zero.
+    In ``scan_context`` heights below zero (ground in a hollow) count as zero.
     """
     if name == "scan_context":
         value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
@@ -32,11 +32,11 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
-    """Describe the virtual local scan around ``centre`` by channels, (R, S) each.
+    """Describe a virtual local scan by channels, (R, S) each.
 
     Args:
         points: (N, 3) gravity-aligned points, metres, one per voxel.
-        centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
+        centre: (3,) the zero of the descriptor: the keyframe's x and y, and the height of the ground below it.
         config: bins and channels.
     """
     grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
@@ -46,8 +46,8 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
 def ground_below(points: Points, position: Floats) -> float:
     """Estimate the height of the ground below ``position`` (3,) from the points around it, metres in their frame.
 
-    The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and independent of the sensor's
-    mounting height. Without points below the sensor there, the sensor's own height.
+    The median of the lowest points below the sensor in 1 m cells within 6 m: robust to clutter, and independent of the
+    sensor's mounting height. Without such points it is the sensor's height.
     """
     x, y = points[:, 0] - position[0], points[:, 1] - position[1]
     near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2]))

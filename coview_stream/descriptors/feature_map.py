@@ -1,7 +1,7 @@
 """Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points.
 
-It is built by the aerial network over bird's-eye views of the map, in windows that overlap by more than the network's
-reach: the result does not depend on where they lie.
+The aerial network encodes bird's-eye views of the map in windows. They overlap by more than the network's reach: the
+result does not depend on their borders.
 """
 
 from __future__ import annotations
@@ -40,17 +40,14 @@ _STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 
 @dataclass(frozen=True)
 class Patch:
-    """Features of a map around a place.
-
-    Attributes:
-        local: (C, h, w) float32 of unit norm, zero where the map has nothing; cells of 1 m.
-        sigma: (h, w) float32, uncertainty of each cell as a keypoint; of no meaning where ``local`` is zero.
-        corner: (2,) x and y of the lower corner of cell (0, 0), metres, map frame.
-    """
+    """Features of a map around a place."""
 
     local: Floats32
+    """(C, h, w) of unit norm, zero where the map has nothing; cells of 1 m."""
     sigma: Floats32
+    """(h, w) uncertainty of each cell as a keypoint; meaningless where ``local`` is zero."""
     corner: Floats
+    """(2,) x and y of the lower corner of cell (0, 0), metres, map frame."""
 
 
 class FeatureMap:
@@ -58,11 +55,12 @@ class FeatureMap:
 
     Attributes:
         weights: :func:`weights_sha256` of the networks that made them.
+        index: look-up of the tiles.
         place: (K, P) int8 global descriptors times 127.
-        place_at: (K, 2) float32 where they were made, metres, map frame.
+        place_at: (K, 2) float32 centres of their surroundings, metres, map frame.
 
     Raises:
-        MapError: some of the arrays are missing or do not fit together.
+        MapError: arrays are missing or do not fit together.
     """
 
     def __init__(self, arrays: dict[str, npt.NDArray[Any]], parameters: dict[str, Any]) -> None:
@@ -93,7 +91,7 @@ class FeatureMap:
 
     @cached_property
     def area(self) -> float:
-        """Square metres that have features; reads all of them once."""
+        """Square metres with features; reads all of them once."""
         return float(sum(int(tile.any(axis=-1).sum()) for tile in self._local) * LOCAL_CELL**2)
 
     @property
@@ -103,7 +101,7 @@ class FeatureMap:
 
     @property
     def box_area(self) -> float:
-        """Square metres of the rectangle around all tiles, which coarse features fill."""
+        """Square metres of the rectangle around all tiles, the size of :meth:`coarse`."""
         return self.index.columns * self.index.rows * (TILE * LOCAL_CELL) ** 2
 
     @property
@@ -112,9 +110,10 @@ class FeatureMap:
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
 
     def patch(self, centre: Reals, reach: float) -> Patch:
-        """Return all within ``reach`` metres of ``centre`` (x and y, map frame), rounded outwards to whole cells."""
-        low = np.floor((np.asarray(centre, dtype=np.float64)[:2] - reach) / LOCAL_CELL).astype(np.int64)
-        high = np.ceil((np.asarray(centre, dtype=np.float64)[:2] + reach) / LOCAL_CELL).astype(np.int64)
+        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), out to whole cells."""
+        middle = np.asarray(centre, dtype=np.float64)[:2]
+        low = np.floor((middle - reach) / LOCAL_CELL).astype(np.int64)
+        high = np.ceil((middle + reach) / LOCAL_CELL).astype(np.int64)
         width, height = (int(n) for n in high - low)
         local = np.zeros((height, width, self.dimensions), dtype=np.int8)
         sigma = np.full((height, width), 255, dtype=np.uint8)
@@ -124,7 +123,7 @@ class FeatureMap:
         return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
     def sample(self, tiles: int) -> Floats32:
-        """Return the features (C, N) of all cells that have any, of that many tiles or fewer, spread evenly."""
+        """Return the features (C, N) of the cells of at most so many tiles, evenly spread."""
         chosen = self._local[:: -(-len(self._local) // tiles) or 1]
         cells = np.asarray(chosen).reshape(-1, self.dimensions)
         return np.ascontiguousarray(dequantized(cells[cells.any(axis=1)]).T)
@@ -132,7 +131,7 @@ class FeatureMap:
     def coarse(self, cell: float = 2.0, axes: Floats32 | None = None) -> tuple[Floats32, Floats]:
         """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
 
-        Cells without features count as zero. With ``axes`` (D, C) their components along these are returned: (D, H, W).
+        Cells without features count as zero. ``axes`` (D, C) projects the means: (D, H, W).
         """
         ratio, side = round(cell / LOCAL_CELL), round(TILE * LOCAL_CELL / cell)
         dimensions = self.dimensions if axes is None else len(axes)
@@ -145,10 +144,10 @@ class FeatureMap:
         return whole, np.asarray(self.index.low * (TILE * LOCAL_CELL), dtype=np.float64)
 
     def check(self) -> None:
-        """Refuse to compare these features with those of another network.
+        """Check that the installed networks can be compared with these features.
 
         Raises:
-            MapError: they were made by other weights than the installed ones, or of images of another version.
+            MapError: other weights, or images of another version, have made them.
             InputError: there are no weights.
         """
         for view in VIEW_NAMES:
@@ -162,7 +161,7 @@ class FeatureMap:
 
 
 def means(tile: Int8s, ratio: int) -> Floats32:
-    """Average stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells: (C, h, w)."""
+    """Average stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells, (C, h, w)."""
     height, width, dimensions = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
     blocks = tile.reshape(height, ratio, width, ratio, dimensions).astype(np.float32)
     return np.ascontiguousarray(blocks.mean(axis=(1, 3)).transpose(2, 0, 1) * np.float32(1.0 / 127.0))
@@ -179,7 +178,7 @@ def weights_sha256() -> str:
 
 
 def quantized(vectors: Floats32) -> Int8s:
-    """Store numbers of magnitude 1 at most (any shape) as bytes; off by 0.004 each."""
+    """Store numbers of magnitude 1 at most (any shape) as bytes, with an error of 0.004."""
     return np.asarray(np.rint(vectors * np.float32(_SCALE)), dtype=np.int8)
 
 
@@ -189,7 +188,7 @@ def dequantized(vectors: Int8s) -> Floats32:
 
 
 def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
-    """Store positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
+    """Store positive sigmas (any shape) as bytes on a logarithmic scale, with 1.5 % of error from 0.02 to 50."""
     steps = np.log(np.clip(sigma, _MIN_SIGMA, _MAX_SIGMA) / _MIN_SIGMA) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
@@ -200,7 +199,7 @@ def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> Floats32:
 
 
 class TileIndex:
-    """Look-up of tiles by their place; made of (T, 2) tile numbers, column (x) and row (y)."""
+    """Look-up of tiles by position; made from (T, 2) tile numbers, column (x) and row (y)."""
 
     def __init__(self, tiles: npt.NDArray[np.int32]) -> None:
         self.tiles = np.array(tiles, dtype=np.int64).reshape(-1, 2)
@@ -211,7 +210,7 @@ class TileIndex:
         self._number[tuple((self.tiles - self.low).T[::-1])] = np.arange(len(self.tiles))
 
     def gather(self, values: npt.NDArray[Any], corner: Ints, out: npt.NDArray[Any]) -> None:
-        """Copy ``values`` (T, 32, 32, ...) from cell ``corner`` (x, y) on into ``out`` (h, w, ...)."""
+        """Copy ``values`` (T, 32, 32, ...) from cell ``corner`` (x, y) into ``out`` (h, w, ...)."""
         height, width = out.shape[:2]
         first = np.floor_divide(corner, TILE) - self.low
         last = np.floor_divide(corner + np.array([width - 1, height - 1]), TILE) - self.low
@@ -220,25 +219,25 @@ class TileIndex:
                 number = self._number[row, column]
                 if number >= 0:
                     x, y = (np.array([column, row]) + self.low) * TILE - corner
-                    to_x, of_x = _overlap(int(x), width)
-                    to_y, of_y = _overlap(int(y), height)
+                    to_x, of_x = _overlap(int(x), TILE, width)
+                    to_y, of_y = _overlap(int(y), TILE, height)
                     out[to_y, to_x] = values[number, of_y, of_x]
 
 
-def _overlap(begin: int, size: int) -> tuple[slice, slice]:
-    """Return slices of an axis of ``size`` cells and of a tile that begins at its cell ``begin``: their overlap."""
-    low, high = max(0, begin), min(size, begin + TILE)
-    return slice(low, high), slice(low - begin, high - begin)
+def _overlap(begin: int, length: int, size: int) -> tuple[slice, slice]:
+    """Return slices of an axis of ``size`` cells, and of a part of ``length`` cells from ``begin``: their overlap."""
+    low, high = max(0, begin), max(0, min(size, begin + length))
+    return slice(low, max(low, high)), slice(low - begin, max(low, high) - begin)
 
 
 WINDOW = 256
-"""Metres along the edge of a window, drawn and encoded at a time; a multiple of a tile's edge."""
+"""Metres along the edge of a window, which is drawn and encoded at once; a multiple of a tile's edge."""
 
-_DRAW_MARGIN = 48  # metres around a window whose points determine its ground
-_NET_MARGIN = 64  # metres around a window that the network sees: 30 m for its layers, 28 for GeM's disk
-_KNOWN_RADIUS = 4  # metres from the nearest point within which the map is known, to bridge shadows
+_DRAW_MARGIN = 48  # metres around a window: points in it determine the window's ground
+_NET_MARGIN = 64  # metres around a window, the network's reach: 30 m for its layers, 28 for GeM's disk
+_KNOWN_RADIUS = 4  # metres around a point within which the map has features, to bridge shadows
 _CELLS = round(1 / CELL)  # image cells a metre
-_PER_PLACE = 2  # cells of the network's global descriptors along the edge of a stored one's
+_PER_PLACE = 2  # of the network's place cells along the edge of a stored one
 
 Windows = dict[tuple[int, int], Image]
 
@@ -246,12 +245,12 @@ Windows = dict[tuple[int, int], Image]
 def feature_arrays(
     points: Points, progress: Callable[[int, int], None] | None = None, window: int = WINDOW
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Return the arrays ``learned.*`` of a map, and the parameters that name the weights and the cell.
+    """Return the arrays ``learned.*`` of a map, and the parameters ``weights`` and ``cell``.
 
     Args:
         points: (N, 3) the map's cloud, metres, z up, relative to the map's origin.
-        progress: called with windows done and all windows.
-        window: metres at a time, a multiple of 32.
+        progress: called with (windows done, windows).
+        window: metres, a multiple of 32.
 
     Raises:
         DependencyError: no onnxruntime. InputError: no weights.
@@ -273,7 +272,7 @@ def feature_arrays(
 
 
 def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt.NDArray[Any]]:
-    """Return the features of one square of a map, by the names of :class:`FeatureMap` without ``learned.``.
+    """Return the arrays of :func:`feature_arrays` for one square of a map, without ``learned.`` in their names.
 
     Args:
         points: (N, 3) of the square and 112 m around it, metres, relative to the map's origin.
@@ -292,7 +291,7 @@ def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt
 
 
 def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:
-    """Draw bird's-eye views of the windows that have points, by column and row."""
+    """Draw bird's-eye views of the windows with points, by column and row."""
     columns, rows = (-(-(high - low) // window)).tolist()
     views: Windows = {}
     for row in range(rows):
@@ -316,28 +315,23 @@ def _within(values: Floats32, begin: np.int64, size: int, margin: int = 0) -> Bo
 
 
 def _with_margin(views: Windows, column: int, row: int, width: int, height: int, window: int) -> Image:
-    """Return a window's view with :data:`_NET_MARGIN` metres of its neighbours' on every side."""
+    """Return a window's view with a margin of :data:`_NET_MARGIN` metres from its neighbours' views."""
     image = np.zeros((LAYERS, (height + 2 * _NET_MARGIN) * _CELLS, (width + 2 * _NET_MARGIN) * _CELLS), dtype=np.uint8)
-    image[-1] = 128  # nothing is known of the ground there
+    image[-1] = 128  # the relief is unknown
     reach = -(-_NET_MARGIN // window)
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
             other = views.get((column + i, row + j))
             if other is not None:
                 x, y = ((k * window + _NET_MARGIN) * _CELLS for k in (i, j))
-                to_x, of_x = _clipped(x, other.shape[2], image.shape[2])
-                to_y, of_y = _clipped(y, other.shape[1], image.shape[1])
+                to_x, of_x = _overlap(x, other.shape[2], image.shape[2])
+                to_y, of_y = _overlap(y, other.shape[1], image.shape[1])
                 image[:, to_y, to_x] = other[:, of_y, of_x]
     return image
 
 
-def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
-    low, high = max(0, begin), max(0, min(size, begin + length))
-    return slice(low, max(low, high)), slice(low - begin, max(low, high) - begin)
-
-
 def _stored(features: Features, image: Image, corner: Ints, shape: tuple[int, int]) -> dict[str, npt.NDArray[Any]]:
-    """Quantize the features without their margin, of the tiles that have points."""
+    """Quantize the features of tiles with points, without the margin."""
     height, width = shape
     mapped = _known(image)
     core = (slice(_NET_MARGIN, _NET_MARGIN + height), slice(_NET_MARGIN, _NET_MARGIN + width))
@@ -357,7 +351,7 @@ def _stored(features: Features, image: Image, corner: Ints, shape: tuple[int, in
 
 
 def _known(image: Image) -> Bools:
-    """Mask the 1 m cells (H, W) of an image that are near points."""
+    """Mask the 1 m cells (H, W) of an image within ``_KNOWN_RADIUS`` of a point."""
     filled = image[:-1].any(axis=0)
     rows, columns = (n // _CELLS for n in filled.shape)
     coarse = filled.reshape(rows, _CELLS, columns, _CELLS).any(axis=(1, 3))
@@ -376,13 +370,12 @@ def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _places(place: Floats32, mapped: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
-    """Pool global descriptors (K, P) over squares of 8 m, as a query does its four middle cells; also their middles."""
+    """Pool global descriptors (K, P) over squares of 8 m, as a query pools its middle cells; also their middles."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)
     inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]
     mean = inner.reshape(len(place), height, _PER_PLACE, width, _PER_PLACE).mean(axis=(2, 4))
     mean /= np.linalg.norm(mean, axis=0) + np.float32(1e-9)
-    wanted = mapped.reshape(height, side, width, side).any(axis=(1, 3))
-    row, column = np.nonzero(wanted)
+    row, column = np.nonzero(mapped.reshape(height, side, width, side).any(axis=(1, 3)))
     at = np.asarray((np.column_stack([column, row]) + 0.5) * side, dtype=np.float64)
     return quantized(mean[:, row, column].T), at

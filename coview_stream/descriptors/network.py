@@ -25,10 +25,10 @@ OUTPUTS = ("local", "sigma", "place")
 """A network's outputs, in this order."""
 
 CARD = "card.json"
-"""Name of the file beside the weights that records how they were made."""
+"""File beside the weights with their training and hashes."""
 
 ORIGIN = "of"
-"""Name under which quantised weights keep the sha256 of those that they were made of."""
+"""Metadata of quantised weights: the sha256 of the weights that were quantised."""
 
 LOCAL_CELL = 1.0
 """Edge of a cell of local descriptors, metres."""
@@ -43,32 +43,40 @@ _REMEDY = "install the package again, or name your own weights' folder in COVIEW
 
 @dataclass(frozen=True)
 class Features:
-    """A network's outputs for an image; all three begin at its corner.
-
-    Attributes:
-        local: (C, H / 2, W / 2) float32 of unit norm, independent of heading; cells of 1 m, row along y.
-        sigma: (H / 2, W / 2) float32, uncertainty of each cell as a keypoint, > 0.
-        place: (P, H / 8, W / 8) float32 of unit norm: global descriptor of the surroundings of each 4 m cell.
-    """
+    """A network's outputs for an image (LAYERS, H, W); all three begin at its corner."""
 
     local: Floats32
+    """(C, H / 2, W / 2) of unit norm, independent of heading; cells of 1 m, row along y."""
     sigma: Floats32
+    """(H / 2, W / 2) uncertainty of each cell as a keypoint, > 0."""
     place: Floats32
+    """(P, H / 8, W / 8) of unit norm: global descriptors of the surroundings of 4 m cells."""
 
 
 class Network:
-    """Encoder of one view; quantised weights beside its own are taken if they were made of these (``exact``: never).
+    """Encoder of one view, with quantised weights if the directory has some of the same training.
+
+    Args:
+        view: the view.
+        directory: of the weights; None takes :func:`weights_directory`.
+        threads: of onnxruntime.
+        exact: never take quantised weights.
 
     Attributes:
-        quantized: whether they were.
+        quantized: whether the weights are quantised.
 
     Raises:
-        InputError: there are no weights in the directory, they are not of this version, or of the other view.
+        InputError: there are no weights in the directory, or they are of another version or another file.
         DependencyError: onnxruntime is not installed, or cannot be loaded.
     """
 
     def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1, *, exact: bool = False) -> None:
-        runtime = _runtime()
+        runtime = require_library("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
+        if not hasattr(runtime, "InferenceSession"):  # an uninstallation may leave an empty folder behind
+            raise DependencyError(
+                "learned re-localization: onnxruntime is not complete; "
+                "pip install --force-reinstall 'onnxruntime>=1.18'"
+            )
         path = weights_file(view, directory)
         _check_hash(path)
         options = runtime.SessionOptions()
@@ -85,11 +93,7 @@ class Network:
             self._session = _session(runtime, path, options)
 
     def __call__(self, image: Image) -> Features:
-        """Encode an image (LAYERS, H, W); H and W are multiples of 8 cells, i.e. 4 m.
-
-        Raises:
-            ValueError: the image has another shape.
-        """
+        """Encode an image (LAYERS, H, W); ValueError unless H and W are multiples of 8 cells, i.e. 4 m."""
         if image.ndim != 3 or image.shape[0] != LAYERS or image.shape[1] % _MULTIPLE or image.shape[2] % _MULTIPLE:
             raise ValueError(f"image {image.shape}: ({LAYERS}, H, W) with H and W multiples of {_MULTIPLE} needed")
         scaled = image[None].astype(np.float32) / np.float32(255.0)
@@ -99,7 +103,7 @@ class Network:
 
 @lru_cache(maxsize=4)
 def network(view: ViewName, threads: int | None = None) -> Network:
-    """Return the encoder of a view, loaded once; without ``threads`` it has as many as the kernels have.
+    """Return the encoder of a view, loaded once, by default with the kernels' number of threads.
 
     Raises:
         InputError, DependencyError: as :class:`Network`. ConfigError: COVIEW_THREADS is no number.
@@ -113,13 +117,13 @@ def network(view: ViewName, threads: int | None = None) -> Network:
 
 
 def weights_directory() -> Path:
-    """Return the directory of the weights: ``COVIEW_WEIGHTS`` if that is set, else the package's."""
+    """Return the directory of the weights: ``COVIEW_WEIGHTS`` if set, else the package's."""
     folder = os.environ.get("COVIEW_WEIGHTS")
     return Path(folder) if folder else Path(__file__).parent / "weights"
 
 
 def weights_file(view: ViewName, directory: Path | None = None) -> Path:
-    """Return where a view's weights are; raises :class:`InputError` if there are none."""
+    """Return the path of a view's weights; InputError if there are none."""
     path = (directory or weights_directory()) / weights_name(view)
     if not path.is_file():
         raise InputError(f"{path}: no weights of the {view} network; {_REMEDY}")
@@ -141,17 +145,8 @@ def file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _runtime() -> Any:
-    runtime = require_library("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
-    if not hasattr(runtime, "InferenceSession"):  # an uninstallation may leave an empty folder behind
-        raise DependencyError(
-            "learned re-localization: onnxruntime is not complete; pip install --force-reinstall 'onnxruntime>=1.18'"
-        )
-    return runtime
-
-
 def _session(runtime: Any, path: Path, options: Any) -> Any:
-    """Load weights, and check that they are of an encoder of this version."""
+    """Load weights; InputError unless they are of an encoder of this version."""
     try:
         session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         (image,) = session.get_inputs()
@@ -165,7 +160,7 @@ def _session(runtime: Any, path: Path, options: Any) -> Any:
 
 
 def _check_hash(path: Path) -> None:
-    """Refuse weights with another hash than the card beside them names, if it names one."""
+    """Refuse weights whose hash differs from the card's, if there is one."""
     try:
         expected = json.loads((path.parent / CARD).read_text())["sha256"][path.name]
     except (OSError, ValueError, KeyError, TypeError):
