@@ -82,7 +82,7 @@ def assert_same(ours, plain, pivot):
 def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every, scattered):
     rng = np.random.default_rng(seed)
     points, normals = room(rng, 0.01)
-    if scattered:  # what lengths say; on a lattice, whose nearest points are up to 0.2 m off
+    if scattered:  # planarity; registration may end a step of the lattice, 0.3 m, off
         normals *= rng.choice([1.0, 0.6, 0.1, 0.0], (len(points), 1)).astype(np.float32)
     truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
     local, above, pivot = scan_of(points, rng, truth, outliers, 0.02)
@@ -94,7 +94,7 @@ def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every, scat
         scales = tuple(scale._replace(every=n) for scale, n in zip(SCALES, every, strict=True))
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior, scales)
     assert_same(ours, plain, pivot)
-    assert np.linalg.norm((ours.T_map_source - truth) @ np.append(pivot, 1.0)) < (0.2 if scattered else 0.1)
+    assert np.linalg.norm((ours.T_map_source - truth) @ np.append(pivot, 1.0)) < (0.4 if scattered else 0.1)
 
 
 def test_scatter_tells_of_all_directions_whatever_its_normals():
