@@ -37,39 +37,23 @@ _MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wr
 
 @dataclass(frozen=True)
 class CapturedMessage:
-    """Description of one message.
+    """Description of one message."""
 
-    Attributes:
-        arrived: local time, seconds.
-        key: key expression of the sample.
-        encoding: named by the sample; empty without one.
-        size: bytes.
-        codec: codec that read it; empty if none could.
-        counter: name of the node's counter for a message that cannot be read.
-        reason: why it cannot be read.
-        readable_as: another codec that could read it.
-        stamp_ns: sensor time, None if it cannot be read.
-        points: number of finite points.
-        distance: median distance of the points, metres, NaN without points.
-        sweep: seconds after the stamp of the first and the last point, None without a time per point.
-        T_odom_body: (4, 4) odometry, None for clouds.
-        cloud: (N, 3) float32 sample of the finite points; None past the first clouds.
-    """
-
-    arrived: float
-    key: str
-    encoding: str
-    size: int
-    codec: str = ""
-    counter: str = ""
-    reason: str = ""
-    readable_as: str = ""
-    stamp_ns: int | None = None
-    points: int = 0
-    distance: float = float("nan")
+    arrived: float  # local time, seconds
+    key: str  # key expression of the sample
+    encoding: str  # named by the sample; empty without one
+    size: int  # bytes
+    codec: str = ""  # codec that read it; empty if none could
+    counter: str = ""  # name of the node's counter for a message that cannot be read
+    reason: str = ""  # why it cannot be read
+    readable_as: str = ""  # another codec that could read it
+    stamp_ns: int | None = None  # sensor time, None if it cannot be read
+    points: int = 0  # number of finite points
+    distance: float = float("nan")  # median distance of the points, metres, NaN without points
+    # seconds after the stamp of the first and the last point, None without a time per point
     sweep: tuple[float, float] | None = None
-    T_odom_body: Pose | None = None
-    cloud: Points | None = None
+    T_odom_body: Pose | None = None  # (4, 4) odometry, None for clouds
+    cloud: Points | None = None  # (N, 3) float32 sample of the finite points; None past the first clouds
 
 
 @dataclass

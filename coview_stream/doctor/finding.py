@@ -13,21 +13,13 @@ Verdict = Literal["ok", "warn", "FAIL"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check.
+    """Result of one check."""
 
-    Attributes:
-        verdict: ``ok``; ``warn``: it works, with limits; ``FAIL``: it will not work.
-        what: name of the check.
-        found: its result.
-        remedy: action to take; may be empty.
-        robot: name of the robot; None for all.
-    """
-
-    verdict: Verdict
-    what: str
-    found: str
-    remedy: str = ""
-    robot: str | None = None
+    verdict: Verdict  # ok; warn: it works, with limits; FAIL: it will not work
+    what: str  # name of the check
+    found: str  # its result
+    remedy: str = ""  # action to take; may be empty
+    robot: str | None = None  # name of the robot; None for all
 
     def line(self) -> str:
         """Return one printable line, without control characters that came from the network."""

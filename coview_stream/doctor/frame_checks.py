@@ -48,38 +48,24 @@ _FOOT = 0.3048  # metres
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """Frame of a robot.
+    """Frame of a robot."""
 
-    Attributes:
-        stamp: seconds.
-        points: (N, 3) body frame, metres.
-        T_odom_body: (4, 4) odometry at its stamp.
-    """
-
-    stamp: float
-    points: Points
-    T_odom_body: Pose
+    stamp: float  # seconds
+    points: Points  # (N, 3) body frame, metres
+    T_odom_body: Pose  # (4, 4) odometry at its stamp
 
 
 @dataclass(frozen=True)
 class _Ground:
-    """Ground below the lidar, over several frames.
+    """Ground below the lidar, over several frames."""
 
-    Attributes:
-        axis: index into :data:`_AXES` of the cloud's axis that points up; 0 is z.
-        up: (3,) mean normal in the cloud's axes.
-        up_level: (3,) mean normal after odometry has levelled the cloud: (0, 0, 1) without a lean.
-        sway: median angle of the frames' normals from their mean, radians, the smaller of the robot's and odometry's.
-        height: of the sensor above it, metres, median.
-        lean: angle between the ground's normal and odometry's vertical, radians.
-    """
-
-    axis: int
-    up: Floats
-    up_level: Floats
+    axis: int  # index into S of the cloud's axis that points up; 0 is z
+    up: Floats  # (3,) mean normal in the cloud's axes
+    up_level: Floats  # (3,) mean normal after odometry has levelled the cloud: (0, 0, 1) without a lean
+    # median angle of the frames' normals from their mean, radians, the smaller of the robot's and odometry's
     sway: float
-    height: float
-    lean: float
+    height: float  # of the sensor above it, metres, median
+    lean: float  # angle between the ground's normal and odometry's vertical, radians
 
 
 @dataclass(frozen=True)
@@ -94,23 +80,14 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Odometry against the lidar's motion, medians over pairs.
+    """Odometry against the lidar's motion, medians over pairs."""
 
-    Attributes:
-        odds: log odds that odometry follows the lidar, over all pairs.
-        misfit: metres, a radian counting as five.
-        yaw: angle from odometry's motion to the lidar's, radians: the heading of the lidar on the body.
-        spread: deviation from it.
-        scale: the lidar's distance over odometry's.
-        pairs: number of pairs that moved.
-    """
-
-    odds: float
-    misfit: float
-    yaw: float
-    spread: float
-    scale: float
-    pairs: int
+    odds: float  # log odds that odometry follows the lidar, over all pairs
+    misfit: float  # metres, a radian counting as five
+    yaw: float  # angle from odometry's motion to the lidar's, radians: the heading of the lidar on the body
+    spread: float  # deviation from it
+    scale: float  # the lidar's distance over odometry's
+    pairs: int  # number of pairs that moved
 
     @property
     def surely(self) -> str:

@@ -43,17 +43,11 @@ _MAX_CANDIDATES = 200  # a large site has more than anyone reads
 
 @dataclass(frozen=True, order=True)
 class Candidate:
-    """Clouds or odometry on the network.
+    """Clouds or odometry on the network."""
 
-    Attributes:
-        channel: ``cloud`` or ``odometry``.
-        where: key or topic.
-        options: options of ``serve`` and ``doctor`` that subscribe to it.
-    """
-
-    channel: str
-    where: str
-    options: str
+    channel: str  # cloud or odometry
+    where: str  # key or topic
+    options: str  # options of serve and doctor that subscribe to it
 
 
 def discover(transport: Transport, wait: Callable[[float], object] = time.sleep) -> list[Candidate]:

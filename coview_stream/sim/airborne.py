@@ -35,21 +35,13 @@ _FOOTPRINT = 6e-4  # radians, one sigma of the pointing
 
 @dataclass(frozen=True)
 class Flight:
-    """Flight over the scene.
+    """Flight over the scene."""
 
-    Attributes:
-        altitude: metres above the scene's zero.
-        swath: half of the opening angle across the flight direction, radians.
-        noise: of the range, metres, one sigma.
-        porosity: probability that a pulse passes one surface of foliage.
-        margin: metres beyond the map within which pulses aimed at the scene's zero are cast.
-    """
-
-    altitude: float = ALTITUDE
-    swath: float = SWATH
-    noise: float = RANGE_NOISE
-    porosity: float = POROSITY
-    margin: float = 15.0
+    altitude: float = ALTITUDE  # metres above the scene's zero
+    swath: float = SWATH  # half of the opening angle across the flight direction, radians
+    noise: float = RANGE_NOISE  # of the range, metres, one sigma
+    porosity: float = POROSITY  # probability that a pulse passes one surface of foliage
+    margin: float = 15.0  # metres beyond the map within which pulses aimed at the scene's zero are cast
 
 
 _DEFAULT_FLIGHT = Flight()
@@ -131,26 +123,17 @@ _OPAQUE = 3.0  # width of a cell that a surface fills, in typical distances betw
 class Survey:
     """Flight over a ground survey.
 
-    Attributes:
-        density: returns of first surfaces per square metre, where the ground survey has as many.
-        swath: half of the opening angle across the flight direction, degrees.
-        altitude: metres above the highest point.
-        noise: of the range, metres, one sigma.
-        porosity: probability that a pulse passes a layer of foliage.
-        misaligned: shift of each strip, metres, one sigma per axis.
-        seed: of flight directions, pulses and noise.
-
     Raises:
         ConfigError: a value out of its range.
     """
 
-    density: float = 8.0
-    swath: float = float(np.degrees(SWATH))
-    altitude: float = ALTITUDE
-    noise: float = RANGE_NOISE
-    porosity: float = POROSITY
-    misaligned: float = 0.0
-    seed: int = 1
+    density: float = 8.0  # returns of first surfaces per square metre, where the ground survey has as many
+    swath: float = float(np.degrees(SWATH))  # half of the opening angle across the flight direction, degrees
+    altitude: float = ALTITUDE  # metres above the highest point
+    noise: float = RANGE_NOISE  # of the range, metres, one sigma
+    porosity: float = POROSITY  # probability that a pulse passes a layer of foliage
+    misaligned: float = 0.0  # shift of each strip, metres, one sigma per axis
+    seed: int = 1  # of flight directions, pulses and noise
 
     def __post_init__(self) -> None:
         within(
@@ -170,17 +153,11 @@ _DEFAULT = Survey()
 
 @dataclass(frozen=True)
 class Surface:
-    """How the surface lies at each point of a cloud.
+    """How the surface lies at each point of a cloud."""
 
-    Attributes:
-        foliage: (N,) whether the neighbours are scattered and lie on no surface.
-        wall: (N,) whether it is a wall below its top edge.
-        spacing: typical distance to the nearest neighbour, metres.
-    """
-
-    foliage: Bools
-    wall: Bools
-    spacing: float
+    foliage: Bools  # (N,) whether the neighbours are scattered and lie on no surface
+    wall: Bools  # (N,) whether it is a wall below its top edge
+    spacing: float  # typical distance to the nearest neighbour, metres
 
 
 def airborne_survey(points: Reals, survey: Survey = _DEFAULT) -> Floats:

@@ -18,61 +18,34 @@ Range = tuple[float, float]
 
 
 class Plot(NamedTuple):
-    """One type of building.
+    """One type of building."""
 
-    Attributes:
-        draw: function that draws one.
-        weight: how often it is chosen, relative to the others.
-        frontage: range of its length along the street, metres.
-        depth: range of its depth, metres.
-    """
-
-    draw: buildings.Draw
-    weight: float
-    frontage: Range
-    depth: Range
+    draw: buildings.Draw  # function that draws one
+    weight: float  # how often it is chosen, relative to the others
+    frontage: Range  # range of its length along the street, metres
+    depth: Range  # range of its depth, metres
 
 
 class Kind(NamedTuple):
-    """Contents of a scene; lengths in metres, densities per square metre.
+    """Contents of a scene; lengths in metres, densities per square metre."""
 
-    Attributes:
-        streets: (rng, size, half) -> layout.
-        relief: amplitude of the hills.
-        roughness: amplitude of the ground off the road.
-        ditch: depth of the ditches along the roads.
-        plots: buildings along the streets.
-        setback: range of the distance from the footway to a building.
-        gap: range of the distance between neighbours.
-        vacant: share of the plots that stay empty.
-        infill: density of buildings away from streets.
-        trees: density.
-        species: their sizes and shapes.
-        undergrowth: density of bushes.
-        rocks: density of boulders.
-        logs: density of fallen trunks.
-        cars: share of the parking places that are taken.
-        pole_spacing: mean distance between poles on one side of a street; 0 for none.
-        hedges: share of the plots with a hedge or fence in front.
-    """
-
-    streets: Callable[[np.random.Generator, float, float], Layout]
-    relief: float
-    roughness: float
-    ditch: float
-    plots: tuple[Plot, ...]
-    setback: Range
-    gap: Range
-    vacant: float
-    infill: float
-    trees: float
-    species: TreeMix
-    undergrowth: float = 0.0
-    rocks: float = 0.0
-    logs: float = 0.0
-    cars: float = 0.0
-    pole_spacing: float = 0.0
-    hedges: float = 0.0
+    streets: Callable[[np.random.Generator, float, float], Layout]  # (rng, size, half) -> layout
+    relief: float  # amplitude of the hills
+    roughness: float  # amplitude of the ground off the road
+    ditch: float  # depth of the ditches along the roads
+    plots: tuple[Plot, ...]  # buildings along the streets
+    setback: Range  # range of the distance from the footway to a building
+    gap: Range  # range of the distance between neighbours
+    vacant: float  # share of the plots that stay empty
+    infill: float  # density of buildings away from streets
+    trees: float  # density
+    species: TreeMix  # their sizes and shapes
+    undergrowth: float = 0.0  # density of bushes
+    rocks: float = 0.0  # density of boulders
+    logs: float = 0.0  # density of fallen trunks
+    cars: float = 0.0  # share of the parking places that are taken
+    pole_spacing: float = 0.0  # mean distance between poles on one side of a street; 0 for none
+    hedges: float = 0.0  # share of the plots with a hedge or fence in front
 
 
 _HOUSE = Plot(buildings.house, 1.0, (8.0, 15.0), (8.0, 13.0))

@@ -19,17 +19,11 @@ _CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole
 
 @dataclass(frozen=True)
 class Layout:
-    """Streets of a scene.
+    """Streets of a scene."""
 
-    Attributes:
-        route: (N, 2) closed loop, metres, points ``_LOOP_STEP`` apart; it is one of the streets.
-        streets: (K_i, 2) centre lines, metres, points a metre apart.
-        half_width: metres from the centre line to the edge of the carriageway.
-    """
-
-    route: Floats
-    streets: tuple[Floats, ...]
-    half_width: float
+    route: Floats  # (N, 2) closed loop, metres, points _LOOP_STEP apart; it is one of the streets
+    streets: tuple[Floats, ...]  # (K_i, 2) centre lines, metres, points a metre apart
+    half_width: float  # metres from the centre line to the edge of the carriageway
 
 
 def resample(points: Floats, step: float) -> Floats:

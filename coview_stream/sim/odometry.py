@@ -28,22 +28,17 @@ _WHEELBASE = 1.0  # metres over which the ground tilts the robot
 class OdometryConfig:
     """Errors of the odometry.
 
-    Attributes:
-        yaw_walk: random walk of the heading, radians per square root of a metre driven, one sigma.
-        scale_error: constant error of the scale over the run, one sigma.
-        position_walk: random walk of the position, metres per square root of a metre, one sigma.
-        tilt_noise: error of roll and pitch, radians, one sigma, independent from frame to frame.
-        offset: the odometry starts within +- this of its origin, metres (a tenth of it in z).
-
     Raises:
         ConfigError: a negative value, or one too large for odometry.
     """
 
+    # random walk of the heading, radians per square root of a metre driven, one sigma
     yaw_walk: float = float(np.radians(0.15))
-    scale_error: float = 0.008
-    position_walk: float = 0.004
+    scale_error: float = 0.008  # constant error of the scale over the run, one sigma
+    position_walk: float = 0.004  # random walk of the position, metres per square root of a metre, one sigma
+    # error of roll and pitch, radians, one sigma, independent from frame to frame
     tilt_noise: float = float(np.radians(0.05))
-    offset: float = 400.0
+    offset: float = 400.0  # the odometry starts within +- this of its origin, metres (a tenth of it in z)
 
     def __post_init__(self) -> None:
         within(self, **{field.name: (0.0, 1e5 if field.name == "offset" else 1.0) for field in fields(self)})

@@ -29,25 +29,15 @@ _GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
 
 @dataclass(frozen=True)
 class Footprint:
-    """Footprint of a building, scene frame, metres.
+    """Footprint of a building, scene frame, metres."""
 
-    Attributes:
-        x: centre.
-        y: centre.
-        w: frontage.
-        d: depth.
-        yaw: heading, radians.
-        ground: height of the ground.
-        top: height of the ridge.
-    """
-
-    x: float
-    y: float
-    w: float
-    d: float
-    yaw: float
-    ground: float
-    top: float
+    x: float  # centre
+    y: float  # centre
+    w: float  # frontage
+    d: float  # depth
+    yaw: float  # heading, radians
+    ground: float  # height of the ground
+    top: float  # height of the ridge
 
 
 @dataclass(frozen=True)
@@ -60,25 +50,15 @@ class SceneState:
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of a scene at one time.
+    """Parts of a scene at one time."""
 
-    Attributes:
-        ground: the bare ground.
-        built: buildings, and the hedges, walls and fences between them.
-        fixed: boulders and fallen trunks.
-        bushes: leafy undergrowth.
-        trees: rows of ``vegetation.TREE_COLUMNS``.
-        cars: rows of parked vehicles, as ``furniture.cars`` takes them.
-        poles: rows of poles, as ``furniture.poles`` takes them.
-    """
-
-    ground: Mesh
-    built: tuple[Mesh, ...]
-    fixed: tuple[Mesh, ...]
-    bushes: tuple[Mesh, ...]
-    trees: Floats
-    cars: Floats
-    poles: Floats
+    ground: Mesh  # the bare ground
+    built: tuple[Mesh, ...]  # buildings, and the hedges, walls and fences between them
+    fixed: tuple[Mesh, ...]  # boulders and fallen trunks
+    bushes: tuple[Mesh, ...]  # leafy undergrowth
+    trees: Floats  # rows of vegetation.TREE_COLUMNS
+    cars: Floats  # rows of parked vehicles, as furniture.cars takes them
+    poles: Floats  # rows of poles, as furniture.poles takes them
 
     def state(self, site: Site) -> SceneState:
         """Join the solid parts, and the leafy ones."""
@@ -90,29 +70,18 @@ class Parts:
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene in both states.
+    """Scene in both states."""
 
-    Attributes:
-        kind: one of ``KINDS``.
-        size: side of the square that the map covers, metres.
-        mapped: the scene as the aircraft saw it.
-        now: the scene as the robot sees it.
-        site: ground and roads.
-        route: (N, 2) closed loop that robots drive on, metres.
-        footprints: of the buildings.
-        parts: its parts when the map was made and now; None for a scene not drawn by :func:`build_scene`.
-        houses: for each footprint the index of its building among ``Parts.built``.
-    """
-
-    kind: str
-    size: float
-    mapped: SceneState
-    now: SceneState
-    site: Site
-    route: Floats
-    footprints: tuple[Footprint, ...]
+    kind: str  # one of KINDS
+    size: float  # side of the square that the map covers, metres
+    mapped: SceneState  # the scene as the aircraft saw it
+    now: SceneState  # the scene as the robot sees it
+    site: Site  # ground and roads
+    route: Floats  # (N, 2) closed loop that robots drive on, metres
+    footprints: tuple[Footprint, ...]  # of the buildings
+    # its parts when the map was made and now; None for a scene not drawn by e
     parts: tuple[Parts, Parts] | None = None
-    houses: tuple[int, ...] = ()
+    houses: tuple[int, ...] = ()  # for each footprint the index of its building among Parts.built
 
 
 @dataclass(frozen=True)

@@ -29,19 +29,12 @@ _STEP = 2e-3  # metres beyond a leaf at which the ray goes on
 
 
 class Hits(NamedTuple):
-    """First hits of (N,) rays.
+    """First hits of (N,) rays."""
 
-    Attributes:
-        distance: (N,) metres; inf without a hit.
-        incidence: (N,) absolute cosines of the angles of incidence; 1 on foliage.
-        mesh: (N,) index of the mesh; -1 without a hit.
-        normal: (N, 3) unit normals of the surfaces, on either side.
-    """
-
-    distance: Floats32
-    incidence: Floats32
-    mesh: Indices
-    normal: Floats32
+    distance: Floats32  # (N,) metres; inf without a hit
+    incidence: Floats32  # (N,) absolute cosines of the angles of incidence; 1 on foliage
+    mesh: Indices  # (N,) index of the mesh; -1 without a hit
+    normal: Floats32  # (N, 3) unit normals of the surfaces, on either side
 
 
 class MeshCaster:
@@ -138,19 +131,12 @@ _LOST_PULSES = 0.01  # share of pulses without a return, on any surface
 
 @dataclass(frozen=True)
 class Sensor:
-    """Lidar of a robot.
+    """Lidar of a robot."""
 
-    Attributes:
-        name: as on the command line.
-        beams: frame number -> (N, 3) unit directions in the sensor frame.
-        min_range: metres; nearer returns are dropped.
-        max_range: metres, at perpendicular incidence.
-    """
-
-    name: str
-    beams: Callable[[int], Floats]
-    min_range: float
-    max_range: float
+    name: str  # as on the command line
+    beams: Callable[[int], Floats]  # frame number -> (N, 3) unit directions in the sensor frame
+    min_range: float  # metres; nearer returns are dropped
+    max_range: float  # metres, at perpendicular incidence
 
     def scan(
         self,

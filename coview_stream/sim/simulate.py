@@ -43,38 +43,23 @@ from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, MeshCaster
 class SimulationConfig:
     """Configuration of a world and a drive through it.
 
-    Attributes:
-        scene: town, campus, village, industrial or forest.
-        sensor: vlp16, os64, os64-2048 or mid360.
-        seed: of all random numbers; equal configurations give equal files.
-        size: side of the square map, metres.
-        length: distance driven, metres.
-        density: airborne pulses per square metre.
-        changed: share of the trees, cars and poles that were replaced since the map was made.
-        origin: added to all map coordinates, metres (a UTM-like offset).
-        speed: of the robot, metres per second.
-        height: of the sensor above the ground, metres.
-        odometry: errors of the odometry.
-        dirt: further imperfections; none by default.
-        drive_seed: of the drive, its scans and its odometry: another run through the same world.
-
     Raises:
         ConfigError: unknown scene or sensor, or a value out of its range.
     """
 
-    scene: str = "town"
-    sensor: str = "vlp16"
-    seed: int = 1
-    size: float = 240.0
-    length: float = 80.0
-    density: float = 20.0
-    changed: float = 0.0
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    speed: float = 1.5
-    height: float = 1.5
-    odometry: OdometryConfig = field(default_factory=OdometryConfig)
-    dirt: Dirt = field(default_factory=Dirt)
-    drive_seed: int = 0
+    scene: str = "town"  # town, campus, village, industrial or forest
+    sensor: str = "vlp16"  # vlp16, os64, os64-2048 or mid360
+    seed: int = 1  # of all random numbers; equal configurations give equal files
+    size: float = 240.0  # side of the square map, metres
+    length: float = 80.0  # distance driven, metres
+    density: float = 20.0  # airborne pulses per square metre
+    changed: float = 0.0  # share of the trees, cars and poles that were replaced since the map was made
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to all map coordinates, metres (a UTM-like offset)
+    speed: float = 1.5  # of the robot, metres per second
+    height: float = 1.5  # of the sensor above the ground, metres
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)  # errors of the odometry
+    dirt: Dirt = field(default_factory=Dirt)  # further imperfections; none by default
+    drive_seed: int = 0  # of the drive, its scans and its odometry: another run through the same world
 
     def __post_init__(self) -> None:
         for name, choices in (("scene", KINDS), ("sensor", SENSORS)):

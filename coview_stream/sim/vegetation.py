@@ -19,17 +19,11 @@ TREE_COLUMNS = ("x", "y", "height", "spread", "conifer", "lean_x", "lean_y", "se
 
 
 class TreeMix(NamedTuple):
-    """Sizes and shapes of a scene's trees.
+    """Sizes and shapes of a scene's trees."""
 
-    Attributes:
-        height: range, metres.
-        spread: range of the crown's radius, share of the height.
-        conifers: share of the trees.
-    """
-
-    height: tuple[float, float]
-    spread: tuple[float, float] = (0.16, 0.28)
-    conifers: float = 0.0
+    height: tuple[float, float]  # range, metres
+    spread: tuple[float, float] = (0.16, 0.28)  # range of the crown's radius, share of the height
+    conifers: float = 0.0  # share of the trees
 
 
 def draw_tree(rng: np.random.Generator, x: float, y: float, species: TreeMix) -> Floats:

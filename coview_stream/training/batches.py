@@ -74,19 +74,12 @@ _TRIES = 50  # middles of a piece drawn until there are enough queries near it
 
 @dataclass(frozen=True)
 class Batch:
-    """G pieces of maps of different worlds and Q queries.
+    """G pieces of maps of different worlds and Q queries."""
 
-    Attributes:
-        pieces: (G, LAYERS, PIECE, PIECE).
-        queries: (Q, LAYERS, 128, 128).
-        piece_of: (Q,) which piece a query stands in.
-        poses: (Q, 3) x, y and heading of the queries in their piece's frame, whose origin is its middle.
-    """
-
-    pieces: Image
-    queries: Image
-    piece_of: Ints
-    poses: Floats
+    pieces: Image  # (G, LAYERS, PIECE, PIECE)
+    queries: Image  # (Q, LAYERS, 128, 128)
+    piece_of: Ints  # (Q,) which piece a query stands in
+    poses: Floats  # (Q, 3) x, y and heading of the queries in their piece's frame, whose origin is its middle
 
 
 def draw_batch(

@@ -89,35 +89,21 @@ _MIN_FRAMES = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # drawn in between
 
 
 class Submap(NamedTuple):
-    """A robot's local cloud and its true pose: one query.
+    """A robot's local cloud and its true pose: one query."""
 
-    Attributes:
-        points: (N, 3) metres, odometry's axes, origin at the newest position of the sensor.
-        pose: (3,) x, y and yaw: ``p_world = R(yaw) p + (x, y)``.
-        travelled: metres driven.
-    """
-
-    points: Points
-    pose: Floats
-    travelled: float
+    points: Points  # (N, 3) metres, odometry's axes, origin at the newest position of the sensor
+    pose: Floats  # (3,) x, y and yaw: p_world = R(yaw) p + (x, y)
+    travelled: float  # metres driven
 
 
 class Frames(NamedTuple):
-    """Frames along a drive, oldest first.
+    """Frames along a drive, oldest first."""
 
-    Attributes:
-        truth: (F, 4, 4) map <- sensor.
-        odometry: (F, 4, 4) odometry <- sensor, drifting.
-        clouds: (N, 3) of each frame, the sensor's axes, metres.
-        lean: (2,) roll and pitch by which the odometry's gravity is off, radians.
-        travelled: metres driven.
-    """
-
-    truth: Floats
-    odometry: Floats
-    clouds: tuple[Points, ...]
-    lean: Floats
-    travelled: float
+    truth: Floats  # (F, 4, 4) map <- sensor
+    odometry: Floats  # (F, 4, 4) odometry <- sensor, drifting
+    clouds: tuple[Points, ...]  # (N, 3) of each frame, the sensor's axes, metres
+    lean: Floats  # (2,) roll and pitch by which the odometry's gravity is off, radians
+    travelled: float  # metres driven
 
 
 def scanned(

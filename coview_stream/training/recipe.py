@@ -21,90 +21,54 @@ class Recipe:
 
     The defaults span forests and towns as they are known, without a calibration.
 
-    Attributes:
-        built: share of worlds with buildings; the others are forests.
-        kinds: scenes of the worlds with buildings.
-        size: side of the square map, metres.
-        submaps: queries of a world, evenly of ``sensors``.
-        changed: share of trees, cars and poles that differ between map and drive, in worlds with buildings.
-        stems: trees per hectare.
-        tree_height: metres.
-        crown_width: diameter, in shares of the tree's height.
-        crown_base: height of the lowest leaves, in shares of the tree's height.
-        crown_offset: metres between a crown's middle and its stem's foot.
-        stem_radius: metres.
-        mortality: share of trees that stand, or have leaves, at one of the two times only.
-        dead: share of bare trees.
-        leaf_off: probability that one of the two times lies in winter.
-        understory: bushes and saplings per square metre.
-        slope: steepest slopes of a world, degrees.
-        roughness: of the ground, metres.
-        wind: shift of each crown between the two times, metres, 1 sigma.
-        aerial_porosity: probability that an airborne pulse passes a surface of leaves.
-        ground_porosity: probability that a robot's beam does.
-        leaf_depth: mean depth below a crown's surface at which leaves are hit, metres.
-        pulses: airborne, per square metre.
-        altitude: of the flight, metres.
-        swath: half angle of the scan, degrees.
-        strip_shift: error of a strip's horizontal position, metres, 1 sigma.
-        strip_lift: error of a strip's height, metres, 1 sigma.
-        aerial_noise: of airborne ranges, metres.
-        ground_noise: of the robot's ranges, metres.
-        sensors: names for :func:`~coview_stream.training.sensors.trained_sensor`.
-        sensor_height: metres above the ground.
-        travel: metres that the robot drives.
-        standing: share of submaps with less than 3 m.
-        frame_step: metres between the frames of a submap.
-        tilt: sway of the robot, degrees, 1 sigma.
-        gravity_error: error of its odometry's vertical, degrees, 1 sigma.
-        scale_error: drift of its odometry, a share.
-        yaw_walk: drift of its odometry, degrees per square root of a metre.
-        rays: maximum of beams cast for a submap, thinned evenly.
-        dirt: kinds of :data:`~coview_stream.training.sensors.TRAINED_DIRT` that drives have.
-
     Raises:
         ConfigError: a value out of its range, or an unknown kind or sensor.
     """
 
-    built: Annotated[float, 0.0, 1.0] = 0.25
-    kinds: tuple[str, ...] = ("town", "campus", "village", "industrial")
-    size: Annotated[Range, 80.0, 400.0] = (160.0, 200.0)
-    submaps: Annotated[int, 1, 1000] = 60
+    built: Annotated[float, 0.0, 1.0] = 0.25  # share of worlds with buildings; the others are forests
+    kinds: tuple[str, ...] = ("town", "campus", "village", "industrial")  # scenes of the worlds with buildings
+    size: Annotated[Range, 80.0, 400.0] = (160.0, 200.0)  # side of the square map, metres
+    submaps: Annotated[int, 1, 1000] = 60  # queries of a world, evenly of sensors
+    # share of trees, cars and poles that differ between map and drive, in worlds with buildings
     changed: Annotated[Range, 0.0, 0.5] = (0.0, 0.2)
-    stems: Annotated[Range, 20.0, 3000.0] = (150.0, 1200.0)
-    tree_height: Annotated[Range, 2.0, 60.0] = (4.0, 35.0)
-    crown_width: Annotated[Range, 0.03, 0.6] = (0.08, 0.5)
-    crown_base: Annotated[Range, 0.0, 0.9] = (0.1, 0.75)
-    crown_offset: Annotated[Range, 0.0, 3.0] = (0.0, 1.5)
-    stem_radius: Annotated[Range, 0.03, 1.0] = (0.05, 0.5)
+    stems: Annotated[Range, 20.0, 3000.0] = (150.0, 1200.0)  # trees per hectare
+    tree_height: Annotated[Range, 2.0, 60.0] = (4.0, 35.0)  # metres
+    crown_width: Annotated[Range, 0.03, 0.6] = (0.08, 0.5)  # diameter, in shares of the tree's height
+    crown_base: Annotated[Range, 0.0, 0.9] = (0.1, 0.75)  # height of the lowest leaves, in shares of the tree's height
+    crown_offset: Annotated[Range, 0.0, 3.0] = (0.0, 1.5)  # metres between a crown's middle and its stem's foot
+    stem_radius: Annotated[Range, 0.03, 1.0] = (0.05, 0.5)  # metres
+    # share of trees that stand, or have leaves, at one of the two times only
     mortality: Annotated[Range, 0.0, 0.5] = (0.0, 0.15)
-    dead: Annotated[Range, 0.0, 0.5] = (0.0, 0.1)
-    leaf_off: Annotated[float, 0.0, 1.0] = 0.2
-    understory: Annotated[Range, 0.0, 0.3] = (0.0, 0.1)
-    slope: Annotated[Range, 0.0, 35.0] = (0.0, 30.0)
-    roughness: Annotated[Range, 0.0, 0.5] = (0.0, 0.15)
-    wind: Annotated[Range, 0.0, 1.0] = (0.0, 0.3)
+    dead: Annotated[Range, 0.0, 0.5] = (0.0, 0.1)  # share of bare trees
+    leaf_off: Annotated[float, 0.0, 1.0] = 0.2  # probability that one of the two times lies in winter
+    understory: Annotated[Range, 0.0, 0.3] = (0.0, 0.1)  # bushes and saplings per square metre
+    slope: Annotated[Range, 0.0, 35.0] = (0.0, 30.0)  # steepest slopes of a world, degrees
+    roughness: Annotated[Range, 0.0, 0.5] = (0.0, 0.15)  # of the ground, metres
+    wind: Annotated[Range, 0.0, 1.0] = (0.0, 0.3)  # shift of each crown between the two times, metres, 1 sigma
+    # probability that an airborne pulse passes a surface of leaves
     aerial_porosity: Annotated[Range, 0.0, 0.95] = (0.2, 0.7)
-    ground_porosity: Annotated[Range, 0.0, 0.95] = (0.1, 0.6)
+    ground_porosity: Annotated[Range, 0.0, 0.95] = (0.1, 0.6)  # probability that a robot's beam does
+    # mean depth below a crown's surface at which leaves are hit, metres
     leaf_depth: Annotated[Range, 0.0, 2.0] = (0.05, 0.6)
-    pulses: Annotated[Range, 1.0, 200.0] = (5.0, 60.0)
-    altitude: Annotated[Range, 150.0, 1000.0] = (180.0, 400.0)
-    swath: Annotated[Range, 5.0, 45.0] = (12.0, 30.0)
-    strip_shift: Annotated[Range, 0.0, 1.0] = (0.0, 0.1)
-    strip_lift: Annotated[Range, 0.0, 1.0] = (0.0, 0.05)
-    aerial_noise: Annotated[Range, 0.0, 0.3] = (0.02, 0.06)
-    ground_noise: Annotated[Range, 0.0, 0.3] = (0.01, 0.04)
+    pulses: Annotated[Range, 1.0, 200.0] = (5.0, 60.0)  # airborne, per square metre
+    altitude: Annotated[Range, 150.0, 1000.0] = (180.0, 400.0)  # of the flight, metres
+    swath: Annotated[Range, 5.0, 45.0] = (12.0, 30.0)  # half angle of the scan, degrees
+    strip_shift: Annotated[Range, 0.0, 1.0] = (0.0, 0.1)  # error of a strip's horizontal position, metres, 1 sigma
+    strip_lift: Annotated[Range, 0.0, 1.0] = (0.0, 0.05)  # error of a strip's height, metres, 1 sigma
+    aerial_noise: Annotated[Range, 0.0, 0.3] = (0.02, 0.06)  # of airborne ranges, metres
+    ground_noise: Annotated[Range, 0.0, 0.3] = (0.01, 0.04)  # of the robot's ranges, metres
+    # names for r
     sensors: tuple[str, ...] = ("vlp16", "os64", "mid360", "vlp16-inclined")
-    sensor_height: Annotated[Range, 0.3, 5.0] = (0.6, 2.2)
-    travel: Annotated[Range, 0.0, 60.0] = (3.0, 25.0)
-    standing: Annotated[float, 0.0, 1.0] = 0.2
-    frame_step: Annotated[Range, 0.1, 5.0] = (0.7, 2.0)
-    tilt: Annotated[Range, 0.0, 20.0] = (0.3, 1.5)
-    gravity_error: Annotated[Range, 0.0, 3.0] = (0.0, 0.4)
-    scale_error: Annotated[Range, 0.0, 0.2] = (0.0, 0.02)
-    yaw_walk: Annotated[Range, 0.0, 2.0] = (0.0, 0.2)
-    rays: Annotated[int, 5_000, 2_000_000] = 160_000
-    dirt: tuple[str, ...] = ()
+    sensor_height: Annotated[Range, 0.3, 5.0] = (0.6, 2.2)  # metres above the ground
+    travel: Annotated[Range, 0.0, 60.0] = (3.0, 25.0)  # metres that the robot drives
+    standing: Annotated[float, 0.0, 1.0] = 0.2  # share of submaps with less than 3 m
+    frame_step: Annotated[Range, 0.1, 5.0] = (0.7, 2.0)  # metres between the frames of a submap
+    tilt: Annotated[Range, 0.0, 20.0] = (0.3, 1.5)  # sway of the robot, degrees, 1 sigma
+    gravity_error: Annotated[Range, 0.0, 3.0] = (0.0, 0.4)  # error of its odometry's vertical, degrees, 1 sigma
+    scale_error: Annotated[Range, 0.0, 0.2] = (0.0, 0.02)  # drift of its odometry, a share
+    yaw_walk: Annotated[Range, 0.0, 2.0] = (0.0, 0.2)  # drift of its odometry, degrees per square root of a metre
+    rays: Annotated[int, 5_000, 2_000_000] = 160_000  # maximum of beams cast for a submap, thinned evenly
+    dirt: tuple[str, ...] = ()  # kinds of T that drives have
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(Recipe, include_extras=True).items():
@@ -130,27 +94,16 @@ class Recipe:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of the training loop.
+    """Settings of the training loop."""
 
-    Attributes:
-        steps: number of batches.
-        pieces: maps (136 m) in a batch.
-        each: queries per map.
-        rate: of AdamW at first; it falls along a cosine.
-        decay: AdamW's weight decay.
-        width: the encoder's channels at 1 m.
-        wrong: headings that compete with each query's true one.
-        seed: of the weights' start and of the batches.
-    """
-
-    steps: int = 600
-    pieces: int = 4
-    each: int = 5
-    rate: float = 3e-3
-    decay: float = 1e-4
-    width: int = 24
-    wrong: int = 4
-    seed: int = 0
+    steps: int = 600  # number of batches
+    pieces: int = 4  # maps (136 m) in a batch
+    each: int = 5  # queries per map
+    rate: float = 3e-3  # of AdamW at first; it falls along a cosine
+    decay: float = 1e-4  # AdamW's weight decay
+    width: int = 24  # the encoder's channels at 1 m
+    wrong: int = 4  # headings that compete with each query's true one
+    seed: int = 0  # of the weights' start and of the batches
 
     def __post_init__(self) -> None:
         counts(self, "steps", "pieces", "each", "width", "wrong")

@@ -77,19 +77,12 @@ _STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat beams throug
 
 
 class DriveDirt(NamedTuple):
-    """Dirt of one drive; None for kinds that are off.
+    """Dirt of one drive; None for kinds that are off."""
 
-    Attributes:
-        T_body_sensor: (4, 4) of the sensor, whose points are sent as the body's.
-        beams: width and noise of its beams.
-        grass: off the roads, here everywhere.
-        rng: random numbers of all of it.
-    """
-
-    T_body_sensor: Pose
-    beams: Beams | None
-    grass: Grass | None
-    rng: np.random.Generator
+    T_body_sensor: Pose  # (4, 4) of the sensor, whose points are sent as the body's
+    beams: Beams | None  # width and noise of its beams
+    grass: Grass | None  # off the roads, here everywhere
+    rng: np.random.Generator  # random numbers of all of it
 
     @classmethod
     def draw(cls, kinds: tuple[str, ...], rng: np.random.Generator) -> DriveDirt:

@@ -18,23 +18,14 @@ _STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares 
 
 
 class Stand(NamedTuple):
-    """A forest.
+    """A forest."""
 
-    Attributes:
-        mapped: geometry when the map is flown.
-        now: geometry when the robot drives.
-        terrain: the ground.
-        trees: all trees of either time.
-        obstacles: (N, 3) x, y and radius of obstacles for the robot, metres.
-        drawn: values that were drawn for the stand, for JSON.
-    """
-
-    mapped: SceneState
-    now: SceneState
-    terrain: Terrain
-    trees: Trees
-    obstacles: Floats
-    drawn: dict[str, Any]
+    mapped: SceneState  # geometry when the map is flown
+    now: SceneState  # geometry when the robot drives
+    terrain: Terrain  # the ground
+    trees: Trees  # all trees of either time
+    obstacles: Floats  # (N, 3) x, y and radius of obstacles for the robot, metres
+    drawn: dict[str, Any]  # values that were drawn for the stand, for JSON
 
 
 def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:

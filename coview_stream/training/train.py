@@ -32,23 +32,14 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of a training: its worlds and its settings; the card next to the weights holds it.
+    """Plan of a training: its worlds and its settings; the card next to the weights holds it."""
 
-    Attributes:
-        worlds: number of worlds to train on; their seeds are consecutive from ``first``.
-        first: first seed.
-        validation: number of worlds of other seeds on which the result is evaluated.
-        most: maximum of queries evaluated in each of them.
-        recipe: ranges that worlds are drawn from.
-        training: settings of the training loop.
-    """
-
-    worlds: int = 62
-    first: int = 10_000
-    validation: int = 8
-    most: int = 60
-    recipe: Recipe = field(default_factory=Recipe)
-    training: TrainingConfig = field(default_factory=TrainingConfig)
+    worlds: int = 62  # number of worlds to train on; their seeds are consecutive from first
+    first: int = 10_000  # first seed
+    validation: int = 8  # number of worlds of other seeds on which the result is evaluated
+    most: int = 60  # maximum of queries evaluated in each of them
+    recipe: Recipe = field(default_factory=Recipe)  # ranges that worlds are drawn from
+    training: TrainingConfig = field(default_factory=TrainingConfig)  # settings of the training loop
 
     def __post_init__(self) -> None:
         counts(self, "worlds", "validation", "most")
@@ -200,23 +191,14 @@ Encoder = Callable[[Image], Features]
 
 @dataclass(frozen=True)
 class SearchedQuery:
-    """One query and the places that the search found.
+    """One query and the places that the search found."""
 
-    Attributes:
-        world: index of its world.
-        sensor: of the robot.
-        travelled: metres driven for it.
-        places: (5, 3) x, y (metres) and heading (radians) of the best places, best first.
-        pose: (3,) the true x, y and heading.
-        scores: (5,) of the places.
-    """
-
-    world: int
-    sensor: str
-    travelled: float
-    places: Floats
-    pose: Floats
-    scores: Floats
+    world: int  # index of its world
+    sensor: str  # of the robot
+    travelled: float  # metres driven for it
+    places: Floats  # (5, 3) x, y (metres) and heading (radians) of the best places, best first
+    pose: Floats  # (3,) the true x, y and heading
+    scores: Floats  # (5,) of the places
 
     def found_among(self, best: int = 1) -> bool:
         """Tell whether one of the ``best`` places lies within 10 m of the truth."""

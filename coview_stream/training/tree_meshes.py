@@ -13,17 +13,11 @@ from coview_stream.training.trees import Terrain, Trees, waves
 
 
 class MeshCopies(NamedTuple):
-    """Copies of a mesh.
+    """Copies of a mesh."""
 
-    Attributes:
-        template: whose triangles all copies have.
-        vertices: (M, V, 3) metres.
-        owner: (M,) index of the tree, bush or other object that each copy belongs to.
-    """
-
-    template: Mesh
-    vertices: Floats
-    owner: Ints
+    template: Mesh  # whose triangles all copies have
+    vertices: Floats  # (M, V, 3) metres
+    owner: Ints  # (M,) index of the tree, bush or other object that each copy belongs to
 
 
 def join_standing(parts: Iterable[MeshCopies], there: Bools, shift: Floats | None = None) -> Mesh:

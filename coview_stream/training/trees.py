@@ -95,35 +95,20 @@ class Species(NamedTuple):
 
 
 class Trees(NamedTuple):
-    """Columns (N,) of all trees, metres.
+    """Columns (N,) of all trees, metres."""
 
-    Attributes:
-        x: of the foot.
-        y: of the foot.
-        z: of the foot.
-        height: of the top above the foot.
-        radius: of the stem.
-        crown: radius of the crown.
-        base: height of the lowest leaves above the foot.
-        lean: (N, 2) metres per metre of height.
-        offset: (N, 2) of the crown's middle from the stem's axis.
-        family: index into ``FAMILIES``.
-        evergreen: whether it keeps its leaves in winter.
-        dead: whether it is bare.
-    """
-
-    x: Floats
-    y: Floats
-    z: Floats
-    height: Floats
-    radius: Floats
-    crown: Floats
-    base: Floats
-    lean: Floats
-    offset: Floats
-    family: Ints
-    evergreen: Bools
-    dead: Bools
+    x: Floats  # of the foot
+    y: Floats  # of the foot
+    z: Floats  # of the foot
+    height: Floats  # of the top above the foot
+    radius: Floats  # of the stem
+    crown: Floats  # radius of the crown
+    base: Floats  # height of the lowest leaves above the foot
+    lean: Floats  # (N, 2) metres per metre of height
+    offset: Floats  # (N, 2) of the crown's middle from the stem's axis
+    family: Ints  # index into FAMILIES
+    evergreen: Bools  # whether it keeps its leaves in winter
+    dead: Bools  # whether it is bare
 
     def axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
         """Return points (M, 3) of the stems' axes ``up`` (M,) metres above their feet, bent towards their crowns."""

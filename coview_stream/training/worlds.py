@@ -36,27 +36,17 @@ _BEYOND = 8.0  # metres of forest beyond the map
 
 @dataclass(frozen=True)
 class World:
-    """A training world.
+    """A training world."""
 
-    Attributes:
-        size: side of the square map about the origin, metres.
-        kind: forest type or kind of scene, in words.
-        mapped: the place when the map is scanned.
-        now: the place when the robot drives.
-        ground: heights (N,) of the ground at x and y (N,), metres.
-        span: lowest and highest ground, metres.
-        path: (random numbers, greatest distance from the origin in x and y, length) -> path (N, 2), metres.
-        drawn: values that were drawn for it, for JSON.
-    """
-
-    size: float
-    kind: str
-    mapped: SceneState
-    now: SceneState
-    ground: Callable[[Floats, Floats], Floats]
-    span: tuple[float, float]
+    size: float  # side of the square map about the origin, metres
+    kind: str  # forest type or kind of scene, in words
+    mapped: SceneState  # the place when the map is scanned
+    now: SceneState  # the place when the robot drives
+    ground: Callable[[Floats, Floats], Floats]  # heights (N,) of the ground at x and y (N,), metres
+    span: tuple[float, float]  # lowest and highest ground, metres
+    # (random numbers, greatest distance from the origin in x and y, length) -> path (N, 2), metres
     path: Callable[[np.random.Generator, float, float], Floats]
-    drawn: dict[str, Any]
+    drawn: dict[str, Any]  # values that were drawn for it, for JSON
 
 
 def draw_world(seed: int, recipe: Recipe) -> World:
@@ -143,27 +133,16 @@ _KEYS = ("aerial", "corner", "queries", "poses", "sensor", "kind", "travelled", 
 
 @dataclass(frozen=True)
 class WorldViews:
-    """Bird's-eye views of a world.
+    """Bird's-eye views of a world."""
 
-    Attributes:
-        aerial: (LAYERS, H, W) the map.
-        corner: (2,) of the map's cell (0, 0), metres.
-        queries: (K, LAYERS, QUERY_CELLS, QUERY_CELLS), each about the robot.
-        poses: (K, 3) x, y, yaw of the queries: ``p_world = R(yaw) p_query + (x, y)``, metres and radians.
-        sensor: (K,) names.
-        kind: of the world, in words.
-        travelled: (K,) metres driven for each query.
-        recipe: the seed, the recipe, and the values drawn from it.
-    """
-
-    aerial: Image
-    corner: Floats
-    queries: npt.NDArray[np.uint8]
-    poses: Floats
-    sensor: npt.NDArray[np.str_]
-    kind: str
-    travelled: Floats
-    recipe: dict[str, Any]
+    aerial: Image  # (LAYERS, H, W) the map
+    corner: Floats  # (2,) of the map's cell (0, 0), metres
+    queries: npt.NDArray[np.uint8]  # (K, LAYERS, QUERY_CELLS, QUERY_CELLS), each about the robot
+    poses: Floats  # (K, 3) x, y, yaw of the queries: p_world = R(yaw) p_query + (x, y), metres and radians
+    sensor: npt.NDArray[np.str_]  # (K,) names
+    kind: str  # of the world, in words
+    travelled: Floats  # (K,) metres driven for each query
+    recipe: dict[str, Any]  # the seed, the recipe, and the values drawn from it
 
 
 def world_views(seed: int, recipe: Recipe) -> WorldViews:

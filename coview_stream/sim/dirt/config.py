@@ -22,48 +22,28 @@ class Dirt:
 
     The truth that is written stays the true pose of the body.
 
-    Attributes:
-        seed: of all that is drawn for dirt, besides the world's own seed.
-        motion: raw sweeps of a moving robot, deskewed by its odometry.
-        traffic: people and vehicles that move.
-        rain: returns of drops.
-        dust: returns of a cloud behind the robot.
-        beams: noise that grows with the range, mixed echoes at edges.
-        reflectors: signs that bloom.
-        glass: windows that mirror or let through.
-        mounting: a leaning, displaced sensor.
-        gravity: a false direction of down in the odometry.
-        odometry: wrong scale and a turning heading.
-        slip: bursts of slipping wheels.
-        strips: survey strips that disagree.
-        density: an uneven density of the survey.
-        seasons: bare trees in the map, leaves now.
-        years: years between survey and run.
-        grass: tall grass off the roads.
-        snow: snow on the ground.
-
     Raises:
         ConfigError: a value out of its range, here or in one of the kinds.
     """
 
-    seed: int = 0
-    motion: Motion | None = None
-    traffic: Traffic | None = None
-    rain: Rain | None = None
-    dust: Dust | None = None
-    beams: Beams | None = None
-    reflectors: Reflectors | None = None
-    glass: Glass | None = None
-    mounting: Mounting | None = None
-    gravity: Gravity | None = None
-    odometry: Miscalibration | None = None
-    slip: Slip | None = None
-    strips: Strips | None = None
-    density: Density | None = None
-    seasons: Seasons | None = None
-    years: Years | None = None
-    grass: Grass | None = None
-    snow: Snow | None = None
+    seed: int = 0  # of all that is drawn for dirt, besides the world's own seed
+    motion: Motion | None = None  # raw sweeps of a moving robot, deskewed by its odometry
+    traffic: Traffic | None = None  # people and vehicles that move
+    rain: Rain | None = None  # returns of drops
+    dust: Dust | None = None  # returns of a cloud behind the robot
+    beams: Beams | None = None  # noise that grows with the range, mixed echoes at edges
+    reflectors: Reflectors | None = None  # signs that bloom
+    glass: Glass | None = None  # windows that mirror or let through
+    mounting: Mounting | None = None  # a leaning, displaced sensor
+    gravity: Gravity | None = None  # a false direction of down in the odometry
+    odometry: Miscalibration | None = None  # wrong scale and a turning heading
+    slip: Slip | None = None  # bursts of slipping wheels
+    strips: Strips | None = None  # survey strips that disagree
+    density: Density | None = None  # an uneven density of the survey
+    seasons: Seasons | None = None  # bare trees in the map, leaves now
+    years: Years | None = None  # years between survey and run
+    grass: Grass | None = None  # tall grass off the roads
+    snow: Snow | None = None  # snow on the ground
 
     def __post_init__(self) -> None:
         within(self, seed=(0, 2**31 - 1))

@@ -13,17 +13,11 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 
 @dataclass(frozen=True)
 class Beams:
-    """Range noise and divergence of a lidar's beams.
+    """Range noise and divergence of a lidar's beams."""
 
-    Attributes:
-        noise: of the range, metres per metre, one sigma, besides the sensor's constant noise.
-        divergence: full angle of the beam, milliradians.
-        pulse: metres within which two echoes of one beam are not told apart; their ranges mix.
-    """
-
-    noise: float = 0.0007
-    divergence: float = 3.0
-    pulse: float = 0.8
+    noise: float = 0.0007  # of the range, metres per metre, one sigma, besides the sensor's constant noise
+    divergence: float = 3.0  # full angle of the beam, milliradians
+    pulse: float = 0.8  # metres within which two echoes of one beam are not told apart; their ranges mix
 
     def __post_init__(self) -> None:
         within(self, noise=(0.0, 0.05), divergence=(0.0, 50.0), pulse=(0.0, 10.0))
@@ -53,17 +47,11 @@ class Beams:
 
 @dataclass(frozen=True)
 class Rain:
-    """Rain: near drops return some beams, and far surfaces return fewer.
+    """Rain: near drops return some beams, and far surfaces return fewer."""
 
-    Attributes:
-        drops: share of the beams that meet a drop; they return from it where nothing is nearer.
-        reach: mean range of such a return, metres.
-        extinction: of the light, per metre.
-    """
-
-    drops: float = 0.02
-    reach: float = 5.0
-    extinction: float = 0.006
+    drops: float = 0.02  # share of the beams that meet a drop; they return from it where nothing is nearer
+    reach: float = 5.0  # mean range of such a return, metres
+    extinction: float = 0.006  # of the light, per metre
 
     def __post_init__(self) -> None:
         within(self, drops=(0.0, 1.0), reach=(0.1, 100.0), extinction=(0.0, 1.0))
@@ -76,19 +64,12 @@ class Rain:
 
 @dataclass(frozen=True)
 class Dust:
-    """Dust cloud that the robot drags behind it, an ellipsoid that comes in gusts.
+    """Dust cloud that the robot drags behind it, an ellipsoid that comes in gusts."""
 
-    Attributes:
-        reach: mean way of a beam into the cloud, metres, in a gust of medium strength.
-        centre: of the cloud, metres behind the body.
-        size: half of its length, width and height, metres.
-        gusts: logarithm of the factor by which its thickness varies, one sigma.
-    """
-
-    reach: float = 3.0
-    centre: float = 5.0
-    size: tuple[float, float, float] = (3.5, 2.0, 1.2)
-    gusts: float = 0.8
+    reach: float = 3.0  # mean way of a beam into the cloud, metres, in a gust of medium strength
+    centre: float = 5.0  # of the cloud, metres behind the body
+    size: tuple[float, float, float] = (3.5, 2.0, 1.2)  # half of its length, width and height, metres
+    gusts: float = 0.8  # logarithm of the factor by which its thickness varies, one sigma
 
     def __post_init__(self) -> None:
         within(self, reach=(0.01, 1e3), centre=(0.0, 100.0), gusts=(0.0, 3.0))
@@ -117,36 +98,23 @@ _STEP = 0.02  # beyond the pane, at which a ray goes on
 
 @dataclass(frozen=True)
 class Glass:
-    """Windows in the walls of some buildings.
+    """Windows in the walls of some buildings."""
 
-    Attributes:
-        share: of the buildings with windows.
-        mirrors: probability that a window mirrors a beam.
-        passes: probability that the beam passes; the rest returns from the pane.
-        strength: share of the light that comes back from surfaces in or behind the glass.
-    """
-
-    share: float = 0.4
-    mirrors: float = 0.4
-    passes: float = 0.4
-    strength: float = 0.5
+    share: float = 0.4  # of the buildings with windows
+    mirrors: float = 0.4  # probability that a window mirrors a beam
+    passes: float = 0.4  # probability that the beam passes; the rest returns from the pane
+    strength: float = 0.5  # share of the light that comes back from surfaces in or behind the glass
 
     def __post_init__(self) -> None:
         within(self, share=(0.0, 1.0), mirrors=(0.0, 1.0), passes=(0.0, 1.0 - self.mirrors), strength=(0.0, 1.0))
 
 
 class Panes(NamedTuple):
-    """Beams that go on at a window.
+    """Beams that go on at a window."""
 
-    Attributes:
-        which: (K,) their indices among all beams.
-        origins: (K, 3) where they go on, scene frame, metres.
-        rays: (K, 3) where to, unit vectors.
-    """
-
-    which: Indices
-    origins: Floats32
-    rays: Floats32
+    which: Indices  # (K,) their indices among all beams
+    origins: Floats32  # (K, 3) where they go on, scene frame, metres
+    rays: Floats32  # (K, 3) where to, unit vectors
 
 
 def windows(points: Floats, normals: Floats, height: Floats) -> Bools:
@@ -182,15 +150,10 @@ _NOISE = 0.03  # metres; a saturated receiver ranges worse than it should
 
 @dataclass(frozen=True)
 class Reflectors:
-    """Blooming of retro-reflecting signs: a halo at the sign's range.
+    """Blooming of retro-reflecting signs: a halo at the sign's range."""
 
-    Attributes:
-        bloom: width of the halo, degrees, one sigma.
-        reach: metres within which a sign is bright enough.
-    """
-
-    bloom: float = 0.8
-    reach: float = 40.0
+    bloom: float = 0.8  # width of the halo, degrees, one sigma
+    reach: float = 40.0  # metres within which a sign is bright enough
 
     def __post_init__(self) -> None:
         within(self, bloom=(0.01, 10.0), reach=(0.0, 500.0))

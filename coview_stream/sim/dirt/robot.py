@@ -16,17 +16,11 @@ from coview_stream.sim.sensors import FRAME_PERIOD
 
 @dataclass(frozen=True)
 class Miscalibration:
-    """Constant errors of odometry over a run, and a heading that walks.
+    """Constant errors of odometry over a run, and a heading that walks."""
 
-    Attributes:
-        scale: share by which distances are over- or underrated; the sign is drawn.
-        yaw_rate: constant error of the heading, degrees per metre driven; the sign is drawn.
-        yaw_walk: random walk of the heading, degrees per square root of a metre, one sigma.
-    """
-
-    scale: float = 0.05
-    yaw_rate: float = 0.05
-    yaw_walk: float = 0.5
+    scale: float = 0.05  # share by which distances are over- or underrated; the sign is drawn
+    yaw_rate: float = 0.05  # constant error of the heading, degrees per metre driven; the sign is drawn
+    yaw_walk: float = 0.5  # random walk of the heading, degrees per square root of a metre, one sigma
 
     def __post_init__(self) -> None:
         within(self, scale=(0.0, 0.5), yaw_rate=(0.0, 10.0), yaw_walk=(0.0, 20.0))
@@ -42,19 +36,12 @@ class Miscalibration:
 
 @dataclass(frozen=True)
 class Slip:
-    """Bursts of slipping wheels: distance counted but not driven, or driven but not counted, and a false turn.
+    """Bursts of slipping wheels: distance counted but not driven, or driven but not counted, and a false turn."""
 
-    Attributes:
-        share: of a burst's distance that is counted too much (spinning) or too little (skidding), at random.
-        turn: false turn in a burst, degrees, one sigma.
-        length: of a burst, metres driven.
-        every: mean distance from burst to burst, metres driven.
-    """
-
-    share: float = 0.5
-    turn: float = 4.0
-    length: float = 1.5
-    every: float = 25.0
+    share: float = 0.5  # of a burst's distance that is counted too much (spinning) or too little (skidding), at random
+    turn: float = 4.0  # false turn in a burst, degrees, one sigma
+    length: float = 1.5  # of a burst, metres driven
+    every: float = 25.0  # mean distance from burst to burst, metres driven
 
     def __post_init__(self) -> None:
         within(self, share=(0.0, 1.0), turn=(0.0, 90.0), length=(0.1, 100.0), every=(0.1, 1e4))
@@ -79,15 +66,10 @@ class Slip:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Error of the inertial unit's direction of down: constant in size, slowly turning.
+    """Error of the inertial unit's direction of down: constant in size, slowly turning."""
 
-    Attributes:
-        error: angle between the true and the assumed direction of down, degrees.
-        period: seconds in which the false direction goes once round.
-    """
-
-    error: float = 0.5
-    period: float = 300.0
+    error: float = 0.5  # angle between the true and the assumed direction of down, degrees
+    period: float = 300.0  # seconds in which the false direction goes once round
 
     def __post_init__(self) -> None:
         within(self, error=(0.0, 45.0), period=(1.0, 1e6))
@@ -128,17 +110,11 @@ def _driven(odometry: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Uncalibrated mounting: the sensor's points are sent as the body's.
+    """Uncalibrated mounting: the sensor's points are sent as the body's."""
 
-    Attributes:
-        lean: angle between the vertical axes of sensor and body, degrees; the side it leans to is drawn.
-        yaw: turn about the vertical, degrees, one sigma; no map shows it on a straight road.
-        lever: distance between sensor and body, metres; its direction is drawn.
-    """
-
-    lean: float = 2.0
-    yaw: float = 0.0
-    lever: float = 0.05
+    lean: float = 2.0  # angle between the vertical axes of sensor and body, degrees; the side it leans to is drawn
+    yaw: float = 0.0  # turn about the vertical, degrees, one sigma; no map shows it on a straight road
+    lever: float = 0.05  # distance between sensor and body, metres; its direction is drawn
 
     def __post_init__(self) -> None:
         within(self, lean=(0.0, 30.0), yaw=(0.0, 180.0), lever=(0.0, 5.0))
@@ -157,15 +133,10 @@ _NS = 1e9
 
 @dataclass(frozen=True)
 class Motion:
-    """Raw sweeps: each lasts from one stamp to the next and bears the stamp of its end.
+    """Raw sweeps: each lasts from one stamp to the next and bears the stamp of its end."""
 
-    Attributes:
-        rate: samples of odometry a second, by which the sweeps are deskewed.
-        deskewed: whether the frames are deskewed, by the product's own code; if not they stay bent.
-    """
-
-    rate: float = 50.0
-    deskewed: bool = True
+    rate: float = 50.0  # samples of odometry a second, by which the sweeps are deskewed
+    deskewed: bool = True  # whether the frames are deskewed, by the product's own code; if not they stay bent
 
     def __post_init__(self) -> None:
         within(self, rate=(10.0, 1000.0))

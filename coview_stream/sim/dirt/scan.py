@@ -87,17 +87,11 @@ _CONIFER = vegetation.TREE_COLUMNS.index("conifer")
 
 
 class Echoes(NamedTuple):
-    """Echoes of (N,) beams.
+    """Echoes of (N,) beams."""
 
-    Attributes:
-        distance: (N,) metres that the beam counts; inf without a return.
-        strength: (N,) cosine of the incidence, less the loss at glass.
-        signs: (N,) whether a retro-reflecting sign returned it.
-    """
-
-    distance: Floats
-    strength: Floats
-    signs: Bools
+    distance: Floats  # (N,) metres that the beam counts; inf without a return
+    strength: Floats  # (N,) cosine of the incidence, less the loss at glass
+    signs: Bools  # (N,) whether a retro-reflecting sign returned it
 
 
 class Surfaces:

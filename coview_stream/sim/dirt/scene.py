@@ -22,17 +22,11 @@ _WAVES = ((23.0, 0.6), (9.0, 0.4))  # metres and share: drifts and tussocks
 
 @dataclass(frozen=True)
 class Snow:
-    """Snow on the ground, after the survey; the robot's wheels sink through it.
+    """Snow on the ground, after the survey; the robot's wheels sink through it."""
 
-    Attributes:
-        depth: metres, off the roads.
-        on_roads: share of the depth that lies on the carriageway.
-        drifts: share by which the depth varies.
-    """
-
-    depth: float = 0.25
-    on_roads: float = 0.5
-    drifts: float = 0.1
+    depth: float = 0.25  # metres, off the roads
+    on_roads: float = 0.5  # share of the depth that lies on the carriageway
+    drifts: float = 0.1  # share by which the depth varies
 
     def __post_init__(self) -> None:
         within(self, depth=(0.0, 1.0), on_roads=(0.0, 1.0), drifts=(0.0, 1.0))
@@ -40,17 +34,11 @@ class Snow:
 
 @dataclass(frozen=True)
 class Grass:
-    """Tall grass off the roads, after the survey: beams enter it and end somewhere within.
+    """Tall grass off the roads, after the survey: beams enter it and end somewhere within."""
 
-    Attributes:
-        height: metres, of the tallest.
-        reach: mean way of a beam through it, metres.
-        tussocks: share by which the height varies.
-    """
-
-    height: float = 0.35
-    reach: float = 0.3
-    tussocks: float = 0.5
+    height: float = 0.35  # metres, of the tallest
+    reach: float = 0.3  # mean way of a beam through it, metres
+    tussocks: float = 0.5  # share by which the height varies
 
     def __post_init__(self) -> None:
         within(self, height=(0.0, 2.0), reach=(0.01, 10.0), tussocks=(0.0, 1.0))
@@ -114,12 +102,9 @@ class Years:
 
     Buildings were demolished, built, and replaced by others, at least one of each; trees were felled and planted and
     have grown; other cars are parked.
-
-    Attributes:
-        years: between survey and run.
     """
 
-    years: float = 10.0
+    years: float = 10.0  # between survey and run
 
     def __post_init__(self) -> None:
         within(self, years=(0.0, 60.0))
@@ -127,13 +112,9 @@ class Years:
 
 @dataclass(frozen=True)
 class Seasons:
-    """Seasons: the survey saw bare trees and bushes, the robot sees leaves. Conifers stay as they are.
+    """Seasons: the survey saw bare trees and bushes, the robot sees leaves. Conifers stay as they are."""
 
-    Attributes:
-        bare: probability that a pulse passes one surface of a bare crown.
-    """
-
-    bare: float = 0.88
+    bare: float = 0.88  # probability that a pulse passes one surface of a bare crown
 
     def __post_init__(self) -> None:
         within(self, bare=(0.0, 1.0))
@@ -193,17 +174,11 @@ _FOOTWAY = 0.9  # metres beside the carriageway
 
 @dataclass(frozen=True)
 class Traffic:
-    """Moving people and vehicles, none of which is in the map.
+    """Moving people and vehicles, none of which is in the map."""
 
-    Attributes:
-        vehicles: on 100 metres of street.
-        people: on 100 metres of street.
-        companions: people who walk with the robot, within a few metres.
-    """
-
-    vehicles: float = 2.0
-    people: float = 4.0
-    companions: int = 2
+    vehicles: float = 2.0  # on 100 metres of street
+    people: float = 4.0  # on 100 metres of street
+    companions: int = 2  # people who walk with the robot, within a few metres
 
     def __post_init__(self) -> None:
         within(self, vehicles=(0.0, 50.0), people=(0.0, 200.0), companions=(0, 50))

@@ -17,15 +17,10 @@ _UPRIGHT = 0.5  # share of a strip's error that may be vertical
 
 @dataclass(frozen=True)
 class Strips:
-    """Misalignment of the strips of a survey, each as a whole; together they are right on average.
+    """Misalignment of the strips of a survey, each as a whole; together they are right on average."""
 
-    Attributes:
-        least: root mean square distance by which two strips disagree, metres; drawn evenly from here,
-        most: to here.
-    """
-
-    least: float = 0.05
-    most: float = 0.15
+    least: float = 0.05  # root mean square distance by which two strips disagree, metres; drawn evenly from here,
+    most: float = 0.15  # to here
 
     def __post_init__(self) -> None:
         within(self, least=(0.0, 5.0), most=(0.0, 5.0))
@@ -48,15 +43,10 @@ def disagreement(offsets: Floats) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Density of a survey that varies from place to place, in place of the configured one.
+    """Density of a survey that varies from place to place, in place of the configured one."""
 
-    Attributes:
-        least: pulses per square metre where it is thinnest.
-        most: where it is densest.
-    """
-
-    least: float = 4.0
-    most: float = 60.0
+    least: float = 4.0  # pulses per square metre where it is thinnest
+    most: float = 60.0  # where it is densest
 
     def __post_init__(self) -> None:
         within(self, least=(0.1, 500.0), most=(0.1, 500.0))
