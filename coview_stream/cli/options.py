@@ -71,8 +71,6 @@ def fill_from_file(
 ) -> dict[str, dict[str, Any]]:
     """Set the options that were not given to the values of a TOML file, by their names, and return its tables.
 
-    ``args.in_file`` gets the names of the options in the file.
-
     ``args.in_file`` gets the options in the file, ``args.from_file`` those of them that it decides, by all their names.
 
     Raises:
@@ -250,8 +248,7 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
 def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess | None:
     """Return the guess that ``X,Y[,YAW]`` means, metres and degrees; of several maps, ``MAP:X,Y[,YAW]``; None for none.
 
-    Raises:
-        ConfigError: it is no such text, or ``within`` is given without it, or is no distance.
+    ConfigError for another text, and for ``within`` alone or that is no distance.
     """
     from coview_stream.geometry.validation import MAX_COORDINATE
     from coview_stream.localization.search.hints import MIN_WITHIN, PlaceGuess

@@ -47,12 +47,7 @@ def add_view(parser: argparse._ActionsContainer) -> None:
 
 
 def open_sinks(args: argparse.Namespace) -> list[Sink]:
-    """Open what the options ask for, and print where it is to be seen.
-
-    Raises:
-        ConfigError: an address cannot be listened on, or there is no display. InputError: a file cannot be written.
-        DependencyError: a library is missing.
-    """
+    """Open the sinks that the options ask for, and print their addresses."""
     sinks: list[Sink] = []
     mcap, rrd = ([path for path in args.record if path.suffix == suffix] for suffix in (".mcap", ".rrd"))
     for path in args.record:

@@ -67,10 +67,6 @@ def fraction(config: object, *names: str) -> None:
 
 
 def within(config: object, **ranges: tuple[float, float]) -> None:
-    """Refuse fields outside their ranges, both ends included; NaN is outside.
-
-    Raises:
-        ConfigError: naming the field, its value and the range.
-    """
+    """Refuse fields outside their ranges, both ends included; NaN is outside."""
     for name, (low, high) in ranges.items():
         require(low <= getattr(config, name) <= high, config, name, f"within {low:g} and {high:g}")

@@ -51,20 +51,18 @@ class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
 
     Points above the ground and points on it are trimmed apart, else the ground, which fits anywhere, pushes out the
-    facades that fix the position (seen once on KITTI 04, no command prints it: 0.25 m median error against 0.05 m).
+    facades that fix the position (once on KITTI 04: 0.25 m median error against 0.05 m).
 
-    ``inflation``, the floors and the ``shared`` sigmas are calibrated on the simulated drives of
-    ``python -m bench tracking --seeds 5100``, which prints how often the truth lies within 1, 2 and 3 sigma; a real
-    map's own error, against the ground truth that matters to you, comes on top. The rest is set by hand.
+    ``inflation``, the floors and the ``shared`` sigmas are calibrated by ``python -m bench tracking --seeds 5100``: how
+    often the truth lies within 1, 2 and 3 sigma. A real map's own error comes on top. The rest is set by hand.
 
     Attributes:
-        method: ``trimmed-icp``, or ``gicp``, which needs the extra of that name and is for tracking only: the search
-            registers its hypotheses by trimmed ICP (see :mod:`coview_stream.localization.registration.gicp`).
+        method: ``trimmed-icp``, or ``gicp`` (extra gicp), for tracking only: the search uses trimmed ICP.
         keep: overlap, the share of the pairs that is kept; the paper keeps 0.6, 0.7 converges faster and as well.
         search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
         track: likewise while tracking.
-        iterations: at most, on each scale. Half as many leave headings one degree off where odometry is three degrees
-            off (``python -m bench conditions --conditions drift`` on three real runs).
+        iterations: at most, on each scale. Half as many leave headings one degree off where odometry is three off
+            (``python -m bench conditions --conditions drift``).
         source_voxel: metres; one point of the scan is kept in each cube of this size.
         source_points: at most so many of them, chosen at random.
         source_range: metres from the sensor within which the scan's points are used.
@@ -72,17 +70,15 @@ class RegistrationConfig:
         inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
         sigma_floor: metres, added to the sigma that registration claims of each position.
         sigma_floor_angle: radians, likewise of each angle.
-        shared: times the clustered sigma of the error that neighbouring registrations have in common, as a scanned
-            map's points lie off its surfaces
-            (:class:`coview_stream.localization.tracking.shared_error.SharedErrorModel`).
+        shared: times the clustered sigma of the error that neighbouring registrations have in common, because a
+            scanned map's points lie off its surfaces.
         shared_position: metres of x and of y of that error which the pairs do not show.
         shared_height: metres of z, likewise.
         shared_tilt: radians of roll and of pitch, likewise.
         shared_yaw: radians of the heading, likewise.
         gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
         weak_lever: metres; an angle counts like the shift that it makes at this distance.
-        weak_from: metres; a direction that is known less well is one that the map hardly shows, and its sigma is
-            widened (:func:`coview_stream.localization.registration.register.registration_covariance`).
+        weak_from: metres; a direction that is known less well is one that the map hardly shows: its sigma is widened.
         weak_sigma: metres, the largest sigma that this gives.
     """
 
@@ -148,14 +144,14 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Consensus: the votes of keyframes for one ``T_map_odom``.
+    """Consensus: the votes of keyframes for one ``T_map_odom``; set by hand.
 
     Attributes:
-        window: newest keyframes that vote; set by hand.
+        window: newest keyframes that vote.
         peaks: best hypotheses that are scored by the likelihood field; more of the co-view descriptors on maps of
-            more than 20,000 stations, by the fourth root. Set by hand.
-        distinct_distance: metres; a hypothesis farther than this from every better one is one of its own; set by hand.
-        distinct_yaw: radians; so is one turned by more than this; set by hand.
+            more than 20,000 stations, by the fourth root.
+        distinct_distance: metres; a hypothesis farther than this from every better one is one of its own.
+        distinct_yaw: radians; so is one turned by more than this.
     """
 
     window: int = 10
@@ -210,17 +206,14 @@ class LearnedConfig:
 class TrackingConfig:
     """Registrations while tracking: when, with which frames; and the drift that odometry is believed to have.
 
-    A registration is due after ``distance``, ``turn`` or ``seconds``. ``seconds`` counts regardless of odometry, for
-    wheels slip, drivers hang and robots are carried. Where odometry is so bad that the pose has become uncertain, it is
-    due sooner.
+    A registration is due after ``distance``, ``turn`` or ``seconds``, and sooner where odometry is so bad that the pose
+    has become uncertain. ``seconds`` counts regardless of odometry: wheels slip, drivers hang, robots are carried.
 
     The newest frame is registered, with as many earlier ones as it takes to reach ``min_points``. Drift smears older
-    frames: with odometry that drifts by 3 % the heading came out nearly ten times as well from one frame as from those
-    of the last two metres (seen once on worlds 5103 and 5106, no command prints it).
+    frames: at 3 % the heading was nearly ten times as good from one frame as from those of two metres.
 
-    Drifts are sigmas of a random walk per square root of a metre driven, with which
-    :class:`coview_stream.localization.tracking.motion.DriftEstimator` begins before it measures them. All are set by
-    hand.
+    Drifts are sigmas of a random walk per square root of a metre driven, with which the drift estimator begins before
+    it measures them. All are set by hand.
 
     Attributes:
         distance: metres driven.
@@ -269,14 +262,11 @@ class GraphConfig:
     """Smoothing of poses (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
 
     Attributes:
-        window: newest keyframes with which the graph begins anew. What it drops lives on in the belief that it left
-            behind, so a longer window only lets older registrations be weighed and linearised again in the light of
-            later ones.
-        restart: keyframes at which the graph begins anew.
+        window: newest keyframes with which the graph restarts; older ones live on in the belief that they left behind.
+        restart: keyframes at which it restarts.
         huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
             once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
-            kernel that lets go altogether would, with an optimistic covariance, lock the map out for good
-            (``tests/localization/tracking/test_pose_graph.py``).
+            kernel that lets go altogether would, with an optimistic covariance, lock the map out for good.
     """
 
     window: int = 40

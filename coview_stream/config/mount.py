@@ -12,8 +12,7 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
-MAX_LEVER = 100.0
-"""Metres from the body's origin to the sensor; farther is another unit. Set by hand."""
+MAX_LEVER = 100.0  # metres from the body's origin to the sensor; farther is another unit
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,7 @@ class Mount:
 
 
 def parse_mount(text: str) -> Mount:
-    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres.
-
-    Raises:
-        ConfigError: not three or six numbers, an angle beyond 360 degrees, or a sensor 100 m away.
-    """
+    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres; ConfigError for another text."""
     given = f"--mount={text}"
     shape = "give roll,pitch,yaw in degrees, or roll,pitch,yaw,x,y,z with metres, such as --mount=180,0,0"
     try:

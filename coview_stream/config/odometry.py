@@ -16,7 +16,7 @@ Gravity = Literal["ground", "level"] | tuple[float, float, float]
 """Direction of down: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
 
 MAX_TILT = math.radians(60.0)
-"""Radians from upright; a body frame has z up (x forward), so one that leans more is a mistake. Set by hand."""
+"""Radians from upright; a body frame has z up (x forward), so one that leans more is a mistake."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ class LidarOdometryConfig:
 def down(gravity: Gravity) -> Floats:
     """(3,) unit vector in the body frame that points down; not for ``"ground"``.
 
-    Raises:
-        ConfigError: no vector, or one that leaves the body lying or upside down.
+    ConfigError for no vector, or one that leaves the body lying or upside down.
     """
     vector = np.array((0.0, 0.0, -1.0) if gravity == "level" else gravity, dtype=object)
     try:

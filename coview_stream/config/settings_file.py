@@ -15,11 +15,7 @@ T = TypeVar("T")
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        ConfigError: the file cannot be read or is not valid TOML; the message names file and line.
-    """
+    """Return the tables of a TOML file; a ConfigError names the file and the line."""
     if path.suffix in (".json5", ".json", ".yaml", ".yml"):
         raise ConfigError(f"{path}: --config takes a TOML file; zenoh's configuration goes to --zenoh-config")
     try:
@@ -35,13 +31,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
     """Return a configuration with the fields of a table; a field that is a configuration takes a table of its own.
 
-    Args:
-        config: frozen dataclass with the values of all other fields.
-        table: of a settings file.
-        where: file and table, for messages.
-
-    Raises:
-        ConfigError: an unknown key, or a value of another type or out of range.
+    ``where`` names file and table in the ConfigError of an unknown key, or of a value of another type or out of range.
     """
     names = [field.name for field in fields(config)]  # type: ignore[arg-type]  # T is a dataclass
     values: dict[str, Any] = {}

@@ -56,7 +56,14 @@ def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option:
     if allowed:
         name = next((name for name in (by_key, hint) if name in allowed), allowed[0])
     else:
-        name = by_key or hint or _by_magic(sample)
+        name = by_key or hint or ""
+        if not name and (magic := _MAGIC.match(sample.payload)):
+            name = str(magic.lastgroup)
+        if not name:
+            raise EncodingError(
+                f"{sample.key}: no encoding is set, and the payload is neither CDR nor JSON; set one, or name it by "
+                "option"
+            )
     if name not in names:
         raise EncodingError(f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {kind}")
     return name
@@ -99,11 +106,3 @@ def _of_schema(kind: MessageKind, schema: str, source: str) -> str:
     if kind not in kinds:
         raise EncodingError(f"{source}: {schema!r} cannot carry {kind}")
     return codec
-
-
-def _by_magic(sample: Sample) -> str:
-    if magic := _MAGIC.match(sample.payload):
-        return str(magic.lastgroup)
-    raise EncodingError(
-        f"{sample.key}: no encoding is set, and the payload is neither CDR nor JSON; set one, or name it by option"
-    )

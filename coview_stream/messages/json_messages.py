@@ -112,7 +112,10 @@ def decode_hypotheses(sample: Sample) -> HypothesesMessage:
         rows = fields.get("places")
         if not isinstance(rows, list) or len(rows) > _MAX_PLACES:
             raise MessageError(f"places: write a list of at most {_MAX_PLACES}")
-        places = np.array([_place(row) for row in rows], dtype=np.float64).reshape(-1, len(_PLACE_DIGITS))
+        if not all(isinstance(row, dict) for row in rows):
+            raise MessageError(f"places: write objects with {', '.join(_PLACE_DIGITS)}")
+        values = [[number(row.get(name), f"places.{name}") for name in _PLACE_DIGITS] for row in rows]
+        places = np.array(values, dtype=np.float64).reshape(-1, len(_PLACE_DIGITS))
         maps = tuple(text(row, "map") for row in rows) if all("map" in row for row in rows) else ()
         return HypothesesMessage(
             stamp_ns=stamp_from(fields.get("stamp_ns")),
@@ -211,12 +214,6 @@ def _protection(value: object) -> ProtectionLevel | None:
     return ProtectionLevel(
         number(value.get("m"), "protection_level.m"), number(value.get("deg"), "protection_level.deg")
     )
-
-
-def _place(row: Any) -> list[float]:
-    if not isinstance(row, dict):
-        raise MessageError(f"places: write objects with {', '.join(_PLACE_DIGITS)}")
-    return [number(row.get(name), f"places.{name}") for name in _PLACE_DIGITS]
 
 
 def _refuse_constant(name: str) -> NoReturn:

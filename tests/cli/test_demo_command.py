@@ -6,6 +6,7 @@ import json
 import shutil
 
 import pytest
+from sockets import free_endpoint
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_tum
@@ -25,7 +26,9 @@ def demo(tmp_path_factory):
 @pytest.mark.slow
 def test_live_demo_runs_node_robot_and_watcher(tmp_path):
     out = tmp_path / "out"
-    assert main(["demo", "--out", str(out), *SMALL]) == 0
+    address = free_endpoint().removeprefix("tcp/")
+    assert main(["demo", "--out", str(out), "--web", address, *SMALL]) == 0
+    assert f"page at http://{address}/" in (out / "logs" / "serve.log").read_text()
     report = json.loads((out / "report.json").read_text())
     assert report["success"] is True
     assert report["false_frames"] == 0
@@ -88,16 +91,14 @@ def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, 
 
 
 @pytest.mark.parametrize("option", ["--scene moon", "--sensor sonar", "--size 3", "--length nan", "--seed x"])
-def test_bad_demo_options_are_one_line_and_leave_no_files(option, tmp_path, capsys):
-    assert main(["demo", "--out", str(tmp_path / "out"), *option.split()]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+def test_bad_demo_options_are_one_line_and_leave_no_files(option, tmp_path, refused):
+    refused("demo", "--out", tmp_path / "out", *option.split())
     assert not (tmp_path / "out").exists()
 
 
-def test_demo_does_not_overwrite_foreign_files(tmp_path, capsys):
+def test_demo_does_not_overwrite_foreign_files(tmp_path, refused):
     mine = tmp_path / "report.json"
     mine.write_text("mine")
-    assert main(["demo", "--out", str(tmp_path)]) == 2
-    assert main(["demo", "--out", str(mine)]) == 2
-    assert capsys.readouterr().err.count("\n") == 2
+    refused("demo", "--out", tmp_path)
+    refused("demo", "--out", mine)
     assert mine.read_text() == "mine"

@@ -43,11 +43,8 @@ def test_empty_trajectory_is_never_localized(truth, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", ["", "1 2 3\n", "nonsense\n", None])
-def test_bad_ground_truth_is_one_line(truth, tmp_path, capsys, content):
+def test_bad_ground_truth_is_one_line(truth, tmp_path, refused, content):
     bad = tmp_path / "bad.tum"
     if content is not None:
         bad.write_text(content)
-    assert main(["eval", str(truth), str(bad)]) == 2
-    err = capsys.readouterr().err
-    assert "bad.tum" in err
-    assert err.count("\n") == 1
+    assert "bad.tum" in refused("eval", truth, bad)

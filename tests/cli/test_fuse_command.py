@@ -100,17 +100,13 @@ def test_picture(site, world_run, tmp_path):
         (["-o", "fused.laz", "--min-range", "60"], "range_min"),
     ],
 )
-def test_bad_usage_is_one_line(site, world_run, tmp_path, monkeypatch, capsys, arguments, why):
+def test_bad_usage_is_one_line(site, world_run, tmp_path, monkeypatch, refused, arguments, why):
     monkeypatch.chdir(tmp_path)
-    assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", *arguments]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert why in err
+    assert why in refused("fuse", site / "site.coview", f"{world_run}:{site / 'out'}", *arguments)
     assert not list(tmp_path.iterdir())
 
 
-def test_results_of_another_map_are_refused(site, world_file, world_run, tmp_path, capsys):
+def test_results_of_another_map_are_refused(site, world_file, world_run, tmp_path, refused):
     out = tmp_path / "fused.laz"
-    assert main(["fuse", str(world_file), f"{world_run}:{site / 'out'}", "-o", str(out)]) == 2
-    assert "another map" in capsys.readouterr().err
+    assert "another map" in refused("fuse", world_file, f"{world_run}:{site / 'out'}", "-o", out)
     assert not out.exists()

@@ -17,7 +17,6 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.messages import decode_cloud, decode_odometry
-from coview_stream.stream.client import replay
 from coview_stream.stream.transport.zenoh_transport import open_transport
 
 
@@ -121,13 +120,8 @@ def test_replay_without_subscriber_exits_with_one(node, run_folder, capsys):
 
 
 @pytest.mark.slow
-def test_replay_with_late_subscriber_exits_with_zero(node, run_folder, capsys, monkeypatch):
-    def subscribe_late(*arguments):
-        node.subscribe()
-        return inner(*arguments)
-
-    inner = replay.replay
-    monkeypatch.setattr(replay, "replay", subscribe_late)
+def test_replay_with_late_subscriber_exits_with_zero(node, run_folder, capsys):
+    node.transport.subscribe("coview/r1/in/odom", lambda _: node.sent or node.subscribe(), "newest")
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "20"]
     assert main([*command, "--wait", "0"]) == 0
     captured = capsys.readouterr()
@@ -181,11 +175,5 @@ def test_signal_ends_replay_loop_cleanly(node, run_folder, number):
         (["--wait", "-1"], "--wait"),
     ],
 )
-def test_bad_replay_usage_is_one_line(run_folder, capsys, options, text):
-    endpoint = free_endpoint()
-    assert main(["replay", str(run_folder), "--robot", "r1", "--listen", endpoint, *options]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("coview-stream: error: ")
-    assert captured.err.count("\n") == 1
-    assert text in captured.err
+def test_bad_replay_usage_is_one_line(run_folder, refused, options, text):
+    assert text in refused("replay", run_folder, "--robot", "r1", "--listen", free_endpoint(), *options)

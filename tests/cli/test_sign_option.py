@@ -41,13 +41,10 @@ def command(name, site, map_name, key):
         ("signed.coview", "none.pub", "cannot read the key"),
     ],
 )
-def test_map_that_is_not_to_be_trusted_is_one_line_and_exit_code_2(site, capsys, name, map_name, key, said):
-    capsys.readouterr()
-    assert main(command(name, site, map_name, key)) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert said in lines[0]
-    assert str(site / (key if "key" in said and "another" not in said else map_name)) in lines[0]
+def test_map_that_is_not_to_be_trusted_is_one_line_and_exit_code_2(site, refused, name, map_name, key, said):
+    line = refused(*command(name, site, map_name, key))
+    assert said in line
+    assert str(site / (key if "key" in said and "another" not in said else map_name)) in line
 
 
 def test_build_signs_and_info_tells(map_cloud_file, site, capsys):

@@ -9,7 +9,7 @@ import threading
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.cli import main, options, serve
+from coview_stream.cli import options, serve
 from coview_stream.stream.node.serve import NetworkOptions, ServeOptions, open_node
 from coview_stream.stream.transport.keys import robot_keys
 
@@ -51,18 +51,16 @@ def test_state_directory_is_created_tested_and_logged(tmp_path, caplog):
     assert folder("--no-state") is None
 
 
-def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, capsys):
+def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, refused):
     (tmp_path / "file").write_text("")
     for name, text in (
         (str(tmp_path / "file"), "file"),
         (str(tmp_path / "file" / "in"), "Not a directory"),
         ("", "''"),
     ):
-        assert main(["serve", str(world_file), "--robot", "r1", "--listen", "x", "--state", name]) == 2
-        said = capsys.readouterr().err
+        said = refused("serve", world_file, "--robot", "r1", "--listen", "x", "--state", name)
         assert "--state" in said
         assert text in said
-        assert said.count("\n") == 1
 
 
 def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, caplog):

@@ -13,49 +13,28 @@ import urllib.request
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.cli import demo, main
 from coview_stream.clouds.python_child import python_command, python_environment
-from coview_stream.errors import TransportError
 
 
 @pytest.mark.parametrize("command", [["serve", "--robot", "r1", "--web", "site.coview"], ["watch", "--web", "here"]])
-def test_what_is_no_address_is_refused(command, capsys):
-    assert main(command) == 2
-    assert "no HOST:PORT; write --web=127.0.0.1:8642" in capsys.readouterr().err
+def test_what_is_no_address_is_refused(command, refused):
+    assert "no HOST:PORT; write --web=127.0.0.1:8642" in refused(*command)
 
 
-def test_a_port_that_is_taken_ends_watch_with_one_line(capsys):
+def test_a_port_that_is_taken_ends_watch_with_one_line(refused):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        assert main(["watch", "--web", address]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "in use" in line
+        assert "in use" in refused("watch", "--web", address)
 
 
-def test_a_map_that_is_none_ends_watch(tmp_path, capsys):
-    assert main(["watch", "--web", "127.0.0.1:0", "--map", str(tmp_path / "none.coview")]) == 2
-    assert "none.coview" in capsys.readouterr().err
+def test_a_map_that_is_none_ends_watch(tmp_path, refused):
+    assert "none.coview" in refused("watch", "--web", "127.0.0.1:0", "--map", tmp_path / "none.coview")
 
 
-def test_a_demo_without_a_node_has_no_page(capsys):
-    assert main(["demo", "--offline", "--web"]) == 2
-    assert "leave --web away" in capsys.readouterr().err
-
-
-def test_a_demo_hands_its_page_to_the_node(monkeypatch, tmp_path):
-    started = []
-
-    def no_process(log, *args):
-        started.append(args)
-        raise TransportError("not started")
-
-    monkeypatch.setattr(demo, "_process", no_process)
-    with pytest.raises(TransportError, match="not started"):
-        demo.record_live(tmp_path / "site.coview", tmp_path, tmp_path, web="127.0.0.1:8642")
-    assert started[0][0] == "serve"
-    assert started[0][-1] == "--web=127.0.0.1:8642"
+def test_a_demo_without_a_node_has_no_page(refused):
+    assert "leave --web away" in refused("demo", "--offline", "--web")
 
 
 class Command:

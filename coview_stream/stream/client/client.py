@@ -15,6 +15,7 @@ import numpy.typing as npt
 from coview_stream.errors import InputError, MessageError, TransportError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
+from coview_stream.messages import decode_pose
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.fleet_table import STALE
@@ -259,8 +260,6 @@ class RobotClient:
             raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
 
     def _on_pose(self, sample: Sample) -> None:
-        from coview_stream.messages import decode_pose
-
         try:
             pose = decode_pose(sample, hint=self.keys.pose_hint)
         except MessageError as error:

@@ -13,13 +13,11 @@ from coview_stream.errors import CloudError, ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, is_pose, why_no_pose
 from coview_stream.geometry.validation import cloud_rows, to_array
+from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
 from coview_stream.stream.transport.keys import RobotKeys, check_expression
 from coview_stream.stream.transport.rmw import RmwPublisher, publisher_token, type_hash
 from coview_stream.stream.transport.transport import Publisher, Transport, Urgency
-
-CLOUD_ENCODINGS = ("xyz", "xyzi", "foxglove", "cdr", "keelson")
-ODOMETRY_ENCODINGS = ("json", "cdr", "foxglove", "keelson")
 
 _TIMED = {"xyz": "foxglove", "xyzi": "foxglove"}  # raw rows have no place for times
 _SETTLE = 0.3  # seconds; see Sender.settle
@@ -43,12 +41,14 @@ class Sender:
         odometry_encoding: str | None = None,
     ) -> None:
         self._chosen = cloud_encoding is not None
-        self.cloud_encoding = _checked_encoding(
-            cloud_encoding or keys.cloud_hint or "xyz", CLOUD_ENCODINGS, "cloud encoding"
-        )
-        self.odometry_encoding = _checked_encoding(
-            odometry_encoding or keys.odometry_hint or "json", ODOMETRY_ENCODINGS, "odometry encoding"
-        )
+        self.cloud_encoding = cloud_encoding or keys.cloud_hint or "xyz"
+        self.odometry_encoding = odometry_encoding or keys.odometry_hint or "json"
+        for name, known, option in (
+            (self.cloud_encoding, tuple(CLOUD_CODECS), "cloud encoding"),
+            (self.odometry_encoding, tuple(ODOMETRY_CODECS), "odometry encoding"),
+        ):
+            if name not in known:
+                raise ConfigError(f"{option} {name!r} is unknown: choose one of {', '.join(known)}")
         self.cloud_key = _publishing_key(keys.cloud, keys.rmw, "sensor_msgs/msg/PointCloud2", "--cloud-key")
         self.odometry_key = _publishing_key(keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key")
         self._bare = keys.bare
@@ -63,8 +63,6 @@ class Sender:
             CloudError: the array has another shape or no numbers, or there is no finite point.
             InputError: ``times`` has no numbers, or another length.
         """
-        from coview_stream.messages import encode_cloud
-
         rows = cloud_rows(points)
         if times is not None and np.shape(times) != (len(rows),):
             raise InputError(f"times of shape {np.shape(times)} do not fit {len(rows)} points")
@@ -79,8 +77,6 @@ class Sender:
 
     def odometry(self, T_odom_body: Pose, stamp_ns: int) -> Encoded:
         """Encode a (4, 4) pose, odometry <- body, metres; InputError if it is no rigid transform."""
-        from coview_stream.messages import encode_odometry
-
         T = to_array(T_odom_body, np.float64, "T_odom_body", InputError)
         if not is_pose(T):
             raise InputError(f"T_odom_body (odometry <- body) {why_no_pose(T)}")
@@ -113,11 +109,7 @@ class Sender:
 
 
 def nanoseconds(stamp: float) -> int:
-    """Turn seconds into whole nanoseconds.
-
-    Raises:
-        InputError: no number, not finite, or beyond int64 (nanoseconds given for seconds, as a rule).
-    """
+    """Turn seconds into whole nanoseconds; InputError for no number, or one beyond int64 (nanoseconds, as a rule)."""
     try:
         plausible = bool(abs(stamp) < _MAX_STAMP)  # False of NaN
     except (TypeError, ValueError):  # no number at all
@@ -126,12 +118,6 @@ def nanoseconds(stamp: float) -> int:
         raise InputError(f"stamp {stamp!r}: give seconds of sensor time, not nanoseconds")
     whole = math.floor(stamp)  # apart: the product of today's seconds with 1e9 is off by 128 ns
     return whole * 1_000_000_000 + round((float(stamp) - whole) * 1e9)
-
-
-def _checked_encoding(name: str, names: tuple[str, ...], option: str) -> str:
-    if name not in names:
-        raise ConfigError(f"{option} {name!r} is unknown: choose one of {', '.join(names)}")
-    return name
 
 
 def _publishing_key(expression: str, rmw: bool, type_name: str, option: str) -> str:

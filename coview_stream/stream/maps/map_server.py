@@ -81,23 +81,16 @@ class MapServer:
             except Exception:  # the channel's end has no class of its own
                 return
             with self._guard.catch("answering"), query:
-                self._answer(query)
-
-    def _answer(self, query: Any) -> None:
-        expression = query.key_expr
-        if expression.intersects(self._keys.manifest):
-            self._reply(query, self._keys.manifest, self._raw)
-        key = str(expression)  # no wildcards for layers: one query would ask for the whole site
-        prefix = self._keys.layer("")
-        sha256 = key.removeprefix(prefix)
-        if key.startswith(prefix) and sha256 in self._layers:
-            try:
-                raw = self._store.get(sha256, self._layers[sha256])
-            except MapError as error:
-                log.error("%s", error)
-                query.reply_err(str(error).encode())
-                return
-            self._reply(query, key, raw)
+                if query.key_expr.intersects(self._keys.manifest):
+                    self._reply(query, self._keys.manifest, self._raw)
+                key = str(query.key_expr)  # no wildcards for layers: one query would ask for the whole site
+                sha256 = key.removeprefix(self._keys.layer(""))
+                if sha256 != key and sha256 in self._layers:
+                    try:
+                        self._reply(query, key, self._store.get(sha256, self._layers[sha256]))
+                    except MapError as error:
+                        log.error("%s", error)
+                        query.reply_err(str(error).encode())
 
     def _reply(self, query: Any, key: str, raw: bytes) -> None:
         query.reply(key, raw)

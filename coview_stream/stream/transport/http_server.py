@@ -61,17 +61,15 @@ Route = Callable[[str], Reply | EventStream]
 
 
 class HttpServer:
-    """Server of some routes on one address.
+    """Server of some routes on one address, ``HOST:PORT``; port 0 takes any free one. There is no password.
+
+    ``url`` is that of the root, with a final ``/``.
 
     Args:
-        address: ``HOST:PORT``; port 0 takes any free one. Other hosts reach it only through an address of this machine
-            that they reach; there is no password.
+        address: to listen on.
         routes: handlers by path.
         option: command-line option of the address and a valid value, for messages.
         open_to_names: accept any Host header, as scrapers by host name need.
-
-    Attributes:
-        url: of the root, with a final ``/``.
 
     Raises:
         ConfigError: the address is malformed or cannot be listened on.

@@ -1,9 +1,11 @@
-"""RobotClient: what it sends, what it gives back, on the fake network and over real sockets."""
+"""RobotClient in threads and in event loops, on the fake network and over real sockets; and its queue."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
+import threading
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from coview_stream.messages import decode_cloud, decode_odometry, encode_pose
 from coview_stream.messages.types import Encoded, PoseMessage, Sample
 from coview_stream.stream.client import client as client_module
 from coview_stream.stream.client.client import MAX_UNREAD_POSES
+from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.zenoh_transport import open_transport
@@ -338,3 +341,146 @@ def test_last_large_frame_is_sent_before_close():
         assert clouds == [1_200_000]
     finally:
         node.close()
+
+
+def run(main):
+    """Run a coroutine; one that waits for ever fails."""
+    return asyncio.run(asyncio.wait_for(main, 20.0))
+
+
+def publish(net, *stamps):
+    """Publish from another thread, as a network does."""
+
+    def send():
+        for stamp in stamps:
+            pose = PoseMessage(stamp, "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, "ab" * 32)
+            encoded = encode_pose(pose, "json")
+            net.publish(Sample("coview/r1/out/pose", encoded.payload, encoded.encoding, encoded.attachment))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    return thread
+
+
+def test_poses_come_by_async_for_until_none_come(net):
+    async def drive():
+        async with RobotClient("r1", transport=net) as robot:
+            publish(net, 1, 2).join()
+            stamps = []
+            async for pose in robot.poses(timeout=0.05):
+                stamps.append(pose.stamp_ns)
+                if pose.stamp_ns == 2:
+                    thread = publish(net, 3)  # while the loop waits
+            thread.join()
+        with pytest.raises(TransportError, match="closed"):
+            robot.send_cloud(np.zeros((9, 3)), 1.0)
+        return stamps
+
+    assert run(drive()) == [1, 2, 3]
+
+
+def test_other_tasks_go_on_while_poses_are_awaited(net):
+    async def drive():
+        async with RobotClient("r1", transport=net) as robot:
+            waiting = asyncio.ensure_future(anext(robot.poses()))
+            await asyncio.sleep(0)
+            assert not waiting.done()
+            publish(net, 7)
+            return (await waiting).stamp_ns
+
+    assert run(drive()) == 7
+
+
+def test_cancelled_reader_takes_no_pose(net):
+    async def drive():
+        async with RobotClient("r1", transport=net) as robot:
+            poses = robot.poses()
+            waiting = asyncio.ensure_future(anext(poses))
+            await asyncio.sleep(0)
+            publish(net, 8).join()  # it has arrived, and the reader has not run since
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            assert not robot._poses._waking
+            return (await anext(poses)).stamp_ns
+
+    assert run(drive()) == 8
+
+
+def test_closing_ends_async_iteration_and_what_was_unread_is_given(net):
+    async def drive():
+        robot = RobotClient("r1", transport=net)
+        publish(net, 1, 2).join()
+        robot.close()
+        return [pose.stamp_ns async for pose in robot.poses()]
+
+    assert run(drive()) == [1, 2]
+
+
+def test_queue_outlives_the_loop_of_a_reader():
+    queue = LatestQueue[int](3)
+
+    async def give_up():
+        return await queue.next(timeout=0.01)
+
+    assert run(give_up()) is None
+    queue.put(5)
+    assert run(queue.next()) == 5
+    queue.close()
+    assert run(queue.next()) is None
+
+
+def test_iterator_that_has_ended_stays_so(net):
+    with RobotClient("r1", transport=net) as robot:
+        poses = robot.poses(timeout=0.0)
+        assert list(poses) == []
+        publish(net, 1).join()
+        assert list(poses) == []
+        assert [pose.stamp_ns for pose in robot.poses(timeout=0.0)] == [1]
+
+
+def test_client_says_what_it_is_in_one_line(net):
+    with RobotClient("r1", transport=net) as robot:
+        assert repr(robot) == "RobotClient('r1', sends on coview/r1/in/cloud, no status yet)"
+        net.publish(Sample("coview/r1/out/status", b'{"state": "LOST"}', "application/json"))
+        assert "state LOST" in repr(robot)
+    assert repr(robot).endswith(", closed)")
+
+
+def test_latest_queue_keeps_order_and_drops_oldest():
+    queue = LatestQueue[int](3)
+    for k in range(5):
+        queue.put(k)
+    assert [queue.get(0), queue.get(0), queue.get(0), queue.get(0)] == [2, 3, 4, None]
+    assert queue.dropped == 2
+
+
+def test_close_wakes_reader_and_keeps_items():
+    queue = LatestQueue[int](3)
+    found: list[int | None] = [7]
+    reader = threading.Thread(target=lambda: found.append(queue.get()))
+    reader.start()
+    queue.close()
+    reader.join(5)
+    assert found == [7, None]
+
+    full = LatestQueue[int](3)
+    full.put(1)
+    full.close()
+    full.put(2)
+    assert [full.get(), full.get()] == [1, None]
+
+
+def test_put_wakes_waiting_reader():
+    queue = LatestQueue[int](3)
+    found: list[int | None] = []
+    reader = threading.Thread(target=lambda: found.append(queue.get(timeout=10)))
+    reader.start()
+    queue.put(4)
+    reader.join(5)
+    assert found == [4]
+
+
+def test_latest_queue_size_is_validated():
+    with pytest.raises(ConfigError, match="queue size"):
+        LatestQueue[int](0)

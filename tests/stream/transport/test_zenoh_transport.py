@@ -18,7 +18,8 @@ from zenoh_routers import Router, RouterProcess
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.transport import Connection, Transport
-from coview_stream.stream.transport.zenoh_config import compose
+from coview_stream.stream.transport.zenoh_config import compose, reason
+from coview_stream.stream.transport.zenoh_io import THREADS
 from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
 
 ROOT = Path(__file__).parents[3]
@@ -111,6 +112,22 @@ def test_newest_subscription_skips_and_all_subscription_does_not(pair: tuple[Zen
     assert newest[0] == b"first"
     assert len(newest) <= 3  # the last may still have been on its way to this reader
     assert every == [b"first", *(str(number).encode() for number in range(200))]
+
+
+def test_slow_handlers_hold_up_no_others_while_a_thread_is_free(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+    node, robot = pair
+    go = threading.Event()
+    got: list[bytes] = []
+    for number in range(THREADS - 1):
+        node.subscribe(f"slow/{number}", lambda _: go.wait(10.0), "all")
+    node.subscribe("quick", lambda sample: got.append(sample.payload), "all")
+    publishers = [robot.publisher(f"slow/{number}", "data") for number in range(THREADS - 1)]
+    publishers.append(robot.publisher("quick", "data"))
+    for number in range(5):
+        for publisher in publishers:
+            publisher.put(Encoded(bytes([number])))
+    until(lambda: got == [bytes([number]) for number in range(5)])
+    go.set()
 
 
 def test_raising_handler_is_kept_and_logged_once(
@@ -247,11 +264,12 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
     [
         ({"connect": ["127.0.0.1:7447"]}, "--connect.*tcp/127.0.0.1:7447"),
         ({"connect": ["tcp/127.0.0.1"]}, "--connect.*<host>:<port>"),
-        ({"connect": ["tcp/127.0.0.1:70000"]}, "--connect.*1..65535"),
+        ({"connect": ["tcp/127.0.0.1:70000"]}, r"--connect 'tcp/127.0.0.1:70000'.*port must be 1\.\.65535"),
+        ({"listen": ["tcp/[::1]:65536"]}, r"--listen.*1\.\.65535"),
+        ({"connect": ["tls/robot.local:0"]}, r"--connect.*1\.\.65535"),
         ({"listen": ["http/127.0.0.1:80"]}, "--listen.*protocols"),
-        ({"listen": ["tcp/203.0.113.7:7447"]}, "203.0.113.7.*assign"),
+        ({"listen": ["tcp/203.0.113.7:7447"]}, "203.0.113.7.*assign.*no address of this machine: --listen on"),
         ({"connect": ["tls/127.0.0.1:1"], "config": '{mode: "client", '}, "expected"),
-        ({"config": "{nonsense: 1}"}, "nonsense"),
         ({"config": '{connect: {endpoints: ["foo"]}}'}, "foo"),
         ({"config": "{transport: {unicast: {lowlatency: true, qos: {enabled: false}}}}"}, "lowlatency"),
         (
@@ -277,9 +295,14 @@ def test_missing_config_file_and_busy_port_are_named(tmp_path: Path) -> None:
         open_transport(config=tmp_path / "gone.json5")
     endpoint = free_endpoint()
     first = open_transport(listen=[endpoint])
-    with pytest.raises(TransportError, match="in use"):
-        open_transport(listen=[endpoint])
-    first.close()
+    try:
+        with pytest.raises(
+            TransportError, match=r"in use.*holds the port: --connect to it, or another --listen"
+        ) as caught:
+            open_transport(listen=[endpoint])
+    finally:
+        first.close()
+    assert endpoint in str(caught.value)
 
 
 def test_invalid_key_is_refused_without_router() -> None:
@@ -354,3 +377,31 @@ def test_subscription_that_is_ended_hears_nothing(pair: tuple[ZenohTransport, Ze
 def test_lease_is_what_is_asked_for_unless_the_file_says() -> None:
     assert "2000" in str(compose(lease_ms=2000).get_json("transport/link/tx/lease"))
     assert "10000" in str(compose().get_json("transport/link/tx/lease"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.json5", "{\n conect: {}\n}", "line 2: unknown key 'conect'; did you mean 'connect'?"),
+        ("a.json5", "{transport: {auth: {usrpwd: {usr: 1}}}}", "line 1: unknown key 'usr'; did you mean 'user'?"),
+        ("a.json5", "{qwertz: 1}", "line 1: unknown key 'qwertz'; take it out"),
+        ("a.yaml", "mode: client\nconect: 3\n", "unknown key 'conect'; did you mean 'connect'?"),
+        ("a.json5", '{mode: "klient"}', "line 1: unknown variant `klient`, expected one of `router`, `peer`, `client`"),
+        ("a.json5", '{connect: {endpoints: "x"}}', 'line 1: invalid type: string "x", expected'),
+        ("a.json5", "{mode:", "line 1, column 7: expected"),
+    ],
+)
+def test_configuration_errors_are_one_short_line(tmp_path: Path, name: str, text: str, said: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(TransportError) as caught:
+        compose(path=path)
+    message = str(caught.value)
+    assert message.startswith(f"zenoh configuration {path}: {said}")
+    assert len(message) < len(str(path)) + 150
+    assert "\n" not in message
+
+
+def test_other_errors_are_unchanged() -> None:
+    assert reason(ValueError("it broke\n at io/x.rs:12.")) == "it broke"
+    assert reason(ValueError("")) == "ValueError"

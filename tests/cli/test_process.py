@@ -1,8 +1,10 @@
-"""Ending on signals: waits are cut short, handlers are put back, a second interrupt is for good."""
+"""Processes of commands that run for long: signals end waits, and every record of the log is one line of JSON."""
 
 from __future__ import annotations
 
 import ctypes
+import json
+import logging
 import os
 import signal
 import subprocess
@@ -13,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.cli.process import Stop, stop_on_signals
+from coview_stream.cli.process import JsonFormatter, Stop, stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -119,3 +121,29 @@ def test_hangup_wakes_the_wait_and_does_not_end_it():
         assert stop.wait(30.0) is True
     assert signal.getsignal(signal.SIGHUP) is before
     assert signal.set_wakeup_fd(wakeup) == -1
+
+
+def record(message, *args, error=None):
+    info = None
+    if error is not None:
+        try:
+            raise error
+        except type(error):
+            info = sys.exc_info()
+    return logging.LogRecord("coview_stream.node", logging.WARNING, __file__, 1, message, args, info)
+
+
+def test_record_is_one_line_of_json():
+    line = JsonFormatter().format(record('r1: %s\n(second "line" é)', "LOST"))
+    assert "\n" not in line
+    read = json.loads(line)
+    assert read["message"] == 'r1: LOST\n(second "line" é)'
+    assert (read["level"], read["logger"]) == ("WARNING", "coview_stream.node")
+    assert read["time"].endswith("+00:00")
+    assert "exception" not in read
+
+
+def test_exception_is_part_of_the_line():
+    line = JsonFormatter().format(record("failed", error=ValueError("what was wrong")))
+    assert "\n" not in line
+    assert "ValueError: what was wrong" in json.loads(line)["exception"]
