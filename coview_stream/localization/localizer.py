@@ -298,7 +298,7 @@ class Localizer:
         if self.state.has_place:
             return
         self._frames.estimator.learn(earlier.doubted())
-        if not self._tracker.ground.learned:
+        if not self._tracker.ground.metres:
             self._tracker.ground.restore(earlier.ground)
 
     def require_verification(self) -> None:

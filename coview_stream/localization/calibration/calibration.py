@@ -14,15 +14,10 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rotation_angle
 from coview_stream.odometry.deskew import SweepCorrection
 
-# smaller corrections are not reported
-_LEAN = math.radians(0.5)
-_SCALE = 0.01
-_TURN = math.radians(0.05)  # per metre
-_GROUND = 0.1  # metres
-
-_MOVED_TILT = math.radians(1.0)  # least sigmas of a calibration from before the node started
-_MOVED_SCALE = 0.02
-_MOVED_TURN = math.radians(0.02)  # per metre
+_LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
+"""Least corrections that are reported: radians, factor, radians per metre, metres."""
+_MOVED_TILT, _MOVED_SCALE, _MOVED_TURN = math.radians(1.0), 0.02, math.radians(0.02)
+"""Least sigmas of a calibration from before the node started."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +25,7 @@ class Calibration:
     """Corrections of a robot's clouds and odometry, with their standard deviations.
 
     Attributes:
-        roll: radians about the body's x that turn clouds to odometry's gravity.
+        roll: radians about the body's x that level clouds in odometry's gravity.
         pitch: radians about the body's y, likewise.
         scale: factor that corrects odometry's distances, less one.
         turn: correction of odometry's heading, radians per metre driven.
@@ -76,7 +71,7 @@ class Calibration:
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Return one clause of text per noticeable correction.
 
-        Signs are those of ``--mount``; ``mount`` is the mount already applied to the clouds.
+        Signs are as in ``--mount``; ``mount`` is already applied to the clouds.
         """
         clauses: list[str] = []
         leans = [
@@ -85,9 +80,9 @@ class Calibration:
             if abs(angle) >= _LEAN
         ]
         if leans:
-            option = (mount or Mount()).turned(self.R_body_cloud).option
-            beyond = "" if mount is None or mount == Mount() else " beyond its mount"
-            remedy = f"set --mount={option} to silence this"
+            mount = mount or Mount()
+            beyond = "" if mount == Mount() else " beyond its mount"
+            remedy = f"set --mount={mount.turned(self.R_body_cloud).option} to silence this"
             clauses.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; {remedy}")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"

@@ -2,8 +2,8 @@
 
 The state is x = (roll, pitch, s, w, g): tilt of the sensor against odometry's gravity, scale of odometry's distances
 less one, turn of its heading per metre, and lean of the odometry frame against the map (2 components). These are the
-systematic errors of odometry; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every
-believed registration to the map gives two measurements:
+systematic errors; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every believed
+registration to the map gives two measurements:
 
 * Attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the residual
   tilt is u_map x u_odometry (eq. C1). The sensor's tilt turns with the body, the lean of the odometry frame does not;
@@ -11,16 +11,15 @@ believed registration to the map gives two measurements:
 * Motion since the previous registration against odometry's. They differ by s times the distance along the path and by
   w times the distance in heading (eq. C2), apart from both registrations' errors and odometry's random walk.
 
-A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk
-slowly at random with the metres driven.
-
-While a place only leads a search, the state is a mixture of two Gaussians: the place is right and its attitude has been
-measured, or the place is wrong.
+A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk randomly
+with the metres driven. While a place only leads a search, the state is a mixture of two Gaussians: the place is right
+and its attitude has been measured, or the place is wrong.
 """
 
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -31,21 +30,13 @@ from coview_stream.localization.calibration.calibration import Calibration
 
 
 class _Prior(NamedTuple):
-    """Prior of a group of components (values set by hand).
-
-    Attributes:
-        axes: components of the state.
-        exact: sigma of a correct sensor or odometry.
-        wide: sigma of a faulty one.
-        share: probability of a fault.
-        walk: sigma of the random walk, per square root of a metre.
-    """
+    """Prior of a group of components (values set by hand)."""
 
     axes: slice
-    exact: float
-    wide: float
-    share: float
-    walk: float
+    exact: float  # sigma of a correct sensor or odometry
+    wide: float  # sigma of a faulty one
+    share: float  # probability of a fault
+    walk: float  # sigma of the random walk, per square root of a metre
 
 
 _TILT = _Prior(slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03))
@@ -70,29 +61,14 @@ class CalibrationBelief:
         P: (6, 6) covariance.
     """
 
-    def __init__(self, sensor_leans: bool = True) -> None:
-        """Begin with the priors; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
+    def __init__(self, sensor_leans: bool) -> None:
         self.x = np.zeros(SIZE)
         self.P = np.diag(_WIDE**2)
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
-    def copy(self) -> CalibrationBelief:
-        """Return an independent copy."""
-        other = CalibrationBelief(self._sensor_leans)
-        other.x, other.P = self.x.copy(), self.P.copy()
-        return other
-
-    def restore(self, earlier: Calibration) -> None:
-        """Begin with an earlier calibration."""
-        self.x = np.array([earlier.roll, earlier.pitch, earlier.scale, earlier.turn, 0.0, 0.0])
-        self.P = np.diag(_WIDE**2)
-        sigmas = [earlier.sigma_tilt, earlier.sigma_tilt, earlier.sigma_scale, earlier.sigma_turn]
-        self.P[:4, :4] = np.diag(np.square(sigmas))
-        self._stand_straight()
-
     def learn(self, earlier: Calibration) -> None:
-        """Take over the components of an earlier calibration that have a smaller sigma than the present ones."""
+        """See :meth:`CalibrationEstimator.learn`."""
         present = self.applied()
         values = np.array([earlier.roll, earlier.pitch, earlier.scale, earlier.turn])
         sigmas = (earlier.sigma_tilt, earlier.sigma_scale, earlier.sigma_turn)
@@ -106,7 +82,7 @@ class CalibrationBelief:
         self._stand_straight()
 
     def begin_odometry(self) -> None:
-        """Forget the lean of the odometry frame, as a new one begins; the robot's constants stay."""
+        """See :meth:`CalibrationEstimator.begin_odometry`."""
         self.x[GRAVITY.axes] = 0.0
         self.P[GRAVITY.axes], self.P[:, GRAVITY.axes] = 0.0, 0.0
         self.P[GRAVITY.axes, GRAVITY.axes] = np.eye(2) * GRAVITY.wide**2
@@ -206,12 +182,6 @@ class CalibrationEstimator:
         self._probability = 0.0  # that the leading place is right
         self._apply()
 
-    def restore(self, earlier: Calibration) -> None:
-        """Begin with an earlier calibration; measurements go on improving it."""
-        self._supposed = None
-        self._known.restore(earlier)
-        self._apply()
-
     def learn(self, earlier: Calibration) -> None:
         """Take over the components of an earlier calibration that have a smaller sigma than the present ones."""
         self._supposed = None
@@ -253,7 +223,7 @@ class CalibrationEstimator:
 
         A search registers the same scans again, so suppositions do not add up. Args as :meth:`measure_attitude`.
         """
-        self._supposed, self._probability = self._known.copy(), probability
+        self._supposed, self._probability = deepcopy(self._known), probability
         _measure_attitude(self._supposed, T_map_cloud, T_odom_body, variance)
         self._apply()
 

@@ -9,14 +9,14 @@ differs from odometry's (hand-eye calibration, to first order) by
 * (R - I) ε + w |t| z in rotation: a robot that turns also observes its roll (eq. C4).
 
 The registration also corrects the motion itself, as drifting odometry smears the virtual scan of many keyframes. Both
-count by their variances; a registration that contradicts odometry counts less (a street looks alike along its length).
+count by their variances, and a registration that contradicts odometry counts less.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,19 +55,12 @@ Variances = Callable[[float, float], Floats]
 """Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, of metres driven and radians turned."""
 
 
-@dataclass(frozen=True)
-class _Reference:
-    """Keyframe that the next one is registered to.
+class _Reference(NamedTuple):
+    """Keyframe that the next one is registered to."""
 
-    Attributes:
-        points: (K, 3) float32 on surfaces, sensor's axes.
-        normals: (K, 3) float32 of the points, same frame.
-        T_odom_body: (4, 4) corrected odometry.
-    """
-
-    points: Points
-    normals: Floats32
-    T_odom_body: Pose
+    points: Points  # (K, 3) on surfaces, sensor's axes
+    normals: Floats32  # (K, 3) of the points
+    T_odom_body: Pose  # (4, 4) corrected odometry
 
 
 class FrameMotion:
@@ -99,11 +92,11 @@ class FrameMotion:
             drift: of odometry.
         """
         reference = self._reference
-        T_registered = None if reference is None else self._registered(reference, points, T_odom_body, estimator)
-        if reference is not None and T_registered is not None:
-            T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift)
-        on_surfaces, normals = surface_points(points)
-        self._reference = _Reference(on_surfaces, normals, T_odom_body)
+        if reference is not None:
+            T_registered = self._registered(reference, points, T_odom_body, estimator)
+            if T_registered is not None:
+                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift)
+        self._reference = _Reference(*surface_points(points), T_odom_body)
         return T_odom_body
 
     def _registered(
@@ -140,7 +133,8 @@ def _corrected(
     right = _probability_right(motion, step, variances, estimator.calibration, position)
     sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
     step = estimator.measure_frames(motion, step, variances, *sigmas)
-    motion = _turned(motion, estimator.calibration.R_body_cloud @ level.T)
+    turn = pose_from(estimator.calibration.R_body_cloud @ level.T, np.zeros(3))
+    motion = turn @ motion @ inverse(turn)
     return _fused(before @ step, before @ motion, variances, *sigmas)
 
 
@@ -166,11 +160,6 @@ def _sums(values: Floats, cell_of: Ints, count: int) -> Floats:
     """Return the sums (count, K) of values (N, K) by cell number (N,)."""
     columns = [np.bincount(cell_of, column, minlength=count) for column in values.T]
     return np.stack(columns, axis=1) if columns else np.empty((count, 0))
-
-
-def _turned(motion: Pose, R: Floats) -> Pose:
-    """Return a motion (4, 4) in axes turned by ``R`` (3, 3)."""
-    return pose_from(R @ motion[:3, :3] @ R.T, R @ motion[:3, 3])
 
 
 def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration, position: float) -> float:

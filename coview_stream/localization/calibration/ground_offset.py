@@ -1,15 +1,13 @@
 """Ground offset: height of the present ground above the survey's, as grass or snow raise it.
 
-The offset is constant or changes slowly along the path. Registration would put the present ground on the survey's, and
-so the robot too low by the offset. Structure reveals it: structure and ground are compared with the map at shifts up
-and down, and the difference of their best shifts is the offset. The robot's height then follows structure; where no
-structure shows a height, the offset is zero.
+Registration would put the present ground on the survey's, and so the robot too low by the offset. Structure reveals it:
+structure and ground are compared with the map at shifts up and down, and the difference of their best shifts is the
+offset. The robot's height then follows structure; where no structure shows a height, the offset is zero.
 
 Most sites have no offset, and structure seen from below differs by centimetres from a survey from above. So two
 hypotheses are compared: no offset beyond the survey's error, or one of some decimetres. The more probable one holds, as
-a mean of both would raise every site without an offset by some centimetres. Offsets below two decimetres hardly differ
-from none. Ground below the survey's looks like trees that have grown since, which is more probable: little of it is
-corrected.
+a mean of both would raise every site without an offset. Offsets below two decimetres hardly differ from none. Ground
+below the survey's looks like trees that have grown since, which is more probable: little of it is corrected.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats, Ints, Reals
+from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
@@ -58,15 +56,10 @@ class GroundOffset:
     def __init__(self) -> None:
         self.restore(0.0)
 
-    @property
-    def learned(self) -> bool:
-        """Whether a registration has measured it since the place was accepted."""
-        return self._views > 0
-
     def restore(self, metres: float) -> None:
         """Begin, now and at every accepted place, with an earlier offset of this site as a third hypothesis.
 
-        It is the most probable one until registrations contradict it; an offset near zero restores none.
+        It is the most probable one until registrations contradict it; an offset near zero adds none.
         """
         self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
         if abs(metres) > 2.0 * _NONE_SIGMA:
@@ -111,9 +104,15 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
     ground = _some(cloud.points[~cloud.above])
     if len(structure) < _FEW or len(ground) < _FEW:
         return None
-    level = _peak(_fits(ground, T_map_source, target).mean(axis=0))
+    profile = _fits(ground, T_map_source, target).mean(axis=0)
+    k = int(np.clip(profile.argmax(), 1, len(profile) - 2))
+    below, here, above = profile[k - 1 : k + 2]  # a parabola
+    bend = below - 2.0 * here + above
+    between = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
+    level = float(_SHIFTS[k] + (_SHIFTS[1] - _SHIFTS[0]) * np.clip(between, -1.0, 1.0))
     fits = _fits(structure, T_map_source, target)
-    patch, count = _patches(structure)
+    cell = np.floor(structure[:, :2] / _PATCH).astype(np.int64) @ np.array([1 << 20, 1])
+    _, patch, count = np.unique(cell, return_inverse=True, return_counts=True)
     shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
     shares = shares[count >= _FEW]
     # at the structure's height, the ground is off by their difference
@@ -141,22 +140,6 @@ def _fits(points: Points, T_map_source: Pose, target: LocalMap) -> Floats:
     normals, _ = target.planes(partner[paired])
     off[paired] = np.einsum("ij,ij->i", flat[paired] - target.points[partner[paired]], normals, dtype=np.float64)
     return np.where(paired, 1.0 / (1.0 + (off / _WIDTH) ** 2), 0.0).reshape(len(points), -1)
-
-
-def _peak(profile: Floats) -> float:
-    """Return the shift at the maximum of a profile (K,), by a parabola through its neighbours."""
-    k = int(np.clip(profile.argmax(), 1, len(profile) - 2))
-    below, here, above = profile[k - 1 : k + 2]
-    bend = below - 2.0 * here + above
-    between = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
-    return float(_SHIFTS[k] + (_SHIFTS[1] - _SHIFTS[0]) * np.clip(between, -1.0, 1.0))
-
-
-def _patches(points: Points) -> tuple[Ints, Ints]:
-    """Return the patch numbers (N,) of points, and the number of points per patch."""
-    cell = np.floor(points[:, :2] / _PATCH).astype(np.int64)
-    _, patch, count = np.unique(cell @ np.array([1 << 20, 1]), return_inverse=True, return_counts=True)
-    return patch, count
 
 
 def _some(points: Points) -> Points:

@@ -22,11 +22,11 @@ from coview_stream.localization.tracking.place_evidence import Observation, Plac
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
-# set by hand
 _RINGS = ((0.9, 6), (1.7, 10), (2.5, 14), (3.3, 18))  # metres, poses; each is moved to the best within 0.4 m
 _STRAIGHT, _TURNED = (0.0,), (-0.07, 0.0, 0.07)  # radians, of their headings
-_WIDEST = 1.0  # metres: coarser scales are spared, as the poses are the best near them
-_EVERY = 3  # of the scan's points is registered
+_WIDEST = 1.0  # metres: coarser scales are left out, as the poses are the best near them
+_EVERY = 3  # of the scan's points are registered
+_MAX_RIVALS = 2  # searched for in a doubtful match
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ def find_rivals(
 ) -> list[Rival]:
     """Return the most probable poses beside a registered one that do not converge to it; perhaps none.
 
-    Registration starts at odometry's prediction. After a slip that lies beside the right place, and a wall moved since
-    the survey may hold it there. So the map is looked up on rings of poses around, and the most probable one is
-    registered, too: a place has to explain the scan better than its best rival.
+    After a slip, registration starts beside the right place, and a wall moved since the survey may hold it there. So
+    the map is looked up on rings of poses around, and the most probable one is registered, too: a place has to explain
+    the scan better than its best rival.
 
     Args:
         place: evidence of the tracked place.
@@ -64,12 +64,10 @@ def find_rivals(
         config: of the registration.
         count: largest number of rivals; above 1 other headings are tried, too.
     """
-    T_odom_body = scan.T_odom_body
     here = scan.poses(T_map_odom[None])[0]
     poses, ratios = place.look_around(scan, T_map_odom, rings(here, _TURNED if count > 1 else _STRAIGHT))
-    level = config.gravity_sigma**-2
-    cloud = scan.cloud.every(_EVERY)
-    upright, scales = np.diag([level, level, 0.0, 0.0, 0.0, 0.0]), tuple(s for s in config.search if s <= _WIDEST)
+    cloud, upright = scan.cloud.every(_EVERY), np.diag([config.gravity_sigma**-2] * 2 + [0.0] * 4)
+    scales = tuple(scale for scale in config.search if scale <= _WIDEST) or config.search[-1:]
     tried, transforms = [here], [T_map_odom]
     for _ in range(count):
         ratios[np.linalg.norm(poses[:, :2] - tried[-1][:2], axis=1) < 0.5 * ALERT_METRES] = -np.inf
@@ -78,24 +76,20 @@ def find_rivals(
             break
         tried.append(poses[best])
         start = scan.transforms(poses[best][None])[0]
-        settings = (config, scales or config.search[-1:], Prior(start, upright), T_odom_body[:3, 3])
-        other = register(cloud, start, target, *settings)
-        if other is None:
-            continue
-        T = other.T_map_source
-        if all(_beside(T @ T_odom_body, T_other @ T_odom_body) for T_other in transforms):
-            transforms.append(T)
+        other = register(cloud, start, target, config, scales, Prior(start, upright), scan.body)
+        if other is not None and all(_beside(scan, other.T_map_source, T) for T in transforms):
+            transforms.append(other.T_map_source)
     if len(transforms) == 1:
         return []
     ratio = place.ratios(scan, np.stack(transforms))
     return [Rival(transforms[k], float(ratio[k])) for k in np.argsort(-ratio, kind="stable") if k]
 
 
-def _beside(T_map_body: Pose, T_map_other: Pose) -> bool:
-    """Return whether two poses differ by too much on the ground, where wheels slip."""
-    along = T_map_body.copy()
-    along[2, 3] = T_map_other[2, 3]
-    return matters(*off_by(along, T_map_other))
+def _beside(scan: ObservedScan, T_map_odom: Pose, T_map_other: Pose) -> bool:
+    """Return whether two poses of a scan differ by too much on the ground, where wheels slip."""
+    along, other = T_map_odom @ scan.T_odom_body, T_map_other @ scan.T_odom_body
+    along[2, 3] = other[2, 3]
+    return matters(*off_by(along, other))
 
 
 def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
@@ -106,17 +100,14 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
     return np.asarray(pose + np.concatenate([around + np.array([0.0, 0.0, 0.0, turn]) for turn in turns]))
 
 
-_MAX_RIVALS = 2  # searched for in a doubtful match
-
-
 @dataclass(frozen=True)
 class MapMatch:
-    """Registration while tracking, with its verdict.
+    """Registration while tracking: more than an :class:`Estimate`, as its verdict decides its use.
 
     Attributes:
         verdict: the decision and its reason.
         T_map_body: (4, 4) with the prior removed.
-        covariance: (6, 6) of the pose, over (rx, ry, rz, x, y, z) along the map's axes.
+        covariance: (6, 6) as of an :class:`Estimate`.
         innovation: squared Mahalanobis distance from the graph's prediction.
         scan: the registered scan; None if registration failed.
         target: the map around it; None likewise.
@@ -137,7 +128,7 @@ class MapMatch:
 
     @classmethod
     def without_registration(cls, verdict: MatchVerdict, belief: Estimate) -> MapMatch:
-        """Return the match of a scan whose registration failed: the belief stays."""
+        """Return the match of a scan that could not be registered: the belief stays."""
         return cls(verdict, belief.T_map_body, belief.covariance)
 
 
@@ -145,16 +136,14 @@ class MapMatcher:
     """Matcher that registers, verifies and judges scans on a base map.
 
     Attributes:
-        base_map: with the likelihood field.
-        config: of registration and acceptance.
         place: evidence of the tracked place, against chance.
         dispute: evidence of the possible places while odometry is contradicted.
         baseline: usual evidence, for reasons in words.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
-        self.base_map = base_map
-        self.config = config
+        self._base_map = base_map
+        self._config = config
         self.place = PlaceEvidence(base_map)
         self.dispute = Dispute(self.place, config.tracking.distance)
         self.baseline = EvidenceBaseline()
@@ -162,7 +151,7 @@ class MapMatcher:
     def clear(self) -> None:
         """Forget the usual shares: the place is another."""
         self.place.clear()
-        self.baseline.clear()
+        self.baseline.usual = None
 
     def match(
         self,
@@ -183,15 +172,17 @@ class MapMatcher:
             predicted: pose and covariance by the graph, which the innovation is measured from.
             rivals_wanted: largest number of rivals to search for.
         """
-        settings, acceptance = self.config.registration, self.config.acceptance
+        settings = self._config.registration
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
-        information = _inverted(belief.covariance)
-        if information is None:
-            return _failed(belief, "what is believed so far has a covariance without an inverse")
-        prior = Prior(T_start, information)
-        registration = register(scan.cloud, T_start, target, settings, scales, prior, scan.body)
+        try:
+            information = np.asarray(np.linalg.inv(belief.covariance))
+        except np.linalg.LinAlgError:
+            information = np.full((6, 6), np.nan)
+        if not np.isfinite(information).all():
+            return _failed(belief, "the covariance of the belief has no inverse")
+        registration = register(scan.cloud, T_start, target, settings, scales, Prior(T_start, information), scan.body)
         T_map_odom = T_start if registration is None else registration.T_map_source
-        observation, evidence = self.place.observe(scan, T_map_odom), scan.evidence(self.base_map.field, T_map_odom)
+        observation, evidence = self.place.observe(scan, T_map_odom), scan.evidence(self._base_map.field, T_map_odom)
         rivals = find_rivals(self.place, scan, T_map_odom, target, settings, rivals_wanted) if rivals_wanted else []
         observation = replace(observation, rival=max([0.0, *(rival.ratio for rival in rivals)]))
         cause, reason = self._judge(observation, evidence)
@@ -200,7 +191,7 @@ class MapMatcher:
                 return _failed(belief, "too few points have a partner in the map", evidence, observation)
             return MapMatch.without_registration(MatchVerdict(cause, reason, evidence, None, observation), belief)
         tilt = tilt_of(T_map_odom)
-        if tilt > acceptance.max_tilt:
+        if tilt > self._config.acceptance.max_tilt:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
             of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
@@ -227,7 +218,7 @@ class MapMatcher:
         Returns:
             Two or three matches, ``first`` being the first.
         """
-        scales = self.config.registration.search[1:]
+        scales = self._config.registration.search[1:]
         tries = [first, self.match(scan, belief, target, scales, predicted, _MAX_RIVALS)]
         rivals = sorted((rival for attempt in tries for rival in attempt.rivals), key=lambda rival: -rival.ratio)
         for rival in rivals:
@@ -262,15 +253,13 @@ class MapMatcher:
             belief: pose and covariance that odometry leads to.
             travelled: metres driven.
         """
-        rule = self.config.acceptance
+        rule = self._config.acceptance
         plausible = match.innovation <= rule.max_innovation
         metres, degrees = off_by(match.T_map_body, T_map_predicted)
         if plausible and not matters(metres, degrees):
             return match
-        gap, spread = (
-            match.T_map_body[:3, 3] - T_map_predicted[:3, 3],
-            belief.covariance[3:, 3:] + match.covariance[3:, 3:],
-        )
+        gap = match.T_map_body[:3, 3] - T_map_predicted[:3, 3]
+        spread = belief.covariance[3:, 3:] + match.covariance[3:, 3:]
         rare = chdtrc(6, rule.max_innovation)  # probability beyond which nothing is plausible
         here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
         if here and not matters(0.0, degrees):
@@ -325,11 +314,3 @@ def _failed(
 ) -> MapMatch:
     verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence, None, observation)
     return MapMatch.without_registration(verdict, belief)
-
-
-def _inverted(covariance: Floats) -> Floats | None:
-    try:
-        inverted = np.asarray(np.linalg.inv(covariance))
-    except np.linalg.LinAlgError:
-        return None
-    return inverted if np.isfinite(inverted).all() else None

@@ -23,9 +23,9 @@ from coview_stream.localization.state import Event
 from coview_stream.localization.tracking.place_evidence import Observation
 
 # prior probabilities that a place becomes wrong; set by hand
-PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displaced
-_PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
-_UNSEEN = 5e-4  # while nothing was known of the robot
+PER_METRE = 1e-5  # once in 100 km odometry jumps, or the robot is displaced
+_PER_SECOND = 1e-4  # in doubt: a blind robot may be on its way elsewhere
+_UNSEEN = 5e-4  # while the robot was out of contact
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
 _OFF_MAP = 0.3  # share of the scan on the map below which the reason says so; decides nothing
 _NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: about the last five registrations
@@ -58,14 +58,14 @@ _AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TIL
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """Verdict on one registration.
+    """Verdict on one registration; only ``cause`` and ``reason`` without one.
 
     Attributes:
         cause: of the decision.
         reason: one clause for people.
-        evidence: at the registered pose; None without a registration.
-        innovation: squared Mahalanobis distance to the prediction; None likewise.
-        observation: likelihood of the scan at the pose, against chance; None likewise.
+        evidence: at the registered pose.
+        innovation: squared Mahalanobis distance to the prediction.
+        observation: likelihood of the scan at the pose, against chance.
     """
 
     cause: RejectionReason
@@ -97,12 +97,7 @@ class EvidenceBaseline:
         usual: running average; None before the first registration.
     """
 
-    def __init__(self) -> None:
-        self.usual: Evidence | None = None
-
-    def clear(self) -> None:
-        """Forget the usual evidence, as the place is another."""
-        self.usual = None
+    usual: Evidence | None = None
 
     def learn(self, evidence: Evidence) -> None:
         """Add the evidence of a registration that was believed."""
@@ -120,11 +115,11 @@ class EvidenceBaseline:
 
     def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
         """Return the cause of poor evidence, the share that has fallen furthest below the usual one, and a clause."""
-        usual = self.usual
-        structure = evidence.near * evidence.covered / ((usual.near * usual.covered if usual else 0.0) or 0.25)
-        ground = evidence.ground / ((usual.ground if usual else 0.0) or 1.0)
-        space = evidence.free_space / ((usual.free_space if usual else 0.0) or 1.0)
-        inside = evidence.inside / ((usual.inside if usual else 0.0) or 1.0)
+        usual = self.usual or Evidence(0.0, 0.0, 0.0, 0.0, 0.0)
+        structure = evidence.near * evidence.covered / (usual.near * usual.covered or 0.25)
+        ground = evidence.ground / (usual.ground or 1.0)
+        space = evidence.free_space / (usual.free_space or 1.0)
+        inside = evidence.inside / (usual.inside or 1.0)
         worst = min(structure, ground, space, inside)
         if worst >= 1.0 and evidence.inside >= _OFF_MAP:
             return RejectionReason.FITNESS, "what is seen fits no better here than by chance"
@@ -135,23 +130,20 @@ class EvidenceBaseline:
         if worst == ground:
             return RejectionReason.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
         here = f"{evidence.near:.0%} of what stands above the ground is on the map"
-        return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if usual else ''}"
+        return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if self.usual else ''}"
 
 
 class Ruling(NamedTuple):
-    """Consequence of a registration for the place, after the earlier ones.
-
-    Attributes:
-        event: for the robot's state; None: nothing.
-        reason: one clause.
-        wrong: probability that the place is wrong.
-        believed: whether the pose may be corrected by the registration.
-    """
+    """Consequence of a registration for the place, after the earlier ones."""
 
     event: Event | None
+    """For the robot's state; None: nothing."""
     reason: str
+    """One clause."""
     wrong: float
+    """Probability that the place is wrong."""
     believed: bool
+    """Whether the registration may correct the pose."""
 
 
 class LossMonitor:
@@ -163,7 +155,6 @@ class LossMonitor:
     """
 
     def __init__(self, rule: AcceptanceConfig, tracking: TrackingConfig) -> None:
-        """Decide by ``rule``, with views as long as ``tracking`` says."""
         self._rule = rule
         self._tracking = tracking
         self.begin(0.0)
@@ -185,7 +176,19 @@ class LossMonitor:
 
     def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> Ruling:
         """Return the consequence for the place of a registration at ``travelled`` metres."""
-        self._weigh(verdict, stamp, travelled)
+        waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
+        self._newest = stamp, travelled
+        prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
+        # standing and fitting again and again is no certainty: at any view the place may have become wrong
+        self._before = max(self._before + prior, PER_METRE * self._tracking.distance)
+        self._odds += prior
+        if verdict.observation is not None:
+            if travelled - self._viewed_at >= self._tracking.distance:
+                self._viewed_at = travelled
+                # evidence against the place stays; evidence for it is not counted twice
+                self._before = max(self._before, self._odds)
+            ratio = float(np.logaddexp(math.log1p(-_NOTHING) + verdict.ratio, math.log(_NOTHING)))
+            self._odds = self._before * math.exp(-ratio)
         wrong = self._odds / (1.0 + self._odds)
         if self._odds >= 1.0:
             return Ruling(Event.PLACE_GIVEN_UP, f"more probably elsewhere: {verdict.reason}", wrong, False)
@@ -213,20 +216,3 @@ class LossMonitor:
         if verdict.verified or verdict.cause not in _AT_ONCE:
             reason = f"{'it fits again' if verdict.verified else verdict.reason}: wrong {one_in(wrong)}"
         return Ruling(Event.MATCH_REJECTED, reason, wrong, False)
-
-    def _weigh(self, verdict: MatchVerdict, stamp: float, travelled: float) -> None:
-        """Update the odds by the metres driven since the last registration and by the evidence of this one."""
-        waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
-        self._newest = stamp, travelled
-        prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
-        # standing and fitting again and again is no certainty: at any view the place may have become wrong
-        self._before = max(self._before + prior, PER_METRE * self._tracking.distance)
-        self._odds += prior
-        if verdict.observation is None:
-            return
-        if travelled - self._viewed_at >= self._tracking.distance:
-            self._viewed_at = travelled
-            # evidence against the place stays; evidence for it is not counted twice
-            self._before = max(self._before, self._odds)
-        ratio = float(np.logaddexp(math.log1p(-_NOTHING) + verdict.ratio, math.log(_NOTHING)))
-        self._odds = self._before * math.exp(-ratio)

@@ -1,8 +1,7 @@
 """Motion while tracking: distance and drift of odometry, and the newest frames' points.
 
-A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. One sigma for both would be far too large
-for the first and too small for the second. So the rates are measured while tracking: the motion between two
-registrations less odometry's is its drift plus the noise of both registrations.
+A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. So the rates are measured while tracking:
+the motion between two registrations less odometry's is its drift plus the noise of both registrations.
 """
 
 from __future__ import annotations
@@ -22,17 +21,11 @@ from coview_stream.localization.registration.register import swap_rotation_trans
 
 MAX_FRAMES = 40
 """Frames whose points are held."""
-_OWN_NOISE = 0.4
-"""Share of two neighbouring registrations' variances that is independent and so remains in their difference.
-
-Measured once on the simulated drives of ``python -m bench tracking --seeds 5100``; no command prints it.
-"""
-
+_OWN_NOISE = 0.4  # independent share of two neighbouring registrations' variances, measured once on simulated drives
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
-
 _MIN_FACTOR = 0.3  # of the configured rates
 _MAX_FACTOR = 20.0  # likewise: a scale error is no random walk, and looks like a high rate
-_OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
+_OUTLIER = 16.0  # variances; a larger slip counts as this, as rates should grow step by step
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
 _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
@@ -101,13 +94,13 @@ class DriftEstimator:
 
         Args:
             gap: (6,) over (rx, ry, rz, x, y, z): the later pose less odometry's prediction from the earlier one.
-            noise: (6,) variances that the two registrations alone account for.
+            noise: (6,) variances of the two registrations alone.
             driven: metres between them.
             turned: radians between them.
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
-        # single ones may be negative; only so is their mean unbiased
+        # negative ones stay, as their mean would be biased
         squares = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
@@ -139,13 +132,7 @@ class _Mark:
 
 @dataclass(frozen=True)
 class _Registered:
-    """A verified registration.
-
-    Attributes:
-        T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
-        covariance: (6, 6) of the pose.
-        mark: odometry at the registration.
-    """
+    """A verified registration, as in :meth:`OdometryTracker.learn`, with the odometry at it."""
 
     T_map_cloud: Pose
     covariance: Floats
@@ -207,22 +194,22 @@ class OdometryTracker:
             T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
             covariance: (6, 6) of the pose.
         """
-        self._confirm()
+        self._learn_unconfirmed()
         self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
 
     def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn from a registration that contradicts odometry once the next one follows; args as :meth:`learn`."""
-        self._confirm()
+        self._learn_unconfirmed()
         self._unconfirmed = _Registered(T_map_cloud, covariance, self._keyframe)
 
     def forget_registration(self) -> None:
         """Forget the last registration; the rates stay."""
         self._registered = self._unconfirmed = None
 
-    def _confirm(self) -> None:
-        before, self._unconfirmed = self._unconfirmed, None
-        if before is not None:
-            self._learn(before)
+    def _learn_unconfirmed(self) -> None:
+        if self._unconfirmed is not None:
+            self._learn(self._unconfirmed)
+        self._unconfirmed = None
 
     def _learn(self, now: _Registered) -> None:
         before = self._registered
@@ -250,12 +237,8 @@ class ScanBuffer:
         self._frames: deque[tuple[float, RawScan]] = deque(maxlen=MAX_FRAMES)  # metres driven, scan
 
     def add(self, scan: RawScan, travelled: float) -> None:
-        """Add a frame, seen after ``travelled`` metres."""
+        """Add a frame at ``travelled`` metres."""
         self._frames.append((travelled, scan))
-
-    def clear(self) -> None:
-        """Forget them all."""
-        self._frames.clear()
 
     def keep_newest(self, count: int) -> None:
         """Forget all but the newest ``count`` frames."""

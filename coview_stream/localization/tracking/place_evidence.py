@@ -1,16 +1,15 @@
 """Evidence of a tracked place: the search's log-likelihood ratio, with nuisances learned along the path.
 
-A search sums over the nuisances: unchanged share of the site, kind of survey, leaks through foliage. Tracking begins
-with an even prior over them and learns them, as they change slowly along the path: their posterior at one registration,
-spread a little, is the prior of the next (docs/integrity.md, eq. 6). So explaining half of the scan speaks for a place
-in a street where half has changed, and against it where nearly all was explained a metre before.
+Tracking begins with an even prior over the nuisances (unchanged share of the site, kind of survey, leaks through
+foliage). They change slowly along the path: their posterior at one registration, spread a little, is the prior of the
+next (docs/integrity.md, eq. 6). So explaining half of the scan speaks for a place in a street where half has changed,
+and against it where nearly all was explained a metre before.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -50,20 +49,12 @@ class Observation:
         return self.ratio - float(np.logaddexp(math.log1p(-_BESIDE), rival))
 
 
-class _Around(NamedTuple):
-    """Background around a pose (4, 4) where a scan was observed."""
-
-    scan: ObservedScan
-    T_map_odom: Pose
-    background: Background
-
-
 class PlaceEvidence:
     """Belief over the nuisances at one place, from registrations, and the evidence of a scan given them."""
 
     def __init__(self, base_map: BaseMap) -> None:
         self._base_map = base_map
-        self._around: _Around | None = None  # the newest
+        self._newest: tuple[ObservedScan, Pose, Background] | None = None  # background around a scan's pose
         self.clear()
 
     def clear(self) -> None:
@@ -98,11 +89,11 @@ class PlaceEvidence:
 
     def _background(self, scan: ObservedScan, T_map_odom: Pose) -> Background:
         """Return the background around a pose (4, 4); that of the newest is kept."""
-        around = self._around
-        if around is None or around.scan is not scan or not np.array_equal(around.T_map_odom, T_map_odom):
+        newest = self._newest
+        if newest is None or newest[0] is not scan or not np.array_equal(newest[1], T_map_odom):
             _, background = observe_with_background(self._base_map.field, scan, T_map_odom[None])
-            self._around = around = _Around(scan, T_map_odom, background)
-        return around.background
+            self._newest = newest = scan, T_map_odom, background
+        return newest[2]
 
     def _ratios(self, likelihoods: Floats) -> Floats:
         """Return the log-likelihood ratios (P,) under the prior of the nuisances."""
@@ -112,15 +103,7 @@ class PlaceEvidence:
 
     def _presumed(self) -> Floats:
         """Return the prior (Q, D, L) of the nuisances at the next registration."""
-        spread = np.einsum("qr,qdl->rdl", _STEPS, self._known)
+        step = np.exp(-0.5 * ((KEPT[:, None] - KEPT) / _SPREAD) ** 2)  # of one share q to another
+        spread = np.einsum("qr,qdl->rdl", step / step.sum(axis=1, keepdims=True), self._known)
         spread = (1.0 - _ANOTHER) * spread + _ANOTHER * spread.mean(axis=(1, 2), keepdims=True)
         return np.asarray((1.0 - _CHANGED) * spread + _CHANGED / np.prod(NUISANCES))
-
-
-def _steps() -> Floats:
-    """Return the probabilities (Q, Q) that one share q becomes another."""
-    weight = np.exp(-0.5 * ((KEPT[:, None] - KEPT) / _SPREAD) ** 2)
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
-
-
-_STEPS = _steps()

@@ -7,13 +7,12 @@ poses in the tangent of the body, the estimate is the most probable one given
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
 * registrations: e(Y_k, X_k) ~ N(0, R_k), under Huber's kernel on the whitened residual
 
-Only the newest pose is used, where filtering and smoothing agree; smoothing the earlier ones reweighs a registration
-by later ones.
+Only the newest pose is used; smoothing the earlier ones reweighs their registrations.
 
-The memory is bounded: at ``restart`` keyframes the graph restarts with the newest ``window`` of them. The first one's
-*filtering* belief, from the measurements up to it, replaces the past. For a chain this is exact up to linearisation, as
-past and future meet in one pose. Its smoothed belief would count the later measurements twice. (gtsam's fixed-lag
-smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
+The memory is bounded: at ``restart`` keyframes the graph restarts with the newest ``window`` of them, and the first
+one's *filtering* belief, from the measurements up to it, replaces the past. For a chain this is exact up to
+linearisation, as past and future meet in one pose; its smoothed belief would count the later measurements twice.
+(gtsam's fixed-lag smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its si
 
 
 class Estimate(NamedTuple):
-    """Pose and covariance of the newest keyframe."""
+    """A pose and its covariance."""
 
     T_map_body: Pose
     """(4, 4) float64."""
@@ -42,23 +41,17 @@ class Estimate(NamedTuple):
     """(6, 6) over (rx, ry, rz, x, y, z): a turn about the body, then a shift, along the map's axes."""
 
     def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
-        """Squared Mahalanobis distance of a measurement from this estimate.
+        """Squared Mahalanobis distance of a measured pose (4, 4), with the covariance of that measurement alone.
 
         If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
         22.5 by one in a thousand.
-
-        Args:
-            T_map_body: (4, 4) measured pose of the same keyframe.
-            covariance: of that measurement alone.
         """
-        T = check_rigid(T_map_body, "T_map_body")
-        spread = check_covariance(covariance, "covariance")
-        gap: Floats = boxminus(T, self.T_map_body)
-        return float(gap @ np.linalg.solve(self.covariance + spread, gap))
+        gap: Floats = boxminus(T_map_body, self.T_map_body)
+        return float(gap @ np.linalg.solve(self.covariance + covariance, gap))
 
 
 class _Gaussian(NamedTuple):
-    """A pose and its covariance (6, 6) in the tangent of its own body."""
+    """A pose and its covariance (6, 6), unlike an :class:`Estimate`'s along the axes of its own body, as gtsam's."""
 
     T: Pose
     covariance: Floats
@@ -72,7 +65,7 @@ class _Keyframe:
         T: (4, 4) ``T_map_body``, initial or linearised.
         between: this body in the frame of the previous one; None for the first.
         corrections: measured poses in the map.
-        filtered: belief at the time when it was the newest; None for the newest.
+        filtered: belief when it was the newest; None for the newest.
     """
 
     T: Pose
@@ -84,11 +77,10 @@ class _Keyframe:
 class PoseGraph:
     """Poses of a chain of keyframes, and the covariance of the newest.
 
-    All covariances are (6, 6) over (rx, ry, rz, x, y, z), radians and metres, *along the map's axes*: the body turns
-    about its own origin, then it is shifted. Poses are (4, 4) float64. Not safe for use by two threads at once.
+    All poses and covariances are as in :class:`Estimate`. Not safe for use by two threads at once.
 
-    Every method that takes a pose or a covariance raises InputError, and changes nothing, where the pose is not rigid
-    or the covariance not positive definite; every one that needs a keyframe RuntimeError before the first ``start``.
+    A pose that is not rigid or a covariance that is not positive definite raises InputError and changes nothing; a
+    method that needs a keyframe raises RuntimeError before the first ``start``.
     """
 
     def __init__(self, config: GraphConfig | None = None) -> None:
@@ -101,40 +93,29 @@ class PoseGraph:
         # gtsam has no types that mypy reads everywhere, hence Any
         self._gtsam: Any = require_library("gtsam", "gtsam>=4.3", "tracking")
         self._kernel: Any = self._gtsam.noiseModel.mEstimator.Huber.Create(self.config.huber)
-        self.clear()
-
-    def __len__(self) -> int:
-        """Keyframes held: at most ``restart``, however long the robot drives; zero before ``start``."""
-        return len(self._keyframes)
-
-    def clear(self) -> None:
-        """Forget everything."""
         self._keyframes: list[_Keyframe] = []
         self._newest_belief: _Gaussian | None = None
         self._isam: Any = None
         self._factors: Any = None  # not handed over to iSAM2 yet, nor are the values
         self._values: Any = None
 
-    def start(self, T_map_body: Pose, covariance: Floats) -> None:
-        """Begin a new chain with a prior on the first pose; the old chain is dropped.
+    def __len__(self) -> int:
+        """Keyframes held: at most ``restart``, however long the robot drives; zero before ``start``."""
+        return len(self._keyframes)
 
-        Args:
-            T_map_body: (4, 4) of the first keyframe.
-            covariance: of the prior.
-        """
+    def start(self, T_map_body: Pose, covariance: Floats) -> None:
+        """Begin a new chain with a prior on the first pose; the old chain is dropped."""
         T = check_rigid(T_map_body, "T_map_body")
         prior = _Gaussian(T, along_body(check_covariance(covariance, "covariance"), T))
-        self.clear()
-        self._keyframes.append(_Keyframe(T))
+        self._keyframes, self._newest_belief = [_Keyframe(T)], None
         self._build(prior)
 
     def move(self, T_between: Pose, covariance: Floats) -> None:
         """Add a keyframe by odometry from the newest.
 
         Args:
-            T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
-            covariance: of the new pose if the last one were known, along the map's axes as the estimate has them now
-                (see :func:`coview_stream.localization.tracking.motion.Drift.covariance`).
+            T_between: (4, 4) new body in the newest keyframe's frame, ``inverse(T_odom_last) @ T_odom_new``.
+            covariance: of the new pose if the last one were known.
         """
         step = check_rigid(T_between, "T_between")
         spread = check_covariance(covariance, "covariance")
@@ -147,22 +128,26 @@ class PoseGraph:
         Ad = adjoint(inverse(step))
         self._newest_belief = _Gaussian(T, Ad @ before.covariance @ Ad.T + moved.covariance)
         self._add_motion(len(self) - 1)
-        if len(self) > self.config.restart:
-            self._restart()
+        if len(self) > self.config.restart:  # with the newest keyframes, from the filtering belief of the first
+            self._update()
+            values = self._isam.calculateEstimate()
+            for key, item in enumerate(self._keyframes):
+                item.T = np.asarray(values.atPose3(key).matrix())
+            del self._keyframes[: -self.config.window]
+            first = self._keyframes[0].filtered
+            assert first is not None  # a window holds two or more
+            self._build(first)
 
     def correct(self, T_map_body: Pose, covariance: Floats) -> None:
         """Add a registration of the newest keyframe, under Huber's kernel.
 
-        Args:
-            T_map_body: (4, 4) with the prior removed, which would count twice (see
-                :func:`coview_stream.localization.registration.register.remove_prior`).
-            covariance: of the measurement alone (see
-                :func:`coview_stream.localization.registration.register.registration_covariance`).
+        Its prior must be removed, as it would count twice
+        (:func:`coview_stream.localization.registration.register.remove_prior`).
         """
         T = check_rigid(T_map_body, "T_map_body")
         spread = check_covariance(covariance, "covariance")
         measured = _Gaussian(T, along_body(spread, T))
-        self._newest().corrections.append(measured)
+        self._newest.corrections.append(measured)
         self._newest_belief = None
         self._add_correction(len(self) - 1, measured)
 
@@ -172,6 +157,7 @@ class PoseGraph:
         belief = self._belief()
         return Estimate(belief.T.copy(), along_map(belief.covariance, belief.T))
 
+    @property
     def _newest(self) -> _Keyframe:
         if not self._keyframes:
             raise RuntimeError("the graph is empty; call start first")
@@ -179,24 +165,13 @@ class PoseGraph:
 
     def _belief(self) -> _Gaussian:
         """Return the newest keyframe's pose and covariance; solves at the first call."""
-        self._newest()
         if self._newest_belief is None:
+            _ = self._newest
             self._update()
             key = len(self) - 1
             T = np.asarray(self._isam.calculateEstimatePose3(key).matrix())
             self._newest_belief = _Gaussian(T, np.asarray(self._isam.marginalCovariance(key)))
         return self._newest_belief
-
-    def _restart(self) -> None:
-        """Restart with the newest keyframes, from the filtering belief of the first one."""
-        self._update()
-        values = self._isam.calculateEstimate()
-        for key, item in enumerate(self._keyframes):
-            item.T = np.asarray(values.atPose3(key).matrix())
-        del self._keyframes[: -self.config.window]
-        first = self._keyframes[0].filtered
-        assert first is not None  # a window holds two or more
-        self._build(first)
 
     def _build(self, prior: _Gaussian) -> None:
         """Build iSAM2 from the keyframes; ``prior`` includes the corrections of the first one."""

@@ -1,9 +1,9 @@
 """Cluster-robust (sandwich) covariance of a registration: the error that neighbouring registrations share.
 
-The inverse Hessian presumes that residuals are independent. They are not: a wall that the map has 3 cm off pulls with
-all of its points, and a tree's crown looks different from above, all of it. So pairs are gathered into clusters by
-place, and what counts is how far the *clusters* pull apart: A^-1 B A^-1 with A the sum of J^T J over the pairs and B
-the sum over clusters of the outer products of their gradients.
+The inverse Hessian presumes independent residuals. But a wall that lies 3 cm off in the map pulls with all of its
+points, and a tree's whole crown looks different from above. So pairs are gathered into clusters by place, and the
+covariance is A^-1 B A^-1, with A the sum of J^T J over the pairs and B the sum over clusters of the outer products of
+their gradients.
 """
 
 from __future__ import annotations
@@ -12,28 +12,27 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry.arrays import Bools, Floats, Ints, Reals
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
-# set by hand
-_CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 answer much alike
+_CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 give similar results
 _EVERY = 2  # of the points: more change nothing
 _NEWEST_SHARE = 0.3  # of a new covariance in the running average
-_MIN_CLUSTERS = 8  # six unknowns need more
+_MIN_CLUSTERS = 8  # more than the six unknowns
 
 
 class SharedErrorModel:
-    """Running average of the error that neighbouring registrations share, and that does not average out over them."""
+    """Running average of the error that neighbouring registrations share: it does not average out over them."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._clustered: Floats | None = None
+        self.clear()
 
     def clear(self) -> None:
         """Forget all registrations: the place is another."""
-        self._clustered = None
+        self._clustered: Floats | None = None
 
     def learn(self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats) -> None:
         """Add a verified registration; arguments are those of :func:`clustered_covariance`."""
@@ -46,7 +45,7 @@ class SharedErrorModel:
     def covariance(self) -> Floats:
         """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the clustered sigma, and other errors.
 
-        The latter is above all that odometry's roll and pitch tremble from frame to frame.
+        The main one of these: odometry's roll and pitch tremble from frame to frame.
         """
         c = self._config
         tilt, position = c.shared_tilt, c.shared_position
@@ -58,11 +57,11 @@ class SharedErrorModel:
 def clustered_covariance(
     source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, config: RegistrationConfig
 ) -> Floats | None:
-    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None if too little was seen.
+    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None for too few clusters.
 
     Args:
         source: the registered points.
-        T_map_source: (4, 4) where.
+        T_map_source: (4, 4) registered pose.
         target: the map around it.
         pivot: (3,) source-frame point that rotations are about.
         config: the one that the registration had.
@@ -71,15 +70,17 @@ def clustered_covariance(
     reach = config.track[-1]
     moved = transform(T_map_source, source.points)
     distance, partner = kernels.nearest(target.grid, moved, reach)
-    # none are trimmed: those that fit best disagree least
-    weights = _equal_weights(distance < reach, source.above)
+    weights, paired = np.zeros(len(distance)), distance < reach  # not trimmed: the best pairs disagree least
+    for kind in (source.above, ~source.above):  # both kinds weigh the same
+        weights[kind & paired] = 1.0 / max(1, int((kind & paired).sum()))
     chosen = np.flatnonzero(weights)
     gap, (n, planarity) = moved[chosen] - target.points[partner[chosen]], target.planes(partner[chosen])
     residual = np.einsum("ij,ij->i", gap, n).astype(np.float64)
     weight = weights[chosen] * planarity / (1.0 + (residual / config.residual_scale) ** 2)
     arm = moved[chosen] - transform(T_map_source, pivot[None])[0].astype(np.float32)
     J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
-    cluster = _clusters(moved[chosen], source.above[chosen])
+    cell = np.floor(moved[chosen, :2] / _CELL).astype(np.int64)  # structure apart from ground
+    cluster = np.unique((cell[:, 0] * 100_003 + cell[:, 1]) * 2 + source.above[chosen], return_inverse=True)[1]
     count = int(cluster.max()) + 1 if len(cluster) else 0
     if count < _MIN_CLUSTERS:
         return None
@@ -93,21 +94,5 @@ def clustered_covariance(
         A += (J * loose[:, None]).T @ J
     gradients = np.stack([np.bincount(cluster, column, count) for column in gradient.T], axis=1)
     inverse_A = np.linalg.inv(A)
-    # of as many clusters six are used up by the fit
+    # the fit uses up six clusters
     return np.asarray(inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 6))
-
-
-def _equal_weights(paired: Bools, above: Bools) -> Floats:
-    """Weights (N,) of points: 0 for those without a partner, and equal sums for both kinds."""
-    weights = np.zeros(len(paired))
-    for kind in (above, ~above):
-        rows = kind & paired
-        weights[rows] = 1.0 / max(1, int(rows.sum()))
-    return weights
-
-
-def _clusters(points: Reals, above: Bools) -> Ints:
-    """Return the number (M,) of the cluster of each point: its cell of the ground plan, structure apart from ground."""
-    cell = np.floor(points[:, :2] / _CELL).astype(np.int64)
-    key = (cell[:, 0] * 100_003 + cell[:, 1]) * 2 + above
-    return np.unique(key, return_inverse=True)[1]

@@ -1,9 +1,9 @@
 """Evidence of a slip or of a displaced robot, between two registrations and where they contradict odometry.
 
-A registration may fit, and yet not lie where odometry leads. Either odometry is wrong (wheels slip, the robot is
-pushed), and the robot is where the lidar sees it; or odometry is right, and a building or a stack of containers stands
-a metre off where it was surveyed. The scans themselves decide, by how much better they are explained at the one place
-than at all others: the ratio of their likelihoods, given the usual shares of this place.
+A registration may fit away from the place where odometry leads. Either odometry is wrong (wheels slip, the robot is
+pushed) and the lidar is right, or odometry is right and a building or a stack of containers stands a metre off its
+surveyed place. The scans decide, by the ratio of their likelihoods at the one place and at all others, given the usual
+shares of this place.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
 
 def off_by(T_map_body: Pose, T_map_other: Pose) -> tuple[float, float]:
-    """Return how far apart two poses are: metres, degrees."""
+    """Return metres and degrees between two poses."""
     gap = boxminus(T_map_body, T_map_other)
     return float(np.linalg.norm(gap[3:])), math.degrees(float(np.linalg.norm(gap[:3])))
 
 
 def matters(metres: float, degrees: float) -> bool:
-    """Tell whether poses so far apart cannot both be taken for right: by more than half of the alert limit."""
+    """Tell whether poses so far apart cannot both count as right: more than half of the alert limit."""
     return metres > 0.5 * ALERT_METRES or degrees > 0.5 * ALERT_DEGREES
 
 
 class Dispute:
-    """Places that may be the right one while odometry is contradicted, and the scans' evidence for each since then.
+    """Candidate places while odometry is contradicted, and the scans' evidence for each of them.
 
-    The first is where odometry leads. Scans of one view (a metre) tell the same: of each the newest counts, and views
-    add up. All are as likely beforehand; a place that is seen later begins like the first.
+    The first is the one that odometry leads to. Scans of one view (a metre) see the same, so the newest of a view
+    counts, and views add up. The prior is even; a place that appears later starts with the evidence of the first.
     """
 
     def __init__(self, place: PlaceEvidence, view: float) -> None:
@@ -47,101 +47,92 @@ class Dispute:
         self.clear()
 
     def clear(self) -> None:
-        """Forget it: it has been settled."""
+        """Forget all candidates."""
         self._poses: list[Pose] = []  # T_map_odom
-        self._before = np.zeros(0)  # log-likelihood ratios of the views before
-        self._newest = np.zeros(0)  # and of this one
-        self._begun = -math.inf  # metres driven where it began
+        self._before = np.zeros(0)  # log-likelihood ratios of the earlier views
+        self._newest = np.zeros(0)  # and of the present one
+        self._begun = -math.inf  # metres driven at the start of the view
 
     def settle(
         self, scan: ObservedScan, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
     ) -> Pose | None:
-        """Return the pose ``T_map_body`` (4, 4) that must be the right one, as odometry has slipped; None: undecided.
+        """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None: undecided.
 
         Args:
             scan: the registered one.
-            T_map_predicted: (4, 4) pose of the body where odometry leads.
-            T_map_seen: (4, 4) each, where it was registered.
+            T_map_predicted: (4, 4) pose of the body by odometry.
+            T_map_seen: (4, 4) registered poses of the body.
             travelled: metres driven.
-            risk: probability that it is another one of them, so far off that it matters.
+            risk: accepted probability that another candidate is right, so far off that it matters.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled
             self._before = self._before + self._newest
         T_body_odom = inverse(scan.T_odom_body)
-        owners = self._assign([T_map_predicted, *T_map_seen], scan.T_odom_body)
+        owners = self._assign(T_map_predicted, T_map_seen, scan.T_odom_body)
         candidates = [T_map_predicted @ T_body_odom, *self._poses[1:], *(T @ T_body_odom for T in T_map_seen)]
         ratios = self._place.ratios(scan, np.stack(candidates))
         self._newest = ratios[: len(self._poses)].copy()
-        np.maximum.at(self._newest, owners[1:], ratios[len(self._poses) :])
+        np.maximum.at(self._newest, owners, ratios[len(self._poses) :])
         total = self._before + self._newest
         best = int(total.argmax())
         here = [T @ scan.T_odom_body for T in self._poses]
-        # a place near enough to the best contradicts it only if it is odometry's
+        # a place near the best one contradicts it only if it is odometry's
         apart = np.array([k == 0 or matters(*off_by(T, here[best])) for k, T in enumerate(here)])
         if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):
             return None
         return here[best]
 
-    def _assign(self, T_map_body: Sequence[Pose], T_odom_body: Pose) -> list[int]:
-        """Return which place each pose (4, 4) is nearest to, and move that there; those that are at none are new."""
+    def _assign(self, T_map_predicted: Pose, T_map_seen: Sequence[Pose], T_odom_body: Pose) -> list[int]:
+        """Return the nearest candidate of each registered pose, and move it there; a pose far from all is a new one."""
         T_body_odom = inverse(T_odom_body)
-        for k, T in enumerate(T_map_body):
-            if k == 0:
-                self._poses[:1] = [T @ T_body_odom]
-                self._before = self._before if len(self._before) else np.zeros(1)
-            elif all(matters(*off_by(T_place @ T_odom_body, T)) for T_place in self._poses):
+        self._poses[:1] = [T_map_predicted @ T_body_odom]
+        self._before = self._before if len(self._before) else np.zeros(1)
+        for T in T_map_seen:
+            if all(matters(*off_by(T_place @ T_odom_body, T)) for T_place in self._poses):
                 self._poses.append(T @ T_body_odom)
                 self._before = np.append(self._before, self._before[0])
-        owners = [0]
-        for T in T_map_body[1:]:
-            gaps = [off_by(T_place @ T_odom_body, T) for T_place in self._poses]
-            owners.append(
-                min(range(len(gaps)), key=lambda k: max(gaps[k][0] / ALERT_METRES, gaps[k][1] / ALERT_DEGREES))
-            )
-        for k, T in zip(owners, T_map_body, strict=True):
+        owners = []
+        for T in T_map_seen:
+            gaps = [np.divide(off_by(place @ T_odom_body, T), (ALERT_METRES, ALERT_DEGREES)) for place in self._poses]
+            owners.append(int(np.max(gaps, axis=1).argmin()))
+        for k, T in zip(owners, T_map_seen, strict=True):
             if k:
                 self._poses[k] = T @ T_body_odom
         return owners
 
 
-# set by hand
 _REACH = 0.3  # metres: about the map's point spacing
 _MIN_RANGE, _MAX_RANGE = 2.0, 35.0  # metres from the sensor
 _HEIGHT = 1.0  # metres above the lowest of the ground nearby
-_FLOOR_RADIUS = 10.0  # metres within which that is looked for
+_FLOOR_RADIUS = 10.0  # metres, of that ground
 _POINTS = 400  # compared
-_MIN_POINTS = 60  # fewer say nothing
+_MIN_POINTS = 60
 _NEWEST_SHARE = 0.3  # of a new share in the usual one: about the last three registrations
-_DROP = 0.7  # of the usual share: see the module
+_DROP = 0.7  # of the usual share: see DisplacementCheck
 
 
 class DisplacementCheck:
-    """Check of single frames against the map, which asks for a registration before the next one is due.
+    """Check of single frames against the map, for a registration before the next one is due.
 
     A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
-    air, would be at a wrong place until then. So of a few hundred points above the ground of every frame the share with
-    a map point near them is compared with the usual one. Below 0.7 of it were fewer than one frame in 100 at the right
-    pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else (seen once, on the simulated
-    worlds 5101, 5103, 5106 and 5108; no command prints it).
+    air, would have a wrong pose until then. So the share of a few hundred points above the ground that have a map point
+    near them is compared with the usual share, for every frame. Below 0.7 of it were fewer than 1 % of the frames at
+    the right pose, more than half of those half a metre off, and more than 98 % anywhere else (measured once, on the
+    simulated worlds 5101, 5103, 5106 and 5108; no command prints it).
 
     Attributes:
         usual: share in [0, 1]; None before the first registration.
     """
 
-    def __init__(self) -> None:
-        self.usual: float | None = None
-
-    def clear(self) -> None:
-        """Forget the usual shares."""
-        self.usual = None
+    usual: float | None = None
 
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
-        """Add a frame whose registration was verified; not others, or a slow error would become usual.
+        """Add a frame with a verified registration; with others a slow error would become usual.
 
         Args:
-            points: (N, 3) float32 of the frame, gravity-aligned frame, metres.
-            position: (3,) the sensor's, same frame.
+            points: (N, 3) float32 of the frame, gravity-aligned, metres.
+            position: (3,) of the sensor, same frame.
             T: (4, 4) map <- that frame, as registered.
             target: the map around it.
         """
@@ -150,10 +141,7 @@ class DisplacementCheck:
             self.usual = share if self.usual is None else self.usual + _NEWEST_SHARE * (share - self.usual)
 
     def is_displaced(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
-        """Tell whether a frame lies on the map much less than usual; False if there is too little to tell by.
-
-        Arguments are those of :meth:`learn`, ``T`` as predicted.
-        """
+        """Tell whether a frame fits the map much less than usual; arguments are those of :meth:`learn`."""
         if self.usual is None:
             return False
         share = share_on_map(points, position, T, target)
@@ -161,7 +149,7 @@ class DisplacementCheck:
 
 
 def share_on_map(points: Points, position: Floats, T: Pose, target: LocalMap) -> float | None:
-    """Share of the points above the ground that have a map point near them; None if they are too few to tell.
+    """Share of the points above the ground with a map point near them; None for too few points.
 
     Arguments are those of :meth:`DisplacementCheck.learn`.
     """

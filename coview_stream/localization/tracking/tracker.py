@@ -31,9 +31,9 @@ from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
-_STANDING_DRIVE = 0.2  # metres that standing still until the next registration counts as
+_STANDING_DRIVE = 0.2  # metres of driving that standing still until the next registration counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
-"""Covariance of a place that the search has accepted and that may not have converged yet."""
+"""Covariance of a place that the search has accepted and whose registration may not have converged."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried."""
 
@@ -50,7 +50,7 @@ class Tracker:
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, calibration: CalibrationEstimator
     ) -> None:
-        """Track on a map; ``calibration`` has corrected the odometry, and learns from each registration."""
+        """Track on a map; ``calibration`` corrects the odometry, and learns from each registration."""
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
@@ -67,8 +67,6 @@ class Tracker:
         self._disputed = False  # the last match contradicted odometry
         self._doubt = 1.0  # how many times the usual evidence exceeds the newest believed one
 
-    # ---- scans
-
     def add_scan(self, scan: RawScan) -> None:
         """Add a frame: its points, one per voxel, and its odometry."""
         self.odometry.add_pose(scan.T_odom_body)
@@ -81,18 +79,16 @@ class Tracker:
         self.odometry.forget_pose()
 
     def forget_scans(self) -> None:
-        """Drop the points that the next registration would use beside the next frame's."""
-        self._scans.clear()
+        """Drop all points; the next registration uses the next frame alone."""
+        self._scans.keep_newest(0)
 
     def prefetch_map(self, T_odom_body: Pose) -> None:
         """Crop the map on a frame without a registration, as a new crop takes as long as one."""
         if (target := self._target(T_odom_body)) is not None:
             target.prepare(self.config.registration.method)
 
-    # ---- when to register
-
     def needs_registration(self, patience: float = 1.0) -> bool:
-        """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
+        """Whether the robot has driven or turned ``patience`` times as far as a registration needs."""
         driven, turned = self.odometry.since_keyframe()
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
@@ -104,30 +100,28 @@ class Tracker:
         return bool(variances[2] > yaw**2 or variances[3] > position**2)
 
     def looks_displaced(self, T_odom_body: Pose) -> bool:
-        """Whether the newest frame fits the map so much less than usual that it should be registered."""
+        """Whether the newest frame fits the map so much less than usual that it needs a registration."""
         target, points = self._target(T_odom_body), self._scans.newest
         if target is None or points is None:
             return False
         return self._displacement.is_displaced(points, T_odom_body[:3, 3], self.T_map_odom, target)
 
-    # ---- the belief
-
     def start(
         self, registration: Registration, T_odom_body: Pose, travelled: float, T_odom_found: Pose | None = None
     ) -> None:
-        """Begin with an accepted place, with a wide covariance, as its registration may not have converged.
+        """Begin at an accepted place, with a wide covariance.
 
         Args:
             registration: of the accepted keyframe.
             T_odom_body: (4, 4) odometry of the newest frame.
-            travelled: metres that odometry had driven at that keyframe.
+            travelled: metres driven up to that keyframe.
             T_odom_found: (4, 4) odometry of that keyframe; None if it is the newest frame.
         """
         self._matcher.clear()
         self.ground.clear()
         self.odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
-        self._displacement.clear()
+        self._displacement.usual = None
         self._shared_error.clear()
         registered = registration_covariance(registration.information, self.config.registration)
         T_odom_keyframe = T_odom_body if T_odom_found is None else T_odom_found
@@ -147,9 +141,9 @@ class Tracker:
         Args:
             cloud: (N, 3) the newest frame, already added, in the sensor's axes.
             T_odom_body: (4, 4) its odometry.
-            standing_still: by odometry; use only frames since the last registration, and trust odometry a little less:
-                repeated views of a standing robot must not add up to certainty.
-            newest_only: use the newest frame alone, as it or earlier ones are in doubt.
+            standing_still: use only frames since the last registration, and trust odometry a little less: repeated
+                views of a standing robot must not add up to certainty.
+            newest_only: use the newest frame alone, as the frames are in doubt.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
@@ -161,7 +155,7 @@ class Tracker:
         points = prepare_scan(self._scans.window(), T_odom_body[:3, 3], self.config.registration)
         points = self.ground.lower(points)
         newest = self._scans.newest
-        # older frames complete a sparse newest one, but cannot replace a blind one
+        # older frames add to a sparse newest one, but cannot replace a blind one
         count = 0 if newest is None else min(len(points.points), len(newest))
         if count < _MIN_POINTS:
             verdict = MatchVerdict(RejectionReason.BLIND, f"only {count} points to register")
@@ -172,7 +166,7 @@ class Tracker:
         if newest_only or not match.verdict.verified or match.innovation > limit:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
-            match = max(tries, key=_rank)
+            match = max(tries, key=lambda attempt: (attempt.verdict.verified, attempt.verdict.ratio))
         if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
             predicted = tries[0] if match.innovation <= limit and not self._disputed else belief
             return self._matcher.against_odometry(
@@ -181,7 +175,7 @@ class Tracker:
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
-        """Correct the belief by a registration at the newest frame, if it is believed."""
+        """Correct the belief by a registration at the newest frame, if ``believed``."""
         verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
@@ -196,7 +190,7 @@ class Tracker:
             self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
             return
-        self._scans.clear()  # bad frames among the newest must not spoil the next registration too
+        self._scans.keep_newest(0)  # bad frames among the newest must not spoil the next registration too
 
     def predicted_covariance(self) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
@@ -213,16 +207,13 @@ class Tracker:
         return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
 
     def protection_level(self) -> ProtectionLevel:
-        """Metres and degrees that the error exceeds once in a thousand, wider if the evidence is below the usual."""
+        """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
         return protection_level(self.reported_covariance(), self._doubt)
-
-    # ---- inside
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
     def _restart(self, T_map_cloud: Pose, covariance: Floats, T_odom_body: Pose) -> None:
-        """Begin a new graph without the old one's information."""
         self._matcher.dispute.clear()
         self._graph.start(T_map_cloud, covariance)
         self.odometry.set_keyframe(T_odom_body)
@@ -240,7 +231,7 @@ class Tracker:
         return self._belief()
 
     def _belief(self) -> Estimate:
-        """Return the newest keyframe's body pose by the present calibration, with the cloud's covariance."""
+        """Return the newest keyframe's body pose by the present calibration."""
         of_cloud = self._graph.estimate
         level = inverse(self._calibration.calibration.T_body_cloud)
         return Estimate(of_cloud.T_map_body @ level, of_cloud.covariance)
@@ -267,7 +258,3 @@ class Tracker:
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
         self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
-
-
-def _rank(match: MapMatch) -> tuple[bool, float]:
-    return match.verdict.verified, match.verdict.ratio

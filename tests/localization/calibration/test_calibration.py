@@ -126,6 +126,7 @@ def test_ground_offset_of_the_site_is_restored_and_outlives_the_place(world_map)
     localizer.hint_calibration(Calibration(ground=0.35))
     assert localizer.calibration.ground > 0.15
     localizer.relocalize()
+    localizer.hint_calibration(Calibration())
     assert localizer.calibration.ground > 0.15
 
 
@@ -139,7 +140,7 @@ def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
 
 def test_what_is_known_better_here_stays_group_by_group():
     estimator = CalibrationEstimator()
-    estimator.restore(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
+    estimator.learn(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
     estimator.learn(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001).doubted())
     assert estimator.calibration.pitch == pytest.approx(0.03, abs=0.002)
     assert 0.008 < estimator.calibration.scale < 0.03

@@ -89,17 +89,17 @@ def test_what_was_known_before_is_a_prior_and_no_more():
     before = drive((0.0, 3.0))
     assert np.degrees(before.doubted().sigma_tilt) == pytest.approx(1.0)
     estimator = CalibrationEstimator()
-    estimator.restore(before.doubted())
+    estimator.learn(before.doubted())
     assert np.degrees(estimator.calibration.pitch) == pytest.approx(3.0, abs=0.7)
     known = Calibration(0.0, np.radians(4.0), 0.05, 0.0, np.radians(0.2), 0.002, np.radians(0.005))
-    estimator.restore(known)
+    estimator.learn(known)
     assert estimator.calibration.pitch == pytest.approx(known.pitch, rel=0.02)
     assert estimator.calibration.scale == pytest.approx(known.scale, rel=0.02)
 
 
 def test_sensor_that_cannot_lean_does_not():
     estimator = CalibrationEstimator(sensor_leans=False)
-    estimator.restore(Calibration(pitch=0.1))
+    estimator.learn(Calibration(pitch=0.1, sigma_tilt=1e-3))
     leaning = pose_from(exp_so3(np.radians([0.0, 3.0, 0.0])), np.zeros(3))
     for _ in range(20):
         estimator.measure_attitude(leaning, np.eye(4), 1e-6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,7 +108,7 @@ def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
     truth, whole = world_drive.T_map_body[4], register
-    monkeypatch.setattr(map_matching, "register", lambda *given: replace(whole(*given), information=bad))
+    monkeypatch.setattr(map_matching, "register", lambda *given: whole(*given)._replace(information=bad))
     found = matched(world_map, scan, Estimate(truth, TIGHT))
     assert_no_hold(found, truth)
     assert found.verdict.evidence is not None  # it is as good as ever, and does not help
@@ -243,7 +242,7 @@ def judged(shift, degrees, sigma, innovation, disputed=False):
     there = MapMatch(fits, pose_from(rot_z(np.radians(degrees)), shift), 1e-4 * np.eye(6), innovation)
     near = MapMatch(fits, np.eye(4), 1e-4 * np.eye(6), 1.0)
     matcher = SimpleNamespace(
-        config=LocalizerConfig(), dispute=SimpleNamespace(settle=lambda *_: asked.append(1))
+        _config=LocalizerConfig(), dispute=SimpleNamespace(settle=lambda *_: asked.append(1))
     )  # fmt: skip
     scan = SimpleNamespace(T_odom_body=np.eye(4))
     led = near if innovation <= LocalizerConfig().acceptance.max_innovation and not disputed else belief
@@ -256,7 +255,8 @@ def judged(shift, degrees, sigma, innovation, disputed=False):
 )
 def test_pose_above_or_below_is_no_rival(moved, beside):
     """Wheels slip along the ground."""
-    assert _beside(pose_from(np.eye(3), moved), np.eye(4)) == beside
+    scan = SimpleNamespace(T_odom_body=np.eye(4))
+    assert _beside(scan, pose_from(np.eye(3), moved), np.eye(4)) == beside
 
 
 @pytest.mark.parametrize("disputed", [False, True])

@@ -178,7 +178,7 @@ def test_tilt_is_that_of_the_cloud_whatever_is_known_already():
     lean = exp_so3(np.radians([0.0, 2.0, 0.0]))
     for known in (0.0, -1.0, -2.0):
         estimator = CalibrationEstimator()
-        estimator.restore(Calibration(pitch=np.radians(known)))
+        estimator.learn(Calibration(pitch=np.radians(known), sigma_tilt=0.01))
         for _ in range(20):
             estimator.measure_attitude(pose_from(lean.T, np.zeros(3)), np.eye(4), np.radians(0.05) ** 2)
         assert np.degrees(estimator.calibration.pitch) == pytest.approx(-2.0, abs=0.15), known
