@@ -24,29 +24,37 @@ from coview_stream.localization.registration.prepare_scan import RegistrationClo
 from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
-# chosen by hand
 STEP = 4.0  # metres driven from keyframe to keyframe
-_REACH = 2.0  # metres driven before and after it of which the frames are taken
-_EVERY = 0.5  # metres from one of these frames to the next
+_REACH = 2.0  # metres driven before and after it, of its frames
+_EVERY = 0.5  # metres between these frames
 _VOXEL = 0.2  # metres
 _NEAR, _FAR = 1.5, 50.0  # metres from the lidar
 _NEIGHBOURS, _RADIUS = 20, 1.0  # of normals
 
+AGREE = 3.0
+"""Sigmas per degree of freedom up to which two poses agree; chosen by hand, like the next."""
+_SIGMAS = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # of the initial poses of a registration
+_SCALES = (1.6, 0.8, 0.4)  # metres
+_APART = 10.0  # largest distance of two registered keyframes, metres
+_LOOP = 30.0  # least metres driven between two keyframes of one run
+_OTHERS = 2  # most keyframes of another run to register one to
+_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # least shares of the points with a partner
+_MATCH = 0.5  # largest distance between points of one surface, metres
+_FLAT = 0.5  # least planarity of a surface to measure distances from
+
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """One keyframe and the points around it.
-
-    Its frame has its origin in the body and the map's axes, by the poses of ``locate``.
+    """One keyframe and the points around it, about the body, along the map's axes by the poses of ``locate``.
 
     Attributes:
         run: number of the run, from 0.
-        index: of the keyframe among the run's frames that have a pose.
+        index: of the keyframe among the run's frames with a pose.
         driven: metres along the run.
         turned: radians along the run, all turns counted positive.
-        T_map_body: (4, 4) as ``locate`` had it, relative to the map's origin.
+        T_map_body: (4, 4) by ``locate``, relative to the map's origin.
         T_odom_body: (4, 4).
-        points: (N, 3) float32, its frame, metres.
+        points: (N, 3) float32, metres.
     """
 
     run: int
@@ -59,12 +67,12 @@ class Submap:
 
     @property
     def T_submap_body(self) -> Pose:
-        """The turn (4, 4) from the body's axes to the submap's."""
+        """(4, 4), a turn alone."""
         return pose_from(self.T_map_body[:3, :3], np.zeros(3))
 
     @cached_property
     def source(self) -> RegistrationCloud:
-        """The points, prepared to be registered."""
+        """The points, prepared for registration."""
         return prepare_scan(self.points, np.zeros(3), RegistrationConfig())
 
     @cached_property
@@ -77,13 +85,7 @@ class Submap:
 
 
 def submaps_of(run: LocalizedRun, number: int, origin: Floats) -> list[Submap]:
-    """Return the submaps of a run, in order; a frame is read once at most.
-
-    Args:
-        run: the localized run.
-        number: of the run, from 0.
-        origin: (3,) of the map.
-    """
+    """Return the submaps of run ``number`` in order, on a map with ``origin`` (3,); each frame is read once at most."""
     odometry = run.odometry
     driven, turned = path_of(odometry)
     wanted = np.zeros(len(run), dtype=bool)
@@ -99,28 +101,25 @@ def submaps_of(run: LocalizedRun, number: int, origin: Floats) -> list[Submap]:
             T = frame.T_map_body.copy()
             T[:3, 3] -= run.poses[keys[at], :3, 3] - origin
             near[at].append(kernels.transform_unique(points, T, _VOXEL)[0])
-    out = []
+    submaps = []
     for key, parts in zip(keys, near, strict=True):
-        cloud = np.concatenate(parts) if parts else np.zeros((0, 3), dtype=np.float32)
+        cloud = np.concatenate([np.zeros((0, 3), dtype=np.float32), *parts])
         cloud = kernels.transform_unique(cloud, np.eye(4), _VOXEL)[0]
         T = run.poses[key].copy()
         T[:3, 3] -= origin
-        out.append(Submap(number, int(key), float(driven[key]), float(turned[key]), T, odometry[key], cloud))
-    return out
+        submaps.append(Submap(number, int(key), float(driven[key]), float(turned[key]), T, odometry[key], cloud))
+    return submaps
 
 
 def path_of(poses: Floats) -> tuple[Floats, Floats]:
-    """Return metres driven (K,) and radians turned (K,) up to each of some poses (K, 4, 4)."""
+    """Return metres driven (K,) and radians turned (K,) up to each of the poses (K, 4, 4)."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [abs(yaw_of(inverse(a) @ b)) for a, b in pairwise(poses)]
     return np.append(0.0, np.cumsum(steps)), np.append(0.0, np.cumsum(np.asarray(turns, dtype=np.float64)))
 
 
 def spaced(driven: Floats, step: float) -> Ints:
-    """Return indices into metres driven (K,): the first, others ``step`` or more apart, and the last.
-
-    The last is left out within half a step of the one before.
-    """
+    """Return indices into metres driven (K,): the first, others ``step`` or more apart, and a last over half a step."""
     chosen = [0]
     for k in range(1, len(driven)):
         if driven[k] - driven[chosen[-1]] >= step:
@@ -130,28 +129,15 @@ def spaced(driven: Floats, step: float) -> Ints:
     return np.asarray(chosen, dtype=np.int64)
 
 
-AGREE = 3.0
-"""Sigmas per degree of freedom up to which two poses agree; chosen by hand, like the next."""
-
-_BELIEF = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # sigmas of the poses that a registration starts from
-_SCALES = (1.6, 0.8, 0.4)  # metres
-_APART = 10.0  # metres between two keyframes that are registered to each other, at most
-_LOOP = 30.0  # least metres driven between two keyframes of one run
-_OTHERS = 2  # keyframes of another run that one is registered to, at most
-_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # shares of the points that have to find a partner
-_MATCH = 0.5  # metres between points of one surface, at most
-_FLAT = 0.5  # least planarity of a surface to measure distances from
-
-
 @dataclass(frozen=True, eq=False)
 class Constraint:
     """Result of one registration.
 
     Attributes:
-        source: index of the submap that was registered.
-        target: index of the one that it was registered to; -1: the base map.
+        source: index of the registered submap.
+        target: index of the submap that it was registered to; -1: the base map.
         T: (4, 4) pose of the source's body, relative to the target's body or to the map's origin.
-        covariance: (6, 6) over (rx, ry, rz, x, y, z) of it, along the axes of the source's body.
+        covariance: (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body.
     """
 
     source: int
@@ -161,10 +147,10 @@ class Constraint:
 
 
 class Registrar:
-    """Registers submaps, and measures the distances between their surfaces."""
+    """Registration of submaps, and distances between their surfaces."""
 
     def __init__(self, submaps: Sequence[Submap], maps: LocalMaps) -> None:
-        """Register these submaps, and to these crops of the base map."""
+        """Register submaps to crops of the base map and to each other."""
         self.submaps = submaps
         self._maps = maps
         self._config = RegistrationConfig()
@@ -172,7 +158,7 @@ class Registrar:
     def to_map(self, k: int) -> Constraint | None:
         """Register submap ``k`` to the base map from the pose of ``locate``; None where too little is alike.
 
-        Where both agree the pose is the one of ``locate``, which knows the registrations of all frames before.
+        Where both agree the pose is that by ``locate``, which knows the registrations of all earlier frames.
         """
         T_located = self.submaps[k].T_map_body
         target = self._maps.around(T_located[:3, 3])
@@ -192,7 +178,7 @@ class Registrar:
         scan, turn = self.submaps[k].source, self.submaps[k].T_submap_body
         if not len(scan.points):
             return None
-        information, pivot, config = np.diag(_BELIEF**-2), np.zeros(3), self._config
+        information, pivot, config = np.diag(_SIGMAS**-2), np.zeros(3), self._config
         prior = kernels.Prior(T_start @ inverse(turn), information)
         match = register(scan, prior.T_map_source, target, config, _SCALES, prior, pivot)
         if match is None or match.pairs < (_ON_MAP if other < 0 else _ON_SUBMAP) * config.keep * len(scan.points):
@@ -237,7 +223,7 @@ def off_by(constraint: Constraint, T: Pose) -> float:
 
 
 def overlapping(submaps: Sequence[Submap]) -> list[tuple[int, int]]:
-    """Return pairs of submaps of the same place: nearest ones of other runs, and loops of the same run."""
+    """Return pairs of submaps of the same place: nearest submaps of other runs, and loops of the same run."""
     places = np.array([submap.T_map_body[:3, 3] for submap in submaps])
     runs = np.array([submap.run for submap in submaps])
     driven = np.array([submap.driven for submap in submaps])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +42,12 @@ _MAX_CELLS = 400_000_000
 class SurveyCover:
     """Heights of the highest points of the base map around each place.
 
-    A thing that stood higher would have been seen from above and would be in the map; a lower one may have been hidden
-    below a roof or a crown, or be a facade.
+    A higher object would be in a survey from above; a lower one may have been hidden below a roof or a crown, or be a
+    facade.
     """
 
     def __init__(self, base_map: BaseMap, low: Points, high: Points) -> None:
-        """Look at a rectangle from ``low`` (2,) to ``high`` (2,), relative to the map's origin."""
+        """Cover a rectangle from ``low`` (2,) to ``high`` (2,), relative to the map's origin."""
         self._low = np.floor(np.asarray(low, dtype=np.float64) - 2.0)
         shape = np.ceil((np.asarray(high, dtype=np.float64) + 2.0 - self._low) / _CELL).astype(int) + 1
         if int(shape[0]) * int(shape[1]) > _MAX_CELLS:
@@ -54,23 +55,22 @@ class SurveyCover:
         top = np.full(tuple(shape), -np.inf, dtype=np.float32)
         for begin in range(0, len(base_map.points), _CHUNK):
             points = np.asarray(base_map.points[begin : begin + _CHUNK])
-            cells = np.floor((points[:, :2] - self._low) / _CELL).astype(np.int64)
-            inside = ((cells >= 0) & (cells < shape)).all(axis=1)
-            np.maximum.at(top, tuple(cells[inside].T), points[inside, 2])
+            inside, cells = _within_raster(np.floor((points[:, :2] - self._low) / _CELL), top)
+            np.maximum.at(top, cells, points[inside, 2])
         self._top = max_filter(top, _AROUND)
 
     def top_around(self, points: Points) -> Floats32:
-        """Return the highest height (N,) of the map around points (N, 3); minus infinity where it has no points."""
-        cells = np.floor((points[:, :2] - self._low) / _CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self._top.shape)).all(axis=1)
-        out = np.full(len(points), -np.inf, dtype=np.float32)
-        out[inside] = self._top[tuple(cells[inside].T)]
-        return out
+        """Return the greatest height (N,) of the map around points (N, 3); minus infinity where it has no points."""
+        inside, cells = _within_raster(np.floor((points[:, :2] - self._low) / _CELL), self._top)
+        heights = np.full(len(points), -np.inf, dtype=np.float32)
+        heights[inside] = self._top[cells]
+        return heights
 
-    def saw(self, points: Points, above: float) -> Bools:
-        """Tell (N,) whether the survey would have seen points (N, 3): ``above`` metres over all around them."""
-        top = self.top_around(points)
-        return np.asarray(np.isfinite(top) & (points[:, 2] > top + above))
+
+def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple[Ints, ...]]:
+    """Return the rows (M,) of cells (N, 2) within a raster, and these cells as an index."""
+    inside = np.flatnonzero(((cells >= 0) & (cells < raster.shape)).all(axis=1))
+    return inside, tuple(cells[inside].astype(np.int64).T)
 
 
 Progress = Callable[[str, int, int], None]
@@ -88,7 +88,7 @@ class FuseConfig:
     """Selection of the runs' points.
 
     Attributes:
-        voxel: metres; one point of all runs in each cube of this size, and none this near to the map's points.
+        voxel: metres; one point of all runs per cube of this size, and none this near to the map's points.
         range_min: metres from the lidar; nearer points may be the robot itself.
         range_max: metres from the lidar; farther points suffer from errors of the pose's angles.
         keep_moving: keep people and cars, which other rays went through.
@@ -118,7 +118,7 @@ class Added:
         frames: used.
         without_pose: frames that have no pose.
         damaged: frames that could not be read.
-        points: of the run in the fused cloud; a voxel that several runs saw counts for the first of them.
+        points: of the run in the fused cloud; a voxel of several runs counts for the first of them.
     """
 
     frames: int
@@ -137,10 +137,10 @@ class Fused:
         points: (N, 3) float32 of the runs, relative to the map's origin.
         source: (N,) uint16 number of the run, from 1.
         change: (N,) uint8 tag: same, or new.
-        stamp: (N,) float64 of the newest frame that saw it, seconds.
+        stamp: (N,) float64 of the newest frame with the point, seconds.
         added: by run.
-        filled: square metres of surface, about, that lie in blind spots of the survey.
-        moving: voxels apart from the map that rays went through; left out without ``keep_moving``.
+        filled: square metres, about, of new surface in blind spots of the survey.
+        moving: voxels apart from the map with rays through them; left out without ``keep_moving``.
     """
 
     base_map: BaseMap
@@ -175,8 +175,8 @@ def fuse(
 ) -> Fused:
     """Merge localized runs with the map they were localized on.
 
-    Frames are read for their surfaces, and a few of them again for the points that their rays went through.
-    Memory holds one row per voxel that the runs hit, not their points.
+    Frames are read for their surfaces, and a few of them again for their rays. Memory holds one row per voxel with
+    points, not the points.
 
     Raises:
         InputError: a frame lies too far from the map.
@@ -190,7 +190,13 @@ def fuse(
     base = _base_near(base_map, points) if config.changes else np.zeros(0, dtype=np.int64)
     base_points = np.asarray(base_map.points[base])
     sightings = Sightings(np.concatenate([points, base_points]), max(0.3, 1.2 * config.voxel))
-    _look(runs, sightings, progress)
+    for number, run in enumerate(runs, start=1):
+        chosen = looks_at(run.stamps, run.poses[:, :3, 3])
+        for done, frame in enumerate(run.frames(chosen.__getitem__), start=1):
+            if frame is not None:
+                sightings.look(frame)
+            if progress:
+                progress(f"rays of run {number}", done, len(run))
     through, seen = sightings.given(sightings.through), sightings.given(sightings.seen)
     n = len(points)
     moving = _seen_through(through[:n], seen[:n], _THROUGH_MOVING)
@@ -200,8 +206,12 @@ def fuse(
     new = np.zeros(n, dtype=bool)
     if config.changes:
         enough = rows["hits"] >= min(2, sum(taken))
-        new = ~moving & enough & (to_map > _NEAR) & cover.saw(points, _ABOVE)
-        base_change[base[_gone(base_points, through[n:], seen[n:], points[~moving])]] = GONE
+        top = cover.top_around(points)
+        surveyed = np.isfinite(top) & (points[:, 2] > top + _ABOVE)  # the survey would have seen it
+        new = ~moving & enough & (to_map > _NEAR) & surveyed
+        gone = np.flatnonzero(_seen_through(through[n:], seen[n:], _THROUGH_GONE))
+        lasting = np.isfinite(distances(base_points[gone], within(points[~moving]), _NEAR))
+        base_change[base[gone[~lasting]]] = GONE
     keep = (to_map > config.voxel) & (~moving | config.keep_moving)
     blind = keep & ~new & (to_map > _NEAR) & np.isfinite(cover.top_around(points))
     source = rows["source"][keep]
@@ -225,7 +235,7 @@ def fuse(
 def _surfaces(
     runs: Sequence[LocalizedRun], config: FuseConfig, progress: Progress | None
 ) -> tuple[VoxelTable, list[int]]:
-    """Collect the voxels of all runs, and count the frames that were taken of each."""
+    """Collect the voxels of all runs, and count their frames by run."""
     table, taken = VoxelTable(config.voxel), []
     for source, run in enumerate(runs, start=1):
         count = 0
@@ -241,26 +251,8 @@ def _surfaces(
     return table, taken
 
 
-def _look(runs: Sequence[LocalizedRun], sightings: Sightings, progress: Progress | None) -> None:
-    for source, run in enumerate(runs, start=1):
-        chosen = looks_at(run.stamps, run.poses[:, :3, 3])
-        for done, frame in enumerate(run.frames(lambda k, chosen=chosen: bool(chosen[k])), start=1):  # type: ignore[misc]
-            if frame is not None:
-                sightings.look(frame)
-            if progress:
-                progress(f"rays of run {source}", done, len(run))
-
-
 def _seen_through(through: Counts, seen: Counts, times: int) -> Bools:
     return np.asarray((through >= _LOOKS) & (through > times * seen.astype(np.int64)))
-
-
-def _gone(points: Points, through: Counts, seen: Counts, now: Points) -> Bools:
-    """Tell which of the map's points (B, 3) are gone: seen through, with no lasting point near them now."""
-    gone = _seen_through(through, seen, _THROUGH_GONE)
-    far: Floats32 = distances(points[gone], within(now), _NEAR)
-    gone[gone] = ~np.isfinite(far)
-    return gone
 
 
 def _base_near(base_map: BaseMap, points: Points) -> Ints:
@@ -269,20 +261,15 @@ def _base_near(base_map: BaseMap, points: Points) -> Ints:
     low = np.floor(points[:, :2].min(axis=0).astype(np.float64) / tile) - 1
     shape = (np.floor(points[:, :2].max(axis=0) / tile) + 2 - low).astype(int)
     grid = np.zeros(tuple(shape), dtype=bool)
-    grid[tuple((np.floor(points[:, :2].astype(np.float64) / tile) - low).astype(int).T)] = True
+    grid[_within_raster(np.floor(points[:, :2].astype(np.float64) / tile) - low, grid)[1]] = True
     near = []
     for begin in range(0, len(base_map.points), _CHUNK):
-        cells = (np.floor(base_map.points[begin : begin + _CHUNK, :2] / tile) - low).astype(int)
-        inside = np.flatnonzero(((cells >= 0) & (cells < shape)).all(axis=1))
-        near.append(begin + inside[grid[tuple(cells[inside].T)]])
+        inside, cells = _within_raster(np.floor(base_map.points[begin : begin + _CHUNK, :2] / tile) - low, grid)
+        near.append(begin + inside[grid[cells]])
     return np.concatenate(near)
 
 
 def check_count(runs: int) -> None:
-    """Refuse more runs than a point's source number can count.
-
-    Raises:
-        ConfigError: there are more than 65,535.
-    """
+    """Raise ConfigError for more runs than the 65,535 of a point's source number."""
     if runs > np.iinfo(np.uint16).max:
         raise ConfigError(f"{runs} runs: at most 65,535 can be told apart; fuse some of them first")

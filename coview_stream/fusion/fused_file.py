@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.las import las_writer, require_laspy
@@ -25,15 +24,11 @@ _PCD_TYPES = {"f8": "8 F", "u2": "2 U", "u1": "1 U"}
 
 
 def check_name(path: Path, inputs: Iterable[Path]) -> None:
-    """Refuse a name that no cloud can have, the name of an input, and LAS where laspy is missing.
-
-    Raises:
-        CloudError: the name is refused. DependencyError: laspy is missing.
-    """
+    """Raise CloudError for a name that no cloud can have or an input has, DependencyError for LAS without laspy."""
     if path.suffix.lower() not in SUFFIXES:
         raise CloudError(f"{path}: name a cloud, one of {', '.join(SUFFIXES)}")
     if path.is_dir() or not path.resolve().parent.is_dir():
-        raise CloudError(f"{path}: is a directory, or in none; name a file in a directory that is there")
+        raise CloudError(f"{path}: is a directory, or in none; name a file in an existing directory")
     for other in inputs:
         if path.resolve() == other.resolve() or (other.is_dir() and other.resolve() in path.resolve().parents):
             raise CloudError(f"{path}: is, or lies in, {other}, which is read; name another file")
@@ -139,11 +134,8 @@ def _plain(stream: BinaryIO, fused: Fused, path: Path) -> None:
             f"POINTS {count}\nDATA binary\n".encode()
         )
     for rows in fused.chunks():
-        stream.write((_columns(rows) if kind == ".npy" else rows).tobytes())
-
-
-def _columns(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
-    return np.stack([rows[name].astype("<f8") for name in RECORD.names or ()], axis=1)
+        columns = np.stack([rows[name].astype("<f8") for name in names], axis=1) if kind == ".npy" else rows
+        stream.write(columns.tobytes())
 
 
 def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:

@@ -1,12 +1,12 @@
 """Joint adjustment: the poses of several runs, from their registrations to the map, to each other, and odometry.
 
-Unknown are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), gtsam finds the most probable ones given
+The unknowns are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), gtsam finds the most probable ones given
 
 * registrations to the map: e(Y_k, X_k) ~ N(0, R_k)
 * odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q measured from the registrations, as while tracking
 * registrations of overlapping submaps, of two runs or of two times of one: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
 
-all under Cauchy's kernel. Pairs of submaps that took no part judge whether the result is better.
+all under Cauchy's kernel. Held-out pairs of submaps decide whether the result is better.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ Progress = Callable[[str, int, int], None]
 
 # chosen by hand
 _KERNEL = 3.0  # sigmas, of Cauchy's weights
-_ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # belief in a pose that nothing else holds
+_ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # sigmas of a pose without other constraints
 _HELD_OUT = 4  # one of so many pairs is held out to judge the result
 _MIN_HELD_OUT = 3
-_MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distance to the map may grow
+_MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # largest growth of the distance to the map: factor and metres
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Judgement:
     """Medians of distances between surfaces before and after, metres; NaN where there are none.
 
     Attributes:
-        runs: between submaps that overlap and were not used: before, after.
-        to_map: between submaps and the base map: before, after.
+        runs: between held-out submaps.
+        to_map: between submaps and the base map.
     """
 
     runs: tuple[float, float]
@@ -71,15 +71,15 @@ class Joint:
     """Result of a joint adjustment.
 
     Attributes:
-        located: poses of each run by ``locate``, (K, 4, 4) map <- body in the coordinates of the map's sources.
-        adjusted: the adjusted poses, in the same form.
-        keyframes: how many.
-        on_map: registrations to the map.
-        odometry: steps from keyframe to keyframe.
-        between: pairs of submaps of two runs.
-        loops: pairs of submaps of one run.
-        held_out: pairs that took no part, to judge the result.
-        residuals: median of |e| in sigmas of all constraints between submaps that took part: before, after.
+        located: poses by ``locate`` by run, (K, 4, 4) map <- body in the coordinates of the map's sources.
+        adjusted: the adjusted poses, likewise.
+        keyframes: number of keyframes.
+        on_map: number of registrations to the map.
+        odometry: number of steps from keyframe to keyframe.
+        between: number of used pairs of submaps of two runs.
+        loops: number of used pairs of submaps of one run.
+        held_out: number of pairs to judge the result by.
+        residuals: median of |e| in sigmas of the used constraints between submaps: before, after.
         judgement: distances; None with too few pairs to judge by.
     """
 
@@ -129,10 +129,10 @@ class Joint:
 def adjust(
     base_map: BaseMap, runs: Sequence[LocalizedRun], progress: Progress | None = None, *, relative: bool = True
 ) -> Joint:
-    """Adjust the poses of runs jointly; the runs themselves stay as they are.
+    """Adjust the poses of runs jointly; the runs stay unchanged.
 
     Args:
-        base_map: the map that they were localized on.
+        base_map: the map of their localization.
         runs: one or more.
         progress: called after each step.
         relative: use registrations between submaps; False for a comparison with the map and odometry alone.
@@ -172,7 +172,6 @@ def adjust(
         for number, run in enumerate(runs)
     )
     loops = sum(submaps[pair.source].run == submaps[pair.target].run for pair in used)
-    residuals = (_residual(used, before), _residual(used, after))
     return Joint(
         tuple(run.poses for run in runs),
         adjusted,
@@ -182,15 +181,15 @@ def adjust(
         between=len(used) - loops,
         loops=loops,
         held_out=len(held_out),
-        residuals=residuals,
+        residuals=(_residual(used, before), _residual(used, after)),
         judgement=judgement,
     )
 
 
 def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:
-    """Return the steps of odometry, with the uncertainty that the run's registrations to the map show.
+    """Return the steps of odometry, with the drift by the run's registrations to the map.
 
-    Where an end has no registration, the step is taken from ``locate`` unless it jumps there.
+    Where an end has no registration, the step is that of ``locate`` unless it jumps there.
     """
     config = LocalizerConfig().tracking
     registered = {constraint.source: constraint for constraint in on_map}
@@ -255,7 +254,7 @@ def _medians(apart: Callable[[Floats], list[Floats]], before: Floats, after: Flo
 
 
 def _spread(run: LocalizedRun, keyframes: Sequence[tuple[Submap, Pose]], origin: Floats) -> Poses:
-    """Return poses (K, 4, 4) of all frames: the moves of the keyframes around, blended by the way driven."""
+    """Return poses (K, 4, 4) of all frames: moves of the keyframes around, interpolated by metres driven."""
     driven, _ = path_of(run.odometry)
     at = np.array([submap.driven for submap, _ in keyframes])
     moves = [T @ inverse(submap.T_map_body) for submap, T in keyframes]

@@ -50,11 +50,7 @@ class RunPair:
 
 
 def parse_pair(text: str) -> RunPair:
-    """Read ``RUN:OUT``; paths may have colons if only one way to split the text names existing paths.
-
-    Raises:
-        InputError: no way to split the text names existing paths, or several do.
-    """
+    """Read ``RUN:OUT``; InputError unless exactly one way to split the text at a colon names existing paths."""
     ways = [k for k, letter in enumerate(text) if letter == ":" and 0 < k < len(text) - 1]
     if not ways:
         raise InputError(f"{text}: write RUN:OUT, the run and the results of `coview-stream locate RUN -o OUT`")
@@ -75,7 +71,7 @@ class PosedFrame:
 
     Attributes:
         stamp: seconds.
-        points: (N, 3) float32 in the body frame, levelled, metres, relative to ``origin``.
+        points: (N, 3) float32 in the body frame, levelled, metres.
         T_map_body: (4, 4), relative to the map's origin.
         eye: (3,) of the lidar in the body frame, levelled.
     """
@@ -91,14 +87,14 @@ class LocalizedRun:
 
     Attributes:
         pair: its paths.
-        stamps: (K,) of the frames that have a pose, seconds.
-        poses: (K, 4, 4) theirs, map <- body, in the coordinates of the map's sources.
-        without_pose: frames of the run that have none.
+        stamps: (K,) of the frames with a pose, seconds.
+        poses: (K, 4, 4) map <- body, in the coordinates of the map's sources.
+        without_pose: number of frames without a pose.
         damaged: indices of frames that could not be read so far.
     """
 
     def __init__(self, pair: RunPair, base_map: BaseMap, open_it: Callable[[Path, Mount | None], Run]) -> None:
-        """Read the results, then open the run with ``open_it`` (its path, the mount given to ``locate``).
+        """Read the results, then open the run with ``open_it`` (its path, the mount of ``locate``).
 
         Raises:
             InputError: the results are of another map, no frame has a pose, or files cannot be read.
@@ -115,7 +111,9 @@ class LocalizedRun:
         self._correction = SweepCorrection(self._R_level, scale)
         turn = np.radians(_number(calibration, "odometry_turn_deg_per_m"))
         self._calibration = Calibration(scale=scale, turn=float(turn))
-        self._run = open_it(pair.run, _mount(result))
+        mount = _part(result, "mount")
+        axes = ("roll", "pitch", "yaw", "x", "y", "z")
+        self._run = open_it(pair.run, Mount(**{name: _number(mount, name) for name in axes}) if mount else None)
         self._origin = base_map.origin
         self.damaged: set[int] = set()
         self._index, at = _matched(self._run.stamps, stamps)
@@ -142,7 +140,7 @@ class LocalizedRun:
         return self._run.notes
 
     def frames(self, wanted: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
-        """Yield the frames with a pose, in order; None for a damaged one, or one that ``wanted`` refuses."""
+        """Yield the frames with a pose, in order; None for damaged frames and those that ``wanted`` refuses."""
         lever = np.zeros(3) if self._run.mount is None else self._run.mount.T_body_sensor[:3, 3]
         for k, index in enumerate(self._index):
             if wanted is not None and not wanted(k):
@@ -207,8 +205,3 @@ def _part(result: dict[str, Any], name: str) -> dict[str, Any]:
 def _number(values: dict[str, Any], name: str, otherwise: float = 0.0) -> float:
     value = values.get(name, otherwise)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else otherwise
-
-
-def _mount(result: dict[str, Any]) -> Mount | None:
-    value = _part(result, "mount")
-    return Mount(**{name: _number(value, name) for name in ("roll", "pitch", "yaw", "x", "y", "z")}) if value else None

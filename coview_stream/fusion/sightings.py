@@ -1,4 +1,4 @@
-"""Sightings of points: how often rays ended at them or went through them, and the tables of points to look up."""
+"""Sightings of points: counts of rays that end at them or go through them, and look-ups of points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coview_stream.geometry.transforms import Points
 REACH = 25.0
 """Metres within which rays count: farther off, neighbouring rays miss things between them."""
 
-_PIXEL = np.radians(0.5)  # of the picture of ranges; 0.2 m at the reach
+_PIXEL = np.radians(0.5)  # of the range image; 0.2 m at the reach
 _COLUMNS, _ROWS = 720, 361
 _NEAREST, _STEEPEST = 1.5, np.radians(70.0)
 _TILE = 8.0  # metres, of the look-up of points
@@ -26,14 +26,14 @@ Counts = npt.NDArray[np.uint32]
 
 
 class Sightings:
-    """Counts of the sightings of points that do not change.
+    """Counts of the sightings of fixed points.
 
-    A ray goes through a point if it and all rays in the pixels around end well behind it; one that grazes the ground
-    or an edge does not count. Without a ray nothing is known.
+    A ray goes through a point if it and all rays in the pixels around end well behind it; a ray that grazes the ground
+    or an edge does not count.
 
     Attributes:
         points: (N, 3) relative to the map's origin, sorted by tile.
-        order: (N,) indices of the points in the given order.
+        order: (N,) indices of these points among the given ones.
         through: (N,) looks through the point.
         seen: (N,) looks that ended there.
     """
@@ -53,8 +53,11 @@ class Sightings:
 
     def look(self, frame: PosedFrame) -> None:
         """Count the rays of one frame at the points around it."""
-        ranges = _picture(frame.points - frame.eye.astype(np.float32))
-        nearest = _nearest_around(ranges)
+        pixel, far, valid = _pixels(frame.points - frame.eye.astype(np.float32))
+        ranges = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)  # shortest by pixel
+        np.minimum.at(ranges.reshape(-1), pixel[valid], far[valid])
+        wide = np.concatenate([ranges[:, -1:], ranges, ranges[:, :1]], axis=1)
+        nearest = min_filter(wide, 3)[:, 1:-1]
         R, t = frame.T_map_body[:3, :3], frame.T_map_body[:3, 3]
         centre = t + R @ frame.eye
         middle = (self._tiles + 0.5) * _TILE - centre[:2]
@@ -75,14 +78,6 @@ class Sightings:
         return out
 
 
-def _picture(rays: Points) -> Floats32:
-    """Return the shortest range by pixel; infinity where there is no ray."""
-    pixel, far, valid = _pixels(rays)
-    image = np.full(_ROWS * _COLUMNS, np.inf, dtype=np.float32)
-    np.minimum.at(image, pixel[valid], far[valid])
-    return image.reshape(_ROWS, _COLUMNS)
-
-
 def _pixels(rays: Points) -> tuple[Ints, Floats32, Bools]:
     far = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     up = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
@@ -91,13 +86,8 @@ def _pixels(rays: Points) -> tuple[Ints, Floats32, Bools]:
     return row * _COLUMNS + column, far, (far > 0.3) & (np.abs(up) < _STEEPEST)
 
 
-def _nearest_around(ranges: Floats32) -> Floats32:
-    wide = np.concatenate([ranges[:, -1:], ranges, ranges[:, :1]], axis=1)
-    return min_filter(wide, 3)[:, 1:-1]
-
-
 def looks_at(stamps: Floats, positions: Floats, metres: float = 0.5, seconds: float = 1.0) -> Bools:
-    """Choose frames (K,) to look from: ``metres`` or ``seconds`` after the one before."""
+    """Choose frames (K,) to look from: ``metres`` or ``seconds`` after the previous chosen frame."""
     chosen = np.zeros(len(stamps), dtype=bool)
     last = -1
     for k in range(len(stamps)):
@@ -109,21 +99,16 @@ def looks_at(stamps: Floats, positions: Floats, metres: float = 0.5, seconds: fl
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
-_BUFFER = 2_000_000  # rows that wait to be merged: 100 MB
+_BUFFER = 2_000_000  # rows to merge later: 100 MB
 
 ROW = np.dtype([("key", "<i8"), ("hits", "<u4"), ("sum", "<f4", 3), ("stamp", "<f8"), ("source", "<u2")])
-"""A voxel: its key, frames that hit it, sum of their points from its corner, newest stamp, the first run's number."""
+"""A voxel: key, number of frames with a point in it, sum of these points from its corner, newest stamp, first run."""
 
 
 class VoxelTable:
-    """Table of voxels; one point of each frame counts in each voxel.
-
-    Attributes:
-        voxel: edge, metres.
-    """
+    """Table of voxels of an edge in metres; one point per frame and voxel counts."""
 
     def __init__(self, voxel: float) -> None:
-        """Begin empty."""
         self.voxel = voxel
         self._rows = np.zeros(0, dtype=ROW)
         self._waiting: list[npt.NDArray[np.void]] = []

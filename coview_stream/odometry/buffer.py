@@ -1,12 +1,12 @@
-"""Buffer of a robot's odometry of the last seconds: kinds of samples, and the pose at a frame's stamp."""
+"""Buffer of a robot's odometry of the last seconds: continuity of its samples, and the pose at a frame's stamp."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from coview_stream.messages.types import OdometryMessage
 
 _NS = 1_000_000_000
 
-# set by hand, all of them
 _MIN_RESTART_SAMPLES = 5  # in a row, before a clock counts as restarted
-_SLACK = 0.5  # metres that a sample may always be off: corrections by a lidar odometry, rough stamps
-_SLACK_SPEED = 3.0  # metres per second by which any robot may have sped up meanwhile
+# limits of a plausible step, set by hand
+_SLACK = 0.5  # metres: corrections by a lidar odometry, rough stamps
+_SLACK_SPEED = 3.0  # metres per second that any robot may gain
 _SPEED_FACTOR = 3.0  # times its speed of the last seconds
 _SPEED_WINDOW_NS = 2 * _NS
 _MIN_SPEED_SPAN = 0.2  # seconds of samples: fewer give no speed
@@ -32,41 +32,33 @@ class SampleKind(StrEnum):
 
     CONTINUES = "continues"
     GAP = "gap"
-    """It comes after a short pause: the pose has to be verified again."""
+    """After a short pause: the pose has to be verified again."""
     OUTAGE = "outage"
-    """It comes after a long pause: the robot may have been carried anywhere."""
+    """After a long pause: the robot may have been carried anywhere."""
     JUMP = "jump"
-    """It is farther away than the robot can have driven: odometry started anew."""
+    """Farther away than the robot can have driven: odometry has restarted."""
     RESTART = "restart"
-    """The sender's clock started anew."""
+    """The sender's clock has restarted."""
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A sample, and the way to it."""
+class _Entry(NamedTuple):
+    """A sample, with metres driven and radians turned since the first sample."""
 
-    sample: OdometryMessage
-    travelled: float  # metres since the first sample
-    turned: float  # radians since the first sample
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.sample.stamp_ns
+    stamp_ns: int
+    T_odom_body: Pose
+    travelled: float
+    turned: float
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Odometry around a frame.
-
-    Attributes:
-        stamps: (K,) nanoseconds, increasing.
-        poses: (K, 4, 4) odometry <- body, metres.
-    """
+class Segment(NamedTuple):
+    """Odometry around a frame."""
 
     stamps: Ints
+    """(K,) nanoseconds, increasing."""
     poses: Poses
+    """(K, 4, 4) odometry <- body, metres."""
 
 
 class OdometryBuffer:
@@ -74,7 +66,7 @@ class OdometryBuffer:
 
     Attributes:
         newest: the newest sample, None before the first.
-        arrived: local time (seconds) at which it came.
+        arrived: local time (seconds) of its arrival.
         travelled: metres driven since the first sample.
         turned: radians turned since the first sample.
     """
@@ -93,7 +85,7 @@ class OdometryBuffer:
         self._discontinuous_since = float("inf")
 
     def continue_from(self, other: OdometryBuffer) -> None:
-        """Go on with another buffer's samples, to notice poses that do not continue them."""
+        """Take over another buffer's samples, to detect poses that do not continue them."""
         self.newest, self.arrived = other.newest, other.arrived
         self.travelled, self.turned = other.travelled, other.turned
         self._samples = other._samples.copy()
@@ -101,12 +93,12 @@ class OdometryBuffer:
         self._discontinuous_since = other._discontinuous_since
 
     def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> SampleKind:
-        """Take in a sample and return its kind; duplicates and samples out of order are not kept.
+        """Add a sample and return its kind; duplicates and samples out of order are dropped.
 
         Args:
             sample: the sample.
-            now: local time (seconds) at which it came.
-            unreachable: no sample could have come since the last one: the connection was down.
+            now: local time (seconds) of its arrival.
+            unreachable: the connection was down since the last sample.
         """
         longest = self.config.max_network_outage if unreachable else self.config.max_outage
         step = None if self.newest is None else inverse(self.newest.T_odom_body) @ sample.T_odom_body
@@ -117,9 +109,9 @@ class OdometryBuffer:
             self.clear()
         elif step is not None:
             self.travelled += _distance(step)
-            self.turned += abs(yaw_of(step))  # as the engine counts it
+            self.turned += abs(yaw_of(step))  # as in the engine
         self.newest, self.arrived = sample, now
-        self._samples.append(_Entry(sample, self.travelled, self.turned))
+        self._samples.append(_Entry(sample.stamp_ns, sample.T_odom_body, self.travelled, self.turned))
         self._discontinuous.clear()
         self._discontinuous_since = float("inf")
         oldest = sample.stamp_ns - round(self.config.odometry_history * _NS)
@@ -134,7 +126,7 @@ class OdometryBuffer:
         if sample.stamp_ns == last.stamp_ns:
             return SampleKind.DUPLICATE
         seconds = (sample.stamp_ns - last.stamp_ns) / _NS
-        # a single stray stamp must not shut out all that follow, so one far ahead has to be confirmed as well
+        # a single stray stamp must not exclude all later ones, so one far ahead has to be confirmed as well
         ahead = seconds > self.config.odometry_history + 2.0 * (now - self.arrived)
         if seconds < 0 or ahead:
             if not self._is_new_sequence(sample.stamp_ns, now):
@@ -142,12 +134,14 @@ class OdometryBuffer:
             return SampleKind.RESTART if seconds < 0 else SampleKind.OUTAGE
         if seconds > longest:
             return SampleKind.OUTAGE
-        if self._impossible(step, seconds):
+        max_distance = _SLACK + min(self.config.max_speed, self._max_plausible_speed()) * seconds
+        max_angle = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
+        if _distance(step) > max_distance or rotation_angle(step) > max_angle:
             return SampleKind.JUMP
         return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES
 
     def _is_new_sequence(self, stamp_ns: int, now: float) -> bool:
-        """Tell whether the samples that do not continue the buffer have continued each other for long enough."""
+        """Tell whether the samples that do not continue the buffer have continued one another for long enough."""
         if self._discontinuous and stamp_ns <= self._discontinuous[-1]:
             self._discontinuous.clear()
         if not self._discontinuous:
@@ -158,13 +152,8 @@ class OdometryBuffer:
             and now - self._discontinuous_since >= self.config.restart_after
         )
 
-    def _impossible(self, step: Pose, seconds: float) -> bool:
-        max_distance = _SLACK + min(self.config.max_speed, self._max_plausible_speed()) * seconds
-        max_angle = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
-        return _distance(step) > max_distance or rotation_angle(step) > max_angle
-
     def _max_plausible_speed(self) -> float:
-        """Bound the robot's speed, metres per second, by that of the last seconds; infinite while unknown."""
+        """Return a limit of the robot's speed, metres per second, by its last seconds; infinite while unknown."""
         newest = self._samples[-1]
         first = self._samples[bisect_left(self._samples, newest.stamp_ns - _SPEED_WINDOW_NS, key=lambda s: s.stamp_ns)]
         seconds = (newest.stamp_ns - first.stamp_ns) / _NS
@@ -185,12 +174,12 @@ class OdometryBuffer:
         k = bisect_left(self._samples, stamp_ns, key=lambda s: s.stamp_ns)
         after = self._samples[k]
         if after.stamp_ns == stamp_ns:
-            return after.sample.T_odom_body
+            return after.T_odom_body
         before = self._samples[k - 1]
         if after.stamp_ns - before.stamp_ns > self.config.max_gap * _NS:
             return None
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        return interpolate(before.sample.T_odom_body, after.sample.T_odom_body, share)
+        return interpolate(before.T_odom_body, after.T_odom_body, share)
 
     def driven_since(self, stamp_ns: int) -> tuple[float, float]:
         """Return metres driven and radians turned since a stamp, or since the oldest sample in the buffer."""
@@ -204,10 +193,10 @@ class OdometryBuffer:
         stamps = [s.stamp_ns for s in self._samples]
         first = max(0, bisect_left(stamps, begin_ns + 1) - 1)
         last = min(len(stamps), bisect_left(stamps, end_ns) + 1)
-        poses = [self._samples[k].sample.T_odom_body for k in range(first, last)]
+        poses = [self._samples[k].T_odom_body for k in range(first, last)]
         return Segment(np.array(stamps[first:last], dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
 
 
 def _distance(step: Pose) -> float:
-    """Metres that a step goes; for one vector NumPy takes ten times as long, and lets other threads go first."""
+    """Length of a step, metres; for one vector NumPy takes ten times as long, and yields to other threads."""
     return math.hypot(*step[:3, 3].tolist())

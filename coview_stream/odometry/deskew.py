@@ -1,4 +1,4 @@
-"""Deskewing: a sweep's points moved to where they would have been seen at the frame's stamp."""
+"""Deskewing: a sweep's points moved to their places in the body frame at the frame's stamp."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def deskew(
     T_odom_body: Pose,
     correction: SweepCorrection | None = None,
 ) -> Points:
-    """Return the points (N, 3) in the body frame at ``stamp_ns``; a cloud that leans goes on leaning.
+    """Return the points (N, 3) in the body frame at ``stamp_ns``; a leaning cloud stays leaning.
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.

@@ -1,12 +1,11 @@
 """Gravity's direction in the body frame, from the ground around a lidar and the walls on it.
 
-The ground is a plane through the lowest points, if there is one. Its normal is gravity's direction only where the
-ground is level; walls, which are vertical also where the ground slopes, correct it. On a slope without walls the
-odometry frame leans with the slope.
+The ground is a plane through the lowest points. Its normal is gravity's direction only where the ground is level;
+walls are vertical on slopes, too, and correct it. On a slope without walls the odometry frame leans with the slope.
 
-Measured once, by no command that is kept, on nine simulated worlds, 20 frames each (town, campus, village, industrial;
-vlp16, os64, mid360): the ground's normal leans 0.4 to 4.1 degrees against gravity (medians), corrected by the walls
-0.05 to 0.33. The walls of these worlds are exactly vertical; real ones nearly so.
+Measured once, by no command of this repository, on nine simulated worlds, 20 frames each (town, campus, village,
+industrial; vlp16, os64, mid360): the ground's normal leans 0.4 to 4.1 degrees against gravity (medians), corrected by
+the walls 0.05 to 0.33. The walls of these worlds are exactly vertical.
 """
 
 from __future__ import annotations
@@ -19,30 +18,32 @@ from coview_stream.config.odometry import MAX_TILT
 from coview_stream.geometry.arrays import Floats, Indices, Reals
 
 SLOPE = float(np.radians(4.0))
-"""One sigma of how far the ground's normal leans, radians; set by hand, after the figures above."""
+"""One sigma of the lean of the ground's normal, radians, after the figures above."""
 
 # the ground; set by hand
 _REACH = 25.0  # metres around the sensor
-_CELL = 1.0  # metres: of each such cell the lowest point
+_CELL = 1.0  # metres, of cells with their lowest point
 _BAND = 0.15  # metres to both sides of the plane
 _MIN_HEIGHT = 0.1  # metres of the sensor above the ground
 _TRIALS = 400  # planes through three points
 _REFINEMENTS = 5
 _MIN_CELLS = 40
-_MIN_SHARE = 0.4  # of the cells whose lowest point could be ground
-_MAX_BELOW = 0.25  # of all cells may lie below the plane: a table top is not the ground
+_MIN_SHARE = 0.4  # of the cells in the plane
+_MAX_BELOW = 0.25  # share of the cells below the plane: a table top is not the ground
 _MIN_EXTENT = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
 
 # patches of wall; set by hand
-_WALL_POINTS = 20_000  # of a cloud are looked at
+_WALL_POINTS = 20_000  # of a cloud
 _WALL_REACH = 40.0  # metres around the sensor
-_WALL_CELL = 2.0  # metres: points of one such cube are fitted by a plane
+_WALL_CELL = 2.0  # metres, of cubes with one plane each
 _WALL_MIN_POINTS = 8
 _WALL_MAX_THICKNESS = 0.04  # metres, one sigma, off the plane
 _WALL_MIN_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
 _WALL_MAX_LEAN = np.sin(np.radians(15.0))
-_WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
+_WALL_SIGMA = np.radians(2.0)  # of a patch; a larger lean counts less and less
 _WALL_ROUNDS = 10
+_WIDE = float(np.radians(10.0))  # sigma of the direction that a search for walls starts with
+_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical along the direction that they all face
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,9 @@ class Ground:
     Attributes:
         up: (3,) unit vector in the body frame: the plane's normal, corrected by walls.
         height: of the sensor above it, metres.
-        share: of the cells around whose lowest point lies in it.
-        cells: how many those are.
-        walls: patches of wall that agreed on ``up``, or corrected it.
+        share: of the cells around with their lowest point in it.
+        cells: number of these cells.
+        walls: number of patches of wall behind ``up``.
     """
 
     up: Floats
@@ -65,7 +66,7 @@ class Ground:
 
 
 def find_ground(points: Reals) -> Ground | str:
-    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return why there is none."""
+    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return the reason for none."""
     ground = ground_plane(points)
     if isinstance(ground, str):
         return ground
@@ -74,13 +75,12 @@ def find_ground(points: Reals) -> Ground | str:
 
 
 def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
-    """Find the ground in a cloud (N, 3) as :func:`find_ground` does, without a look at walls.
-
-    Args:
-        points: (N, 3) body frame with z about up, metres.
-        near: where it is expected; searched for anew if there is none.
-    """
-    lowest = _lowest(np.asarray(points, dtype=np.float64))
+    """Find the ground without its walls; arguments as :func:`find_ground`, ``near`` an expected ground to try first."""
+    points = np.asarray(points, dtype=np.float64)
+    points = points[(points[:, :2] ** 2).sum(axis=1) < _REACH**2]
+    cell = np.floor(points[:, :2] / _CELL).astype(np.int64) @ np.array([1 << 20, 1])
+    order = np.lexsort((points[:, 2], cell))
+    lowest = points[order][np.diff(cell[order], prepend=-(1 << 62)) != 0]
     if len(lowest) < _MIN_CELLS:
         return f"only {len(lowest)} cells of {_CELL:g} m within {_REACH:g} m hold points"
     if near is not None:
@@ -91,7 +91,7 @@ def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
 
 
 def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str:
-    """Return the plane as the ground below the sensor, or why it is not."""
+    """Return the plane as the ground below the sensor, or the reason against it."""
     if plane is None:
         return "no plane below the sensor fits three of the lowest points"
     up, height = plane
@@ -111,19 +111,16 @@ def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str
 
 
 def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
-    """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
+    """Correct ``up`` (3,), with ``sigma`` radians, by the walls in a cloud (N, 3), metres; and count their patches.
 
-    Without walls, or with walls that all face one way, it stays as it is in the directions that they leave open.
-
-    Returns:
-        The unit vector, and the number of wall patches it was taken from.
+    Directions that the walls leave open stay.
     """
     better, _, count = wall_evidence(points, up, sigma)
     return better, count
 
 
 def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
-    """Return :func:`gravity_from_walls`, and in between the walls' own information (3, 3), 1 / radians^2."""
+    """Return ``up`` corrected by walls, their information (3, 3), 1 / radians^2, and the number of their patches."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
@@ -141,17 +138,8 @@ def level_rotation(up: Floats) -> Floats:
     return np.stack([x, np.cross(up, x), up])
 
 
-def _lowest(points: Floats) -> Floats:
-    """Return the lowest point of every cell around, (K, 3)."""
-    near = points[(points[:, :2] ** 2).sum(axis=1) < _REACH**2]
-    cell = np.floor(near[:, :2] / _CELL).astype(np.int64) @ np.array([1 << 20, 1])
-    order = np.lexsort((near[:, 2], cell))
-    first = np.r_[True, np.diff(cell[order]) != 0] if len(order) else np.empty(0, dtype=bool)
-    return np.asarray(near[order][first])
-
-
 def _consensus_plane(lowest: Floats) -> tuple[Floats, float] | None:
-    """Find, of planes through three points each, the one that most points lie in (RANSAC)."""
+    """Return the plane with the most points of many through three points (RANSAC)."""
     rng = np.random.default_rng(0)  # equal clouds have equal grounds
     a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIALS, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
@@ -169,7 +157,7 @@ def _consensus_plane(lowest: Floats) -> tuple[Floats, float] | None:
 
 
 def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats, float] | None:
-    """Fit the plane to the points within it by least squares, a few times over."""
+    """Fit the plane to the points within it by least squares, five times."""
     for _ in range(_REFINEMENTS if plane else 0):
         assert plane is not None
         up, height = plane
@@ -184,7 +172,7 @@ def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats
 
 
 def _patches(points: Floats, up: Floats) -> Floats:
-    """Return normals (K, 3) of the flat, roughly upright pieces of surface around."""
+    """Return normals (K, 3) of the flat, roughly upright patches of surface."""
     near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
     cell = np.floor(near / _WALL_CELL).astype(np.int64) @ np.array([1 << 40, 1 << 20, 1])
     _, cell_of, count = np.unique(cell, return_inverse=True, return_counts=True)
@@ -198,13 +186,8 @@ def _patches(points: Floats, up: Floats) -> Floats:
 
 
 def _sums(values: Floats, cell_of: Indices, count: int) -> Floats:
-    """Add up, (count, K), the rows of values (N, K) that go to each of ``count`` places."""
+    """Return the sums (count, K) of values (N, K) by cell number (N,)."""
     return np.stack([np.bincount(cell_of, column, minlength=count) for column in values.T], axis=1)
-
-
-# set by hand
-_WIDE = float(np.radians(10.0))  # sigma of the up direction that walls are looked for about
-_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical along the direction that they all face
 
 
 @dataclass(frozen=True)
@@ -212,7 +195,7 @@ class Plumb:
     """The vertical by the surrounding surfaces, in level axes, for a filter.
 
     Attributes:
-        walls: (2,) x and y of the unit vector that walls are parallel to; None without walls.
+        walls: (2,) x and y of the unit vector along the walls; None without walls.
         covariance: (2, 2) of it, radians squared, but for a factor.
         ground: (2,) x and y of the ground's unit normal; None without ground.
     """
@@ -222,7 +205,7 @@ class Plumb:
     ground: Floats | None
 
     def rows(self) -> tuple[Floats, Indices]:
-        """Return the measurement (4,), zeros where there is none, and the indices of those that there are (K,)."""
+        """Return the measurement (4,), zeros for missing parts, and the indices (K,) of the present components."""
         y = np.concatenate([np.zeros(2) if part is None else part for part in (self.walls, self.ground)])
         return y, np.flatnonzero(np.repeat([self.walls is not None, self.ground is not None], 2))
 
@@ -232,7 +215,7 @@ class Surfaces:
     """Walls and ground around one frame, in its body frame.
 
     Attributes:
-        walls: (3,) unit vector that the walls are parallel to; None without walls.
+        walls: (3,) unit vector along the walls; None without walls.
         information: (3, 3) of it, 1 / radians squared.
         ground: None without ground.
     """
@@ -243,13 +226,13 @@ class Surfaces:
 
     @classmethod
     def around(cls, points: Reals, up: Floats, near: Ground | None) -> Surfaces:
-        """Look at a frame (N, 3), metres, whose up (3,) is good to some degrees; ``near``: the last ground seen."""
+        """Measure in a frame (N, 3), metres, with ``up`` (3,) right to some degrees and the last ground ``near``."""
         walls, information, count = wall_evidence(points, up, _WIDE)
         plane = ground_plane(points, near)
         return cls(walls if count else None, information, None if isinstance(plane, str) else plane)
 
     def seen(self, R: Floats) -> Plumb:
-        """Return the same in axes that are level but for a small tilt; ``R`` (3, 3), those axes <- body."""
+        """Return the vertical in axes that are level but for a small tilt; ``R`` (3, 3): these axes <- body."""
         information = (R @ self.information @ R.T)[:2, :2] + np.eye(2) / _UNSEEN**2
         return Plumb(
             None if self.walls is None else (R @ self.walls)[:2],

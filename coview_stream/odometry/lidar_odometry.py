@@ -1,8 +1,10 @@
-"""Odometry from lidar frames alone: each frame is registered to a local map of those before it."""
+"""Odometry from lidar frames alone: each frame is registered to a local map of the earlier ones."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,8 +29,6 @@ from coview_stream.odometry.deskew import deskew
 from coview_stream.odometry.gravity import Ground, Surfaces, find_ground, level_rotation
 from coview_stream.odometry.tilt_filter import Since, TiltFilter, upright
 
-_NO_TIMES = np.zeros(0)
-
 
 class ScanRegistration(Protocol):
     """Registration of frames to a local map that grows with them."""
@@ -38,85 +38,77 @@ class ScanRegistration(Protocol):
         ...
 
     def clear(self) -> None:
-        """Forget the local map; the next frame is placed where it is guessed to be."""
+        """Forget the local map; the pose of the next frame is its guess."""
         ...
 
 
 class KissRegistration:
     """kiss-icp's (MIT; Vizzo et al., RA-L 2023) point-to-point ICP against its voxel map, with its adaptive threshold.
 
-    kiss-icp's own deskewing takes normalised time stamps for a rotation, unchecked: where all are equal, or one is not
-    finite, 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``). So it gets no time stamps, and the frames come
-    deskewed by :func:`~coview_stream.odometry.deskew.deskew`, which refers them to the frame's stamp as well: kiss-icp
-    refers them to the sweep's end, or its middle, by version.
+    kiss-icp 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``) where all time stamps are equal or one is not
+    finite, and refers its deskewed frames to the sweep's end or middle, by version. So it gets no time stamps, and the
+    frames come deskewed to the frame's stamp by :func:`~coview_stream.odometry.deskew.deskew`.
     """
 
     def __init__(self, config: LidarOdometryConfig) -> None:
-        self._kiss_icp, self._settings = _settings(config)
+        """Prepare kiss-icp; DependencyError where it is missing."""
+        pipeline, configuration = (
+            require_library(f"kiss_icp.{name}", "kiss-icp>=1.2", "lidar odometry") for name in ("kiss_icp", "config")
+        )
+        settings = configuration.KISSConfig()
+        settings.data.min_range, settings.data.max_range = config.min_range, config.max_range
+        settings.data.deskew = False
+        settings.mapping.voxel_size = config.voxel
+        settings.registration.max_num_threads = config.threads
+        settings.registration.convergence_criterion = config.convergence
+        settings.registration.max_num_iterations = config.iterations
+        self._make: Callable[[], Any] = partial(pipeline.KissICP, settings)
         self.clear()
 
     def register(self, points: Floats, guess: Pose) -> Pose:
         """As of :class:`ScanRegistration`."""
         icp = self._icp
-        # register_frame predicts by the last motion, for any time between: so the guess goes in as that motion
+        # register_frame predicts by the last motion, without times, so this carries the guess
         icp.last_delta = inverse(icp.last_pose) @ guess
-        icp.register_frame(points, _NO_TIMES)
+        icp.register_frame(points, np.zeros(0))
         return np.array(icp.last_pose, dtype=np.float64)
 
     def clear(self) -> None:
         """As of :class:`ScanRegistration`."""
-        self._icp = self._kiss_icp(self._settings)
+        self._icp = self._make()
 
 
-def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
-    """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
-    pipeline, configuration = (
-        require_library(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry") for module in ("kiss_icp", "config")
-    )
-    settings = configuration.KISSConfig()
-    settings.data.min_range, settings.data.max_range = config.min_range, config.max_range
-    settings.data.deskew = False
-    settings.mapping.voxel_size = config.voxel
-    settings.registration.max_num_threads = config.threads
-    settings.registration.convergence_criterion = config.convergence
-    settings.registration.max_num_iterations = config.iterations
-    return pipeline.KissICP, settings
-
-
-# set by hand, all of them
-_MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise and predicts nothing
-_MIN_SWEEP_SECONDS = 1e-4  # times that differ by less are one
+_MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise
+_MIN_SWEEP_SECONDS = 1e-4  # shorter sweeps are instants
 _MAX_SWEEP_SECONDS = 1.0  # from the stamp: points farther away in time have another clock
-_SLACK = 0.5  # metres that a registration may always move: the first motion cannot be predicted
-_SLACK_ANGLE = np.radians(20.0)
-_FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there make it better
-_GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction that the user names
-_SHAKE = float(np.radians(2.0))  # one sigma by which a body tilts from one frame to the next
-_SHAKE_SECONDS = 0.1  # in which it does; over longer, as a random walk
+_SLACK, _SLACK_ANGLE = 0.5, np.radians(20.0)  # metres and radians that a registration may always move
+_FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there reduce it
+_GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction from the user
+_SHAKE = float(np.radians(2.0))  # one sigma of a body's tilt from one frame to the next, set by hand
+_SHAKE_SECONDS = 0.1  # between these frames; over longer, it is a random walk
 
 
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
-    The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
-    then, level. It drifts, but not in tilt where there are walls
-    (:mod:`~coview_stream.odometry.tilt_filter`). The motion between two frames is predicted from the
-    one before, over the time between their stamps, and deskews the frame as well. ``docs/results.md`` has the costs;
-    kiss-icp holds the interpreter lock.
+    The odometry frame has z up, and its origin and the level direction of its x are the body's at the first usable
+    frame. It drifts, but not in tilt where there are walls (:mod:`~coview_stream.odometry.tilt_filter`). The last
+    motion, scaled to the time between stamps, predicts the next one and deskews the frame. ``docs/results.md`` has the
+    costs; kiss-icp holds the interpreter lock.
 
     Attributes:
         config: the settings.
-        ground: the plane that gravity was taken from; None before it is found, and where gravity was given.
+        ground: the plane behind gravity's direction; None before the first frame, and where gravity was given.
         points: (N, 3) float32, the finite points of the newest frame, deskewed: input of a ``Localizer``.
-        restarts: how often the local map was begun anew, after a gap or an impossible motion: what the robot drove
-            meanwhile is missing from the odometry then.
+        restarts: number of restarts of the local map, after a gap or an impossible motion; the odometry lacks the
+            robot's motion meanwhile.
     """
 
     def __init__(self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None) -> None:
         """Start without a frame; ``registration`` replaces kiss-icp.
 
         Raises:
-            DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
+            DependencyError: kiss-icp is missing, or cannot be loaded.
         """
         self.config = config or LidarOdometryConfig()
         self._registration = registration or KissRegistration(self.config)
@@ -128,31 +120,30 @@ class LidarOdometry:
         self.points: Points = np.empty((0, 3), dtype=np.float32)
         self.restarts = 0
         self._pose: Pose | None = None
-        self._local = np.eye(4)  # the same by registration in the local map, whose tilt drifts
+        self._local = np.eye(4)  # the pose by registration in the local map, whose tilt drifts
         self._T_odom_local = np.eye(4)
         self._ground: Ground | None = None  # of the newest frame that had one
         self._tilt = TiltFilter(_FOUND_GRAVITY if self.config.gravity == "ground" else _GIVEN_GRAVITY)
         self._stamp = 0.0
-        self._forget_motion()
+        self._step, self._step_seconds = np.eye(4), 1.0  # the last motion, over these seconds
         self._registration.clear()
 
     def step(self, points: Points, point_times: Floats | None, stamp: float) -> Pose:
-        """Take in one frame and return where it was taken.
+        """Add one frame; return its pose.
 
         Args:
             points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
-            point_times: (N,) seconds after ``stamp`` (before: negative) at which each point was measured; None for
-                a deskewed frame. Where they do not differ nothing is deskewed; where they are not finite that point
-                stays as it is.
-            stamp: seconds, later than that of the frame before.
+            point_times: (N,) seconds of the points after ``stamp`` (before: negative); None for a deskewed frame. Equal
+                times deskew nothing; a point with a time that is not finite stays.
+            stamp: seconds, later than the stamp of the previous frame.
 
         Returns:
             ``T_odom_body`` (4, 4) at ``stamp``.
 
         Raises:
             CloudError: too few points in range, another shape, no ground to take gravity from, or a motion that no
-                robot makes. RunError: the stamp is not finite, or not later than the one before. The odometry is as
-                good as before: skip the frame and go on.
+                robot makes. RunError: the stamp is not finite or not later than the previous one. After either, skip
+                the frame and go on.
         """
         finite, times = _validated(points, point_times, self.config)
         check_stamp(stamp)
@@ -167,11 +158,13 @@ class LidarOdometry:
         if seconds > self.config.max_gap:
             self._restart()
         guess = self._local @ self._predicted_motion(seconds)
-        if times is not None:
-            finite = self._deskewed(finite, times)
+        if times is not None and (sweep := self._sweep(times)) is not None:
+            finite = deskew(finite, times, sweep, 0, np.eye(4))
         around = self._surfaces(finite, guess) if self.config.keep_level else None
-        if around is not None:
-            guess = self._upright_guess(guess, around)
+        if around is not None:  # a body shakes unpredictably: tilt the guess by the frame's own walls and ground
+            R = self._T_odom_local[:3, :3]
+            tilt = self._tilt.expected(around.seen(R @ guess[:3, :3]), _SHAKE)
+            guess = pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
         local = self._registration.register(finite.astype(np.float64), guess)
         step = inverse(self._local) @ local
         self._check_motion(step, seconds)
@@ -209,14 +202,8 @@ class LidarOdometry:
         self._ground = around.ground or self._ground
         return around
 
-    def _upright_guess(self, guess: Pose, around: Surfaces) -> Pose:
-        """Tilt a guess in the local map as the frame's own walls and ground have it: a body shakes unpredictably."""
-        R = self._T_odom_local[:3, :3]
-        tilt = self._tilt.expected(around.seen(R @ guess[:3, :3]), _SHAKE)
-        return pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
-
     def _level(self, around: Surfaces, metres: float, since: Since) -> None:
-        """Take registration's tilt out of the newest pose, and turn the odometry frame about it, slowly."""
+        """Remove registration's tilt from the newest pose, and turn the odometry frame about it, slowly."""
         assert self._pose is not None
         R, here = self._pose[:3, :3], self._pose[:3, 3]
         tilt = upright(self._tilt.update(around.seen(R), metres, since))
@@ -228,16 +215,17 @@ class LidarOdometry:
         """Extrapolate the last motion (4, 4) to ``seconds``, which may be negative."""
         return interpolate(np.eye(4), self._step, seconds / self._step_seconds)
 
-    def _deskewed(self, points: Points, times: Floats) -> Points:
-        ends = _sweep_interval(times)
-        if ends is None:
-            return points
+    def _sweep(self, times: Floats) -> Segment | None:
+        """Predict the motion over times (N,), seconds after the stamp; None for equal times or another clock's."""
+        finite = times[np.isfinite(times)]
+        if not len(finite) or np.abs(finite).max() > _MAX_SWEEP_SECONDS or np.ptp(finite) < _MIN_SWEEP_SECONDS:
+            return None
+        ends = float(finite.min()), float(finite.max())
         stamps = np.array([round(1e9 * t) for t in ends], dtype=np.int64)
-        sweep = Segment(stamps, np.array([self._predicted_motion(t) for t in ends]))
-        return deskew(points, times, sweep, 0, np.eye(4))
+        return Segment(stamps, np.array([self._predicted_motion(t) for t in ends]))
 
     def _check_motion(self, step: Pose, seconds: float) -> None:
-        """Refuse a motion that no robot makes; the local map, which holds the frame at a wrong place, is begun anew."""
+        """Refuse a motion that no robot makes; restart the local map, which holds the frame at a wrong place."""
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
         allowed = _SLACK + self.config.max_speed * seconds
         if is_pose(step) and far <= allowed and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
@@ -254,18 +242,11 @@ class LidarOdometry:
         self._local, self._T_odom_local = self._pose, np.eye(4)
         self._registration.clear()
         self._tilt.restart()
-        self._forget_motion()
-
-    def _forget_motion(self) -> None:
         self._step, self._step_seconds = np.eye(4), 1.0
 
 
 def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig) -> tuple[Points, Floats | None]:
-    """Return the finite points, a copy (N, 3) float32, and their times (N,).
-
-    Raises:
-        CloudError: another shape, times that are not one per point, or too few points in range.
-    """
+    """Return the finite points, a copy (N, 3) float32, and their times (N,); CloudError as of ``step``."""
     rows = cloud_rows(points)
     at = None if times is None else to_array(times, np.float64, "times")
     if at is not None and at.shape != (len(rows),):
@@ -282,11 +263,3 @@ def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig
             f"lidar odometry needs {config.min_points}: is the sensor covered, or the cloud not in its frame?"
         )
     return finite, at
-
-
-def _sweep_interval(times: Floats) -> tuple[float, float] | None:
-    """Return the first and last of times (N,), seconds after the stamp; None if they do not differ, or lie far off."""
-    finite = times[np.isfinite(times)]
-    if not len(finite) or np.abs(finite).max() > _MAX_SWEEP_SECONDS or np.ptp(finite) < _MIN_SWEEP_SECONDS:
-        return None
-    return float(finite.min()), float(finite.max())

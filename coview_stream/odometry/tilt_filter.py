@@ -1,34 +1,33 @@
 """Tilt of lidar odometry against gravity, as a state that changes slowly: a Kalman filter over the up direction.
 
 Registration gives each frame a roll and a pitch in its local map; walls are vertical there and the ground has a
-normal. Directions near z are written by their x and y, in the axes of the local map after the turns made so far. For
-frame k, two numbers each (radians):
+normal. Directions near z are written by their x and y, in the axes of the local map after all turns so far. For frame
+k, two numbers each (radians):
 
-    d_k = d_{k-1} + drift          of the local map, all of it; drift ~ N(0, 0.2^2 N)
-    n_k ~ N(0, N)                  of this frame in the local map: registration's own error, forgotten with the frame
+    d_k = d_{k-1} + drift          of the local map; drift ~ N(0, 0.2^2 N)
+    n_k ~ N(0, N)                  of this frame in the local map: registration's error, forgotten with the frame
     b_k = phi b_{k-1} + ...        of the walls, the same for the next metres: phi = exp(-metres / 10), variance W
-    w_k ~ N(0, kappa C_k)          of the walls, different in each frame; C_k by their number and the ways they face
+    w_k ~ N(0, kappa C_k)          of the walls, different in each frame; C_k by their number and directions
     s_k = psi s_{k-1} + v_k        slope of the ground; v_k ~ N(0, Q), and psi^2 = 1 - Q / (4 deg)^2 keeps it near level
-
-    m_k ~ N(0, M)                  of the body, really, since the frame before: 2 degrees in 0.1 s, and no heavy tail
+    m_k ~ N(0, M)                  true motion of the body since the last frame: 2 degrees in 0.1 s, no heavy tail
 
     up by walls    z_b = d + n + b + w
     up by ground   z_s = d + n + s
-    tilted since   z_m = n + m     the frame before, in its pose as it was given
+    tilted since   z_m = n + m     the last frame, by its reported pose
 
-Turned are d (all of the odometry frame, slowly) and n (this frame alone). A frame's jitter is then that of the
-better witness: where registration is good to 0.03 degrees and walls to 1, n stays what it is, 0; where rings on bare
-ground hold registration fast while the robot shakes, walls and ground outvote it.
+The filter turns d out of the odometry frame, slowly, and n out of this frame alone. So a frame's jitter is that of the
+better witness: where registration has 0.03 degrees and walls 1, n stays 0; where rings on bare ground hold registration
+fast while the robot shakes, walls and ground outvote it.
 
-Who is how good is learnt. Three witnesses of one direction tell their own variances (Gray and Allan's three-cornered
-hat): N, Q and kappa are estimated from the innovations, each as the sum of its squared shares over its redundancy
-(Foerstner's variance components), fading over 60 frames. n, v and w have Student's t distribution with 4 degrees of
-freedom rather than a normal one: a kerb taken for the ground, or a parked lorry for a wall, is outvoted in that frame.
-So is a registration that turns a covered sensor over by 27 degrees: it may be that wrong, the body cannot be that fast.
-As such a likelihood has several maxima, two are looked for, with n as usual and with n an outlier.
+The variances are learnt from three witnesses of one direction (Gray and Allan's three-cornered hat): N, Q and kappa are
+estimated from the innovations, each as the sum of its squared shares over its redundancy (Foerstner's variance
+components), fading over 60 frames. n, v and w have Student's t distribution with 4 degrees of freedom: a kerb taken for
+the ground, or a parked lorry for a wall, is outvoted in that frame. So is a registration that turns a covered sensor
+over by 27 degrees: it may be that wrong, the body cannot be that fast. Such a likelihood has several maxima; the search
+starts twice, with n as usual and with n an outlier.
 
-The odometry frame turns by no more, per frame, than 1.5 times the presumed drift of the local map: what is learnt
-late about gravity (a first frame on a slope) comes in slowly, and a pose never jumps for it.
+Per frame the odometry frame turns by at most 1.5 times the presumed drift of the local map: late knowledge of gravity
+(after a first frame on a slope) comes in slowly, without a jump of the pose.
 """
 
 from __future__ import annotations
@@ -40,25 +39,24 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import exp_so3
-from coview_stream.odometry.gravity import Plumb
+from coview_stream.odometry.gravity import SLOPE, Plumb
 
-# set by hand, all of them
-_DRIFT = 0.2  # of the local map in a frame, as a share of the frame's own error
-_LEAST_DRIFT = float(np.radians(0.005))  # likewise, at least: 0.15 degrees in 100 s at 10 Hz if it has no direction
-_MAX_TURN = 1.5  # sigmas of that drift by which the odometry frame turns in a frame
-_FRAME_TILT = float(np.radians(0.2))  # sigma of a frame's tilt by registration, before anything is learnt
+# set by hand
+_DRIFT = 0.2  # of the local map per frame, as a share of the frame's error
+_LEAST_DRIFT = float(np.radians(0.005))  # at least: 0.15 degrees in 100 s at 10 Hz if it has no direction
+_MAX_TURN = 1.5  # sigmas of that drift that the odometry frame turns per frame
+_FRAME_TILT = float(np.radians(0.2))  # initial sigma of a frame's tilt by registration
 _SLOPE_STEP = float(np.radians(0.5))  # likewise of the ground's slope, from frame to frame
-_SLOPE = float(np.radians(4.0))  # one sigma of the ground's slope: gravity.SLOPE
-_WALL_METRES = 10.0  # over which walls err alike
-_NO_WALLS = float(np.radians(2.0))  # sigma of the walls' common error, while none are seen
-_LEAST = float(np.radians(0.01))  # sigma below which nothing is believed to be
+_WALL_METRES = 10.0  # with the same error of the walls
+_NO_WALLS = float(np.radians(2.0))  # sigma of the walls' common error, without walls
+_LEAST = float(np.radians(0.01))  # least sigma
 _LEAST_KAPPA = 1e-3
 _GROUND_FIT = float(np.radians(0.02))  # sigma of the plane's fit alone
 _FREEDOM = 4.0  # of Student's t
 _ROUNDS = 5  # of reweighting
-_STARTS = ((1.0, 1.0, 1.0), (1e-4, 1.0, 1.0))  # weights of n, v and w that it begins with
+_STARTS = ((1.0, 1.0, 1.0), (1e-4, 1.0, 1.0))  # initial weights of n, v and w
 _FADE = 1.0 - 1.0 / 60.0  # memory per frame
-_PRIOR = 2.0  # degrees of freedom of the prior: a frame's
+_PRIOR = 2.0  # degrees of freedom of the prior: one frame's
 
 _EYE, _ZERO = np.eye(2), np.zeros((2, 2))
 _WALLS, _GROUND = slice(0, 2), slice(2, 4)  # rows of the measurement
@@ -72,11 +70,11 @@ _OF_BODY = np.vstack([_ZERO, _ZERO, _EYE])
 
 @dataclass(frozen=True)
 class Since:
-    """Tilt of a frame's body axis z against that of the frame before, whose pose is known.
+    """Tilt of a frame's body axis z against the axis of the previous frame.
 
     Attributes:
         tilt: (2,) difference of the axes' x and y in the level frame.
-        sigma: by which the body may have tilted meanwhile, radians.
+        sigma: of the body's tilt meanwhile, radians.
     """
 
     tilt: Floats
@@ -85,7 +83,7 @@ class Since:
 
 @dataclass
 class _Variance:
-    """A variance that is learnt: squared shares over their redundancy, fading."""
+    """A learnt variance: squared shares over their redundancy, fading."""
 
     value: float
     least: float
@@ -94,7 +92,7 @@ class _Variance:
         self._squares, self._redundancy = _PRIOR * self.value, _PRIOR
 
     def learn(self, squares: float, redundancy: float) -> None:
-        """Take in one frame's squares, in units of the variance as it is, and their redundancy."""
+        """Add one frame's squares, in units of the present variance, and their redundancy."""
         self._squares = _FADE * self._squares + self.value * squares
         self._redundancy = _FADE * self._redundancy + max(0.0, redundancy)
         self.value = max(self.least, self._squares / self._redundancy)
@@ -104,9 +102,9 @@ class TiltFilter:
     """The filter of the module's docstring."""
 
     def __init__(self, sigma: float) -> None:
-        """Start with an up direction that is good to ``sigma`` radians."""
+        """Start with an up direction of ``sigma`` radians."""
         self._x = np.zeros(6)
-        self._P = np.diag(np.repeat([sigma**2, _NO_WALLS**2, _SLOPE**2], 2))
+        self._P = np.diag(np.repeat([sigma**2, _NO_WALLS**2, SLOPE**2], 2))
         self._frame = _Variance(_FRAME_TILT**2, _LEAST**2)
         self._slope = _Variance(_SLOPE_STEP**2, _LEAST**2)
         self._kappa = _Variance(1.0, _LEAST_KAPPA)
@@ -114,27 +112,24 @@ class TiltFilter:
 
     @property
     def frame_tilt(self) -> float:
-        """One sigma of a frame's tilt by registration, radians, as learnt so far."""
+        """One sigma of a frame's tilt by registration, radians."""
         return float(np.sqrt(self._frame.value))
 
     def restart(self) -> None:
-        """Forget the walls and the ground: the robot is elsewhere, but knows about as well where up is."""
+        """Forget the walls and the ground, as the robot is elsewhere; the up direction stays."""
         tilt = self._P[_MAP, _MAP] + self._frame.value * _EYE
         self._x[2:] = 0.0
-        self._P = np.diag(np.repeat([0.0, _NO_WALLS**2, _SLOPE**2], 2))
+        self._P = np.diag(np.repeat([0.0, _NO_WALLS**2, SLOPE**2], 2))
         self._P[_MAP, _MAP] = tilt
         self._first = True
 
     def expected(self, plumb: Plumb, sigma: float) -> Floats:
-        """Return the tilt (2,) of a frame whose pose is a guess, good to ``sigma`` radians; nothing is learnt."""
+        """Return the tilt (2,) of a frame with a guessed pose of ``sigma`` radians; nothing is learnt."""
         x, P, slope = self._predicted(plumb, 0.0)
         return self._split(x, P, plumb, sigma**2, slope)[0]
 
     def update(self, plumb: Plumb, metres: float, since: Since | None = None) -> Floats:
-        """Take in a registered frame, ``metres`` after the one before; return its own tilt n (2,), radians.
-
-        ``since``: how it is tilted against the frame before.
-        """
+        """Add a registered frame, ``metres`` and ``since`` the previous one; return its tilt n (2,), radians."""
         x, P, slope = self._predicted(plumb, metres)
         frame = 0.0 if self._first else self._frame.value
         tilt, self._x, self._P, learnt = self._split(x, P, plumb, frame, slope, since)
@@ -145,7 +140,7 @@ class TiltFilter:
         return tilt
 
     def turn(self) -> Floats:
-        """Return the turn (2,) of the odometry frame that is due, and take it for done."""
+        """Return the next turn (2,) of the odometry frame, and subtract it from the state."""
         tilt = self._x[_MAP].copy()
         most = _MAX_TURN * self._drift()
         tilt *= min(1.0, most / max(float(np.linalg.norm(tilt)), 1e-12))
@@ -166,7 +161,7 @@ class TiltFilter:
             P[_BIAS, _BIAS] = walls * _EYE
             return x, P, 0.0
         phi = np.exp(-metres / _WALL_METRES)
-        psi = np.sqrt(max(0.0, 1.0 - self._slope.value / _SLOPE**2))
+        psi = np.sqrt(max(0.0, 1.0 - self._slope.value / SLOPE**2))
         change = np.repeat([1.0, phi, psi], 2)
         x, P = change * x, change[:, None] * P * change
         P[_MAP, _MAP] += self._drift() ** 2 * _EYE
@@ -176,10 +171,10 @@ class TiltFilter:
     def _split(
         self, x: Floats, P: Floats, plumb: Plumb, frame: float, slope: float, since: Since | None = None
     ) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
-        """Share the innovation out among the state and the fresh errors n, v and w, outliers outvoted.
+        """Divide the innovation among the state and the new errors n, v and w, without outliers.
 
         Returns:
-            n (2,), the state and its covariance, and for n, v and w squares and redundancy to learn from.
+            n (2,), the state and its covariance, and for n, v and w the squares and redundancy to learn from.
         """
         y, rows = plumb.rows()
         y = np.concatenate([y, np.zeros(2) if since is None else since.tilt])
@@ -215,15 +210,15 @@ def _reweighted(
     """Find a maximum of the likelihood of an innovation (K,) that several errors share (EM), from ``weights``.
 
     Args:
-        innovation: to be explained.
+        innovation: sum of a normal part and the errors.
         normal: (K, K) covariance of its normal part.
-        errors: (2, 2) covariance of each that has Student's t distribution, all zero for none.
-        ways: (K, 2) how each gets into the innovation.
-        weights: of each to begin with; its covariance is divided by that.
+        errors: (2, 2) covariances of the errors with Student's t distribution, all zero for none.
+        ways: (K, 2) Jacobians of the innovation by the errors.
+        weights: initial divisors of the errors' covariances.
 
     Returns:
-        Minus the log-likelihood but for a constant, the innovation's inverse covariance, that times the innovation,
-        and of each error its covariance as weighed, its share (2,) and the rest of its covariance.
+        Minus the log-likelihood but for a constant, the innovation's inverse covariance, its product with the
+        innovation, and for each error its weighted covariance, its share (2,) and its remaining covariance.
     """
     for _ in range(_ROUNDS):
         wide = [C / weight for C, weight in zip(errors, weights, strict=True)]

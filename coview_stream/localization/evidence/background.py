@@ -1,11 +1,9 @@
 """Background: shares of a scan that this map explains by chance, measured at wrong places.
 
 All scored places but those around the leader are chance places. Their mean shares are an observation's value at a wrong
-place, as much as 0.4 in a yard of equal boxes. Their scatter about the mean gives the number of independent
-observations in a scan: neighbouring points fall and rise together, and so do the scans of successive keyframes.
-
-A search has hundreds of wrong places. Tracking has one place, so its background is measured in rings around it, where
-walls and ground are of the same kind (:func:`observe_with_background`).
+place, as much as 0.4 in a yard of equal boxes. Their scatter gives the number of independent observations in a scan:
+neighbouring points fall and rise together, and so do the scans of successive keyframes. A search has hundreds of wrong
+places; tracking has one place, so its background is measured in rings around it (:func:`observe_with_background`).
 """
 
 from __future__ import annotations
@@ -78,9 +76,9 @@ def outcomes(observed: Floats32) -> Floats:
 def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares: on, near, explained, passed.
 
-    They belong to the narrowest normal distribution that covers the shares' tail towards a right place's, at one, two
-    and about three standard deviations and at the second largest share. The tail is often wider than the middle, above
-    all where a few places are of another kind than the rest.
+    They belong to the narrowest normal distribution that covers the tail towards the shares of a right place, at one,
+    two and about three standard deviations and at the second largest share. The tail is often wider than the middle,
+    where a few places are of another kind than the rest.
     """
     if len(observed) < 2:
         return np.full(4, np.nan)
@@ -97,11 +95,8 @@ def scatter(observed: Floats32) -> Floats:
 def left_in_mean(observed: Floats32) -> Floats:
     """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
 
-    They are measured at wrong places. Keyframes see much of the same surroundings, and a place that fits by chance goes
-    on to fit: at 1 all keyframes see the same.
-
-    Args:
-        observed: (N, W, 7) observations of W keyframes at the same chance places.
+    ``observed`` (N, W, 7) has W keyframes at the same chance places. Keyframes see much of the same surroundings, so a
+    place that fits by chance goes on to fit: at 1 all keyframes see the same.
     """
     count, width = observed.shape[:2]
     if count < _MANY or width < 2:
@@ -142,28 +137,20 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     number = _CALIBRATED * chance / ((count * measured + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
     both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
-    return Background(structure, passed, _beta(now, followed), both)
-
-
-def _beta(now: Floats32, followed: Floats32) -> tuple[float, float]:
-    """Fit a Beta distribution to the shares of the ground by their mean and variance."""
-    both = np.concatenate([now, followed])
-    shares = np.clip(both[:, Share.GROUND] / np.maximum(both[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
+    # a Beta distribution by mean and variance of the ground's shares
+    ground = np.concatenate([now, followed])
+    shares = np.clip(ground[:, Share.GROUND] / np.maximum(ground[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
     shares = np.concatenate([shares, np.linspace(0.0, 1.0, round(_PSEUDO))])
     mean = float(np.clip(shares.mean(), 0.02, 0.98))
     spread = float(np.clip(shares.var(), 1e-4, 0.9 * mean * (1.0 - mean)))
     size = mean * (1.0 - mean) / spread - 1.0
-    return max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)
+    return Background(structure, passed, (max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)), both)
 
 
 def observe_with_background(
     field: kernels.FieldMap, scan: ObservedScan, T_map_odom: Floats
 ) -> tuple[Floats32, Background]:
-    """Observe the map from poses (P, 4, 4), and measure the background around the first.
-
-    Returns:
-        Observations (P, 7), see :class:`~coview_stream.localization.evidence.observation.Share`, and the background.
-    """
+    """Return observations (P, 7) of the map from poses (P, 4, 4), and the background around the first."""
     poses = scan.poses(T_map_odom)
     observed = scan.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), kernels.Move.NONE).shares
     places, chance = observed[: len(poses)], observed[len(poses) :]

@@ -1,20 +1,19 @@
 """Likelihood ratio of a place: "the robot is here" against chance, as explanations of the observations.
 
-At the right place a share q of the structure is unchanged, and is explained as the survey allows; the rest is explained
-by chance, as anywhere. So an outcome has the probability
+At the right place the survey explains a share q of the structure, which is unchanged, and chance the rest. So an
+outcome has the probability
 
     m = q d + (1 - q) b
 
-with b the background's probability and d the outcomes of unchanged structure in a survey of this kind. Three nuisances
-are summed over: q (the site may have changed), d (a survey from above shows roofs, one from the ground facades) and the
+with b the background's probability and d the outcomes of unchanged structure in a survey of this kind. The sum is over
+three nuisances: q (the site may have changed), d (a survey from above shows roofs, one from the ground facades) and the
 share of rays that pass through structure (foliage). Most sites have changed little, so q has the density 2 q; the
 chance shares of edges and walls inform d. With n the effective number of observations of a kind and s the shares of
 their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more than chance cannot gain,
 as q >= 0. Points outside the survey add nothing; a rival that covers them gains.
 
-The ground counts as one observation of a place, as a road is level everywhere: its share is compared with the Beta
-distribution of the chance places' shares. One chance place in a hundred is presumed to be as clear and as level as the
-right one.
+The ground counts as one observation, as a road is level everywhere: its share is compared with the Beta distribution of
+the chance places' shares. One chance place in a hundred counts as clear and level as the right one.
 
 The prior is even between "one of these places" and "none of these" (outside the map, a wrong map, a rearranged site),
 and falls with a place's rank in the votes. Likelihoods are against chance, so "none of these" has the likelihood 1.
@@ -34,21 +33,18 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import Background, outcomes
 from coview_stream.localization.evidence.observation import Share
 
-# set by hand
 KEPT = np.linspace(0.05, 1.0, 20)  # shares q
 _KEPT_PRIOR = KEPT / KEPT.sum()
-_SURVEYS = np.array(
-    [
-        [0.1, 0.25, 0.6, 0.05],
-        [0.2, 0.4, 0.35, 0.05],
-        [0.3, 0.15, 0.45, 0.1],
-        [0.5, 0.25, 0.15, 0.1],
-        [0.65, 0.25, 0.05, 0.05],
-        [0.8, 0.17, 0.02, 0.01],
-    ]
-)
-"""Outcomes of unchanged structure: on, near, under an edge, unexplained. The rows go from an airborne survey (a closed
-canopy, then hedges and crowns with few returns, then streets) to a survey from the ground."""
+_SURVEYS = np.array([
+    [0.1, 0.25, 0.6, 0.05],
+    [0.2, 0.4, 0.35, 0.05],
+    [0.3, 0.15, 0.45, 0.1],
+    [0.5, 0.25, 0.15, 0.1],
+    [0.65, 0.25, 0.05, 0.05],
+    [0.8, 0.17, 0.02, 0.01],
+])  # fmt: skip
+"""Outcomes of unchanged structure, set by hand: on, near, under an edge, unexplained. The rows go from an airborne
+survey (a closed canopy, then hedges and crowns with few returns, then streets) to a survey from the ground."""
 _EDGES = _SURVEYS[:, 2] / _SURVEYS[:, :3].sum(axis=1)  # share of the explained points below an edge
 _EDGES_WIDTH = 0.1  # excess of that share over chance's by which a survey's odds fall e-fold
 _LEAKS = np.array([0.05, 0.3, 0.6])  # rays through unchanged structure, as a share of the background's
@@ -100,20 +96,16 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
         hit[:, None, None] * np.log(passed / background.passed)
         + clear[:, None, None] * np.log((1.0 - passed) / (1.0 - background.passed))
     )
-    rest = free + _ground(observed, background)[:, None, None]
+    ground = observed[:, Share.COVERED_GROUND].astype(np.float64)
+    share = np.clip(observed[:, Share.GROUND] / np.maximum(ground, 0.05), _EDGE, 1.0 - _EDGE)
+    a, b = background.ground
+    mean = np.full(1, min(max(a / (a + b), _EDGE), 1.0 - _EDGE))
+    gain, usual = (_beta(x, *_GROUND) - _beta(x, a, b) for x in (share, mean))
+    # a place rougher than chance gets no more than one like chance, however rare it is
+    level = np.clip(ground, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain)
+    rest = free + level[:, None, None]
     rest -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + rest)  # a chance place, too, may be on an open road
     return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
-
-
-def _ground(observed: Floats32, background: Background) -> Floats:
-    covered = observed[:, Share.COVERED_GROUND].astype(np.float64)
-    share = np.clip(observed[:, Share.GROUND] / np.maximum(covered, 0.05), _EDGE, 1.0 - _EDGE)
-    a, b = background.ground
-    gain = _beta(share, *_GROUND) - _beta(share, a, b)
-    mean = np.full(1, min(max(a / (a + b), _EDGE), 1.0 - _EDGE))
-    # a place rougher than chance gets no more than one like chance, however rare it is
-    usual = float((_beta(mean, *_GROUND) - _beta(mean, a, b))[0])
-    return np.asarray(np.clip(covered, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain))
 
 
 def _beta(x: Floats, a: float, b: float) -> Floats:
@@ -133,7 +125,7 @@ class Posterior:
     none: float
 
     def error(self, same: Bools) -> float:
-        """Return the probability that the robot is at none of the places ``same`` (P,), summed to be exact near 0."""
+        """Return the probability that the robot is at none of the places ``same`` (P,), exact near 0."""
         return float(self.place[~same].sum() + self.none)
 
 
@@ -147,7 +139,7 @@ def posterior(ratios: Floats, votes: Ints, count: int, looks: int = 1) -> Poster
         looks: number of looks of the search on different keyframes; every look is another chance of an error.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
-    # two recognizers rank places, and followed ones keep their ranks: the sum may exceed one list's
+    # two recognizers rank places, and followed places keep their ranks: the sum may exceed that of one list
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
     total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
     logs = np.append(ratios - np.log1p(ranks) - np.log(total * looks), 0.0)

@@ -1,13 +1,11 @@
 """Evidence of a moved part: unexplained structure of a scan that fits some metres beside the place.
 
-Where a survey has buildings a few metres off, but trees, poles and hedges in place, the scan fits at two places: most
-of it at one, the rest at the other. The scan cannot decide between them. Objects replaced since the survey agree on a
-shift only by chance. So the unexplained structure is compared with the map at shifts all around the place, the best
-shift against the background of the others.
+Where a survey has buildings a few metres off, but trees, poles and hedges in place, the scan fits at two places and
+cannot decide between them. Objects replaced since the survey agree on a shift only by chance. So the unexplained
+structure is compared with the map at shifts all around the place, the best shift against the background of the others.
 
-Chance moves a patch of some metres as a whole: a wall that fits at a wrong shift fits with all its points, and a hedge
-along itself. So patches agree or not, and each has its own background. Map structure counts only where the scan has not
-explained it at the place already.
+A patch of some metres fits by chance as a whole, with all points of a wall or along a hedge. So patches agree or not,
+and each has its own background. Map structure counts only where the scan has not explained it at the place already.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats, Ints
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.evidence.observation import ObservedScan
 
@@ -67,8 +65,15 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
     structure, unexplained = _structure(field, scans, T_map_odom, place)
     if len(unexplained) < _MIN_POINTS:
         return NO_PART
-    shifts = _shifts()
-    fits = _patches(unexplained) @ _explained(field, unexplained, structure, shifts, place).T  # (P, H) shares
+    axis = np.arange(-_MOST, _MOST + 0.5)
+    shifts: Floats = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    length = np.linalg.norm(shifts, axis=1)
+    shifts = shifts[(length >= _LEAST) & (length <= _MOST)]
+    cell = np.floor(unexplained[:, :2] / np.float32(_PATCH)).astype(np.int64)
+    patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    weights = (patch == np.arange(int(patch.max()) + 1)[:, None]).astype(np.float64)  # of points in patches
+    weights /= weights.sum(axis=1, keepdims=True)
+    fits = weights @ _explained(field, unexplained, structure, shifts, place).T  # (P, H) shares
     chance = np.ones(len(shifts), dtype=bool)
     for _ in range(2):
         usual = (fits[:, chance].sum(axis=1) + _PSEUDO * _PSEUDO_SHARE) / (int(chance.sum()) + _PSEUDO)
@@ -87,7 +92,7 @@ def _structure(
     T = T_map_odom[None]
     for scan in reversed(scans):
         pose, points_of_scan = scan.poses(T), scan.many.points.structure
-        if scan is not scans[-1]:  # undo the drift since
+        if scan is not scans[-1]:  # undo odometry's drift since then
             pose = scan.few.look_up(field, pose, kernels.Move.NEAR).poses
             T = scan.transforms(pose)
         cos, sin = math.cos(pose[0, 3]), math.sin(pose[0, 3])
@@ -118,15 +123,6 @@ def _explained(field: kernels.FieldMap, points: Points, structure: Points, shift
     return out.reshape(len(shifts), len(points))
 
 
-def _patches(points: Points) -> Floats:
-    """Return the weights (P, N) of points in level square patches; a patch's weights add up to one."""
-    _, patch = np.unique(np.floor(points[:, :2] / np.float32(_PATCH)).astype(np.int64), axis=0, return_inverse=True)
-    patch_of: Ints = np.ravel(patch)
-    weights = np.zeros((int(patch_of.max()) + 1, len(points)))
-    weights[patch_of, np.arange(len(points))] = 1.0
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
-
-
 def _log_likelihood_ratios(fits: Floats, usual: Floats) -> Floats:
     """Return the log-ratios (H,) of "a share of the patches belongs here" against "they fit by chance".
 
@@ -138,11 +134,3 @@ def _log_likelihood_ratios(fits: Floats, usual: Floats) -> Floats:
     table = np.log(share / usual) @ fits + np.log((1.0 - share) / (1.0 - usual)) @ (1.0 - fits)
     top = table.max(axis=0)
     return np.asarray(np.log(np.exp(table - top).mean(axis=0)) + top)
-
-
-def _shifts() -> Floats:
-    """Return shifts (H, 2) on a grid, metres."""
-    axis = np.arange(-_MOST, _MOST + 0.5)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    length = np.linalg.norm(grid, axis=1)
-    return np.asarray(grid[(length >= _LEAST) & (length <= _MOST)])

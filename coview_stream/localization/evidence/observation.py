@@ -2,11 +2,11 @@
 
 A point above the ground is explained (map structure in its cell or within half a metre, or a roof edge above it, as a
 survey from above shows no walls), unexplained, or outside the survey. A point on the ground lies on the map's ground or
-not, or is outside the survey. A point that a ray passed through is free in the map, or contradicts it.
+off it, or outside the survey. A point that a ray passed through is free in the map, or contradicts it.
 
-:class:`Share` names the seven shares that the likelihood compares. :class:`Evidence` is their summary for people, from
-which causes of loss and the protection level follow. A right pose scores 0.3 to 0.95, a wrong one up to 0.7 on a road
-that looks the same all along: the score alone decides nothing (docs/integrity.md).
+The likelihood compares the seven shares of :class:`Share`. :class:`Evidence` is their summary for people; causes of
+loss and the protection level follow from it. A right pose scores 0.3 to 0.95, a wrong one up to 0.7 on a uniform road:
+the score alone decides nothing (docs/integrity.md).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from coview_stream.geometry.transforms import Points, Pose, norms
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 _FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
-_PATCH = 4.0  # metres: points of one patch are looked up in turn, as they lie in the same memory
+_PATCH = 4.0  # metres: neighbouring points are looked up in turn, as they lie in the same memory
 _OFFSET = 1 << 15  # keeps patch numbers positive
-_MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
+_MIN_STRUCTURE = 60  # points; fewer cannot distinguish places
 _PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
 
 # free space
@@ -38,17 +38,19 @@ _MIN_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes g
 _BEAM = math.radians(2.0)  # cell of the range image
 _COLUMNS = math.ceil(2.0 * math.pi / _BEAM) + 1  # one more than a turn, for rounding
 _CELLS = _COLUMNS * (math.ceil(math.pi / _BEAM) + 1)
-_BEAM_HITS = 2  # returns in a cell; fewer say nothing
+_BEAM_HITS = 2  # least returns in a cell
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
-_SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, before a ray counts as having passed
-_MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle
-_FLOOR_RADIUS = 10.0  # metres around the sensor in which its ground is looked for
+_SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, that a ray has to end behind a point
+_MARGIN = 0.35  # metres from the middle of a cell of the field to its border
+_FLOOR_RADIUS = 10.0  # metres around the sensor, of its ground
 _FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
 _MIN_FLOOR_POINTS = 20
-_SAMPLES = 6000  # points in the space around the robot; the ones that rays passed through are looked up
+_SAMPLES = 6000  # points in the space around the robot
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
-_LAYERS = 2  # cells that a surface fills on the way through it
+_LAYERS = 2  # cells that a surface fills along a ray
 _VOXEL = 0.5  # metres between neighbouring points of a scan
+_POINTS_PASSED = np.pi * _RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES / (_LAYERS * 0.5) / _VOXEL**2
+"""Scan points on the surface that one passed sample stands for."""
 
 
 class Share(IntEnum):
@@ -134,53 +136,54 @@ class ScanPart:
     @classmethod
     def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int]) -> ScanPart:
         """Take at most ``counts`` points of each kind."""
-        samples = [_evenly(points, count) for points, count in zip(kinds, counts, strict=True)]
+        samples = [
+            points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
+            for points, count in zip(kinds, counts, strict=True)
+        ]
         structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, samples, strict=True))
         return cls(kernels.FieldScan(*samples), (structure, low, free))
 
     def look_up(self, field: kernels.FieldMap, poses: Floats, move: Move) -> Observations:
         """Observe the map from poses (H, 4), as in :class:`Observations`, each moved as far as ``move`` allows first.
 
-        ``Move.NEAR`` is as far as odometry drifts between keyframes.
+        ``Move.NEAR`` allows odometry's drift between keyframes.
         """
         scores = kernels.field_scores(field, self.points, poses, move)
-        return Observations(scores.pose, self._shares(scores), self._parts(scores))
-
-    def _shares(self, scores: kernels.FieldScores) -> Floats32:
         structure, low, free = (max(len(p), 1) for p in (self.points.structure, self.points.low, self.points.free))
-        columns = (
+        shares = np.column_stack([
             scores.on / structure, scores.near / structure, (scores.covered - scores.near) / structure,
             scores.structure / structure, scores.grounded / low, scores.low / low, scores.passed / free,
-        )  # fmt: skip
-        return np.column_stack(columns).astype(np.float32)
+        ])  # fmt: skip
+        return Observations(scores.pose, shares.astype(np.float32), self._parts(scores))
 
     def _parts(self, scores: kernels.FieldScores) -> Floats:
         high, flat, free = self.weights
         structure, low, near = scores.structure * high, scores.low * flat, scores.near * high
         surveyed = np.maximum(scores.structure, 1)
         few = structure < _MIN_STRUCTURE
-        ground = (scores.grounded * flat + 0.5 * _PSEUDO) / (low + _PSEUDO)
-        passed = scores.passed * free * _points_passed()
+        passed = scores.passed * free * _POINTS_PASSED
         total = len(self.points.structure) * high + len(self.points.low) * flat
-        columns = (
-            np.where(few, 0.0, scores.near / surveyed), np.where(few, 0.0, scores.covered / surveyed), ground,
-            (near + 0.5 * _PSEUDO) / (near + passed + _PSEUDO), (structure + low) / max(total, 1.0),
-        )  # fmt: skip
-        return np.column_stack(columns)
+        return np.column_stack([
+            np.where(few, 0.0, scores.near / surveyed),
+            np.where(few, 0.0, scores.covered / surveyed),
+            (scores.grounded * flat + 0.5 * _PSEUDO) / (low + _PSEUDO),
+            (near + 0.5 * _PSEUDO) / (near + passed + _PSEUDO),
+            (structure + low) / max(total, 1.0),
+        ])  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedScan:
-    """A scan to be registered, with samples of it for the field: few points for many poses, many for the best.
+    """A scan to register, with two samples for the field: few points for many poses, many points for the best poses.
 
     Attributes:
         cloud: the points to register, odometry frame, metres.
         T_odom_body: (4, 4) odometry of the newest frame.
         few: a sample.
-        many: one of four times as many points.
-        patches: numbers of four-metre patches that its structure fills, and of cubes that its free space does: the
-            most observations that can be independent.
-        filled: (F,) numbers of those patches, comparable between scans of one odometry frame.
+        many: a sample of four times as many points.
+        patches: number of four-metre patches with structure, and of cubes with free space: upper limits of the number
+            of independent observations.
+        filled: (F,) identifiers of those patches, comparable between scans of one odometry frame.
     """
 
     cloud: RegistrationCloud
@@ -209,7 +212,7 @@ class ObservedScan:
         return np.asarray(self.T_odom_body[:3, 3])
 
     def evidence(self, field: kernels.FieldMap, T_map_odom: Pose) -> Evidence:
-        """Return the evidence for a pose (4, 4); its tilt against gravity is left out."""
+        """Return the evidence for a pose (4, 4), without its tilt against gravity."""
         return self.many.look_up(field, self.poses(T_map_odom[None]), Move.NONE).evidence(0)
 
     def poses(self, T_map_odom: Floats) -> Floats:
@@ -227,7 +230,7 @@ class ObservedScan:
 
 
 def surroundings(scans: Sequence[ObservedScan]) -> float:
-    """Return how many times the surroundings of one scan all of them together have seen; 1 if all are the same."""
+    """Return the joint surroundings of scans as a multiple of those of one scan; 1 if all are the same."""
     mean = float(np.mean([len(scan.filled) for scan in scans]))
     return max(1.0, len(np.unique(np.concatenate([scan.filled for scan in scans]))) / max(mean, 1.0))
 
@@ -237,8 +240,8 @@ class RangeImage:
     """Nearest return of one frame by direction, in cells of 2 degrees.
 
     Attributes:
-        nearest: (C,) metres; -inf where there are too few returns to say anything.
-        floor: height of the ground relative to the sensor, metres, not above it.
+        nearest: (C,) metres; -inf where there are too few returns.
+        floor: height of the ground relative to the sensor, metres, at most 0.
     """
 
     nearest: Floats32
@@ -254,11 +257,13 @@ class RangeImage:
         nearest = np.full(_CELLS, np.inf, dtype=np.float32)
         np.minimum.at(nearest, cells, ranges[far])
         nearest[np.bincount(cells, minlength=_CELLS) < _BEAM_HITS] = -np.inf
-        return cls(nearest, _floor_below(rays))
+        near = rays[:, 2][rays[:, 0] ** 2 + rays[:, 1] ** 2 < _FLOOR_RADIUS**2]
+        floor = float(np.percentile(near, _FLOOR_PERCENTILE)) if len(near) >= _MIN_FLOOR_POINTS else 0.0
+        return cls(nearest, min(0.0, floor))
 
     @staticmethod
     def rays(cloud: Points) -> Points:
-        """Return the points of a frame (N, 3) that :meth:`of` uses: it makes the same image of them alone."""
+        """Return the points of a frame (N, 3) that :meth:`of` uses; they alone give the same image."""
         return cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
 
     def passed_points(self) -> Floats:
@@ -269,13 +274,8 @@ class RangeImage:
         return points[passed & (points[:, 2] > self.floor + _MIN_HEIGHT)]
 
 
-def _evenly(points: Points, count: int) -> Points:
-    """Return at most ``count`` points, spread evenly over all in their order."""
-    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
-
-
 def _filled(points: Points | Floats) -> Ints:
-    """Return the distinct numbers of the patches, or cubes, that points (N, 2) or (N, 3) lie in."""
+    """Return the distinct identifiers of the patches, or cubes, around points (N, 2) or (N, 3)."""
     cell = np.floor(points * (1.0 / _PATCH)).astype(np.int64) + _OFFSET
     return np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16)))
 
@@ -285,15 +285,8 @@ def _by_patch(points: Points) -> Ints:
     return np.asarray(np.lexsort((x, y)))
 
 
-def _floor_below(cloud: Points) -> float:
-    """Height of the ground relative to the sensor: a low percentile of the points near it, never above it."""
-    x, y = cloud[:, 0], cloud[:, 1]
-    near = cloud[:, 2][x * x + y * y < _FLOOR_RADIUS**2]
-    return min(0.0, float(np.percentile(near, _FLOOR_PERCENTILE))) if len(near) >= _MIN_FLOOR_POINTS else 0.0
-
-
 def _directions(points: Points | Floats, ranges: Floats32 | Floats) -> Ints:
-    """Return the cell (N,) of each point (N, 3), body frame: row by row upwards, turning left from straight behind."""
+    """Return the cell (N,) of each point (N, 3), body frame: rows upwards, leftwards from straight behind."""
     turn = ((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
     rise = ((np.arcsin(np.clip(points[:, 2] / ranges, -1.0, 1.0)) + 0.5 * np.pi) / _BEAM).astype(np.int64)
     return np.asarray(rise * _COLUMNS + turn)
@@ -308,9 +301,3 @@ def _samples() -> tuple[Floats, Floats, Ints]:
     points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
     ranges = norms(points)
     return points, ranges, _directions(points, ranges)
-
-
-def _points_passed() -> float:
-    """Return the number of scan points on the surface that one passed sample stands for."""
-    volume = np.pi * _RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES
-    return float(volume / (_LAYERS * 0.5) / _VOXEL**2)

@@ -42,13 +42,13 @@ class LocalMap:
 
     @cached_property
     def grid(self) -> kernels.PointGrid:
-        """The points, to be searched by :func:`coview_kernels.nearest`."""
+        """The points for :func:`coview_kernels.nearest`."""
         if self.cells is None:
             return kernels.PointGrid(self.points)
         return kernels.PointGrid.sorted(self.points, self.cells)
 
     def planes(self, rows: Ints) -> tuple[Floats32, Floats32]:
-        """Return the unit normals (N, 3) of some points, and the planarity (N,) around each in [0, 1]."""
+        """Return the unit normals (N, 3) of points by their rows, and the planarity (N,) around each in [0, 1]."""
         normals = self.normals[rows]
         length = norms(normals)
         unit = np.asarray(normals / np.maximum(length, np.float32(1e-6))[:, None], dtype=np.float32)
@@ -56,14 +56,10 @@ class LocalMap:
 
     def prepare(self, method: RegistrationMethod = "trimmed-icp") -> None:
         """Make the search structures for registration by ``method`` now."""
-        _ = self._sorted
+        if "grid" not in vars(self):
+            kernels.nearest(self.grid, self.points[:1], 1.0)
         if method == "gicp":
             _ = self.surfaces
-
-    @cached_property
-    def _sorted(self) -> bool:
-        kernels.nearest(self.grid, self.points[:1], 1.0)
-        return True
 
     @cached_property
     def surfaces(self) -> Surfaces | None:
@@ -74,7 +70,7 @@ class LocalMap:
 
 
 class LocalMaps:
-    """Crops of a base map by place, of which the recently used ones are kept."""
+    """Crops of a base map by place; the recently used ones are cached."""
 
     def __init__(self, base_map: BaseMap, radius: float, crops: int = _MAX_CROPS) -> None:
         self._map = base_map

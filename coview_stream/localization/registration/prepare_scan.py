@@ -1,4 +1,4 @@
-"""The part of the robot's recent points that is registered."""
+"""Selection of the robot's recent points for registration."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from coview_stream.geometry.transforms import Points, Pose
 if TYPE_CHECKING:
     from coview_stream.localization.registration.gicp import Surfaces
 
-# set by hand
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
-_CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
+_CLEAR = 0.5  # metres above the lowest point nearby, of points that are not ground
 STRUCTURE_HEIGHT = 1.0  # metres above the lowest ground nearby
 _SEED = 20240  # of the choice among too many points
 
@@ -30,7 +29,7 @@ class RegistrationCloud:
 
     Attributes:
         points: (N, 3) float32, gravity-aligned frame, metres.
-        above: (N,) which of them stand above the ground; the others lie on it.
+        above: (N,) whether a point stands above the ground or lies on it.
         height: (N,) metres above the lowest ground nearby.
         ground_offset: metres by which the points on the ground have been lowered.
     """
@@ -42,11 +41,11 @@ class RegistrationCloud:
 
     @property
     def high(self) -> Bools:
-        """(N,) which points are structure: more than a metre above the ground."""
+        """(N,) whether a point is structure: more than a metre above the ground."""
         return np.asarray(self.height > STRUCTURE_HEIGHT)
 
     def lowered(self, metres: float) -> RegistrationCloud:
-        """Return the scan with its ground lowered, to lie where the survey has it; negative metres raise it."""
+        """Return the scan with its ground lowered onto the survey's; negative metres raise it."""
         points = self.points.copy()
         points[~self.above, 2] -= np.float32(metres)
         return replace(self, points=points, ground_offset=self.ground_offset + metres)
@@ -58,7 +57,7 @@ class RegistrationCloud:
 
     @cached_property
     def surfaces(self) -> list[Surfaces]:
-        """The points above the ground and those on it as GICP takes them, what there is of them."""
+        """The points above the ground and the points on it for GICP; kinds with too few points are left out."""
         from coview_stream.localization.registration.gicp import surfaces
 
         kinds = [surfaces(self.points[rows]) for rows in (self.above, ~self.above)]
@@ -70,12 +69,8 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
 
     Args:
         points: (N, 3) float32 in a gravity-aligned frame, metres.
-        position: (3,) where the sensor is, same frame.
-        config: range, voxel and number of points.
-
-    Returns:
-        The thinned points and, for each, its height above the lowest ground nearby. The choice is random but
-        seeded: equal input gives equal output.
+        position: (3,) of the sensor, same frame.
+        config: range, voxel and number of points; the choice is random but seeded.
     """
     thin = thinned(points, position, config)
     height, cell = _heights(thin)
@@ -83,16 +78,16 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
     if len(thin) > config.source_points:
         chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
         chosen.sort()
-    # by place: points that lie together are compared with the same part of the map, which is in the cache then
+    # by place: neighbours are compared with the same part of the map, which is in the cache then
     chosen = chosen[np.argsort(cell[chosen], kind="stable")]
     thin, height = thin[chosen], height[chosen]
     return RegistrationCloud(thin, height > _CLEAR, height)
 
 
 def thinned(points: Points, position: Floats, config: RegistrationConfig) -> Points:
-    """Return the points (K, 3) of a local scan that are in range, one per voxel: :func:`prepare_scan`'s first step.
+    """Return the points (K, 3) of a local scan in range, one per voxel: the first step of :func:`prepare_scan`.
 
-    Arguments are those of :func:`prepare_scan`, which makes the same of the result as of ``points``.
+    Arguments are those of :func:`prepare_scan`, which has the same result for these points as for all.
     """
     return kernels.transform_unique(points, np.eye(4), config.source_voxel, 0.0, config.source_range, position)[0]
 
