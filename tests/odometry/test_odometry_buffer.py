@@ -46,11 +46,6 @@ def test_pose_between_samples_is_interpolated():
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
-def test_rotation_is_interpolated_the_short_way():
-    odometry = buffer((0.0, 0.0, 0.0, np.pi - 0.1), (0.1, 0.0, 0.0, -np.pi + 0.1))
-    np.testing.assert_allclose(odometry.at(ns(0.05)), pose(yaw=np.pi), atol=1e-9)
-
-
 def test_pose_at_a_sample_is_the_sample():
     odometry = buffer((0.0, 1.0), (0.1, 1.1), (0.2, 1.2))
     for seconds, x in ((0.0, 1.0), (0.1, 1.1), (0.2, 1.2)):

@@ -128,12 +128,6 @@ def test_small_lean_is_odometrys_gravity_rather_than_the_sensor():
     assert abs(np.degrees(estimator.calibration.roll)) < 0.05
 
 
-def test_nothing_known_is_as_uncertain_as_the_prior_and_corrects_nothing():
-    found = CalibrationEstimator().calibration
-    assert (found.roll, found.pitch, found.scale, found.turn) == (0.0, 0.0, 0.0, 0.0)
-    assert 2.0 < np.degrees(found.sigma_tilt) < 4.0
-
-
 def test_corrected_odometry_keeps_its_gravity():
     correction, rng = OdometryCorrection(), np.random.default_rng(1)
     for T in truth_of(10, 3.0, rng):

@@ -87,11 +87,6 @@ def test_offset_is_corrected_once_it_is_probable_and_its_end_is_followed_smoothl
     assert np.abs(np.diff([rising[-1], *falling])).max() < 0.3 * rising[-1]
 
 
-def test_two_decimetres_may_as_well_be_none():
-    offset = learned(0.2)
-    assert 0.05 < offset.probability < 0.5
-
-
 def test_offset_that_was_known_before_holds_until_another_is_told():
     offset = GroundOffset()
     offset.restore(0.3)

@@ -14,7 +14,6 @@ from coview_stream.localization.evidence.background import (
     estimate_background,
     left_in_mean,
     observe_with_background,
-    outcomes,
     scatter,
 )
 from coview_stream.localization.evidence.background import chance_places as places_around
@@ -32,11 +31,6 @@ def background_of(places):
 @pytest.fixture
 def rng():
     return np.random.default_rng(20)
-
-
-def test_outcomes_of_an_observation_are_shares_of_what_is_covered():
-    places = observation([[0.4, 0.1, 0.2, 0.3], [1.0, 0.0, 0.0, 0.0]], covered=np.array([0.5, 1.0]))
-    np.testing.assert_allclose(outcomes(places), [[0.2, 0.05, 0.1, 0.15], [1, 0, 0, 0]], atol=1e-6)
 
 
 @pytest.mark.parametrize("number", [12, NUMBER, 60])
@@ -64,12 +58,6 @@ def test_scans_of_other_surroundings_are_more_observations(rng):
     one, three = (estimate_background(chance, scatter(chance), chance, Most(scans=n)).number[0] for n in (1.0, 3.0))
     assert one == 100.0
     assert 100.0 < three <= 300.0
-
-
-def test_correlated_points_are_counted_once(rng):
-    """A thousand points that fall and rise together in 15 groups are 15 observations, not a thousand."""
-    found = background_of(chance_places(rng, 250, number=15))
-    assert found.number[0] < 40
 
 
 @pytest.mark.parametrize("copies", [1, 4, 8])
@@ -113,11 +101,6 @@ def test_few_places_count_little_against_what_is_presumed(rng):
     found = estimate_background(one, scatter(one), one)
     assert presumed.structure[0] < found.structure[0] < 0.5
     assert np.isfinite(found.number).all()
-
-
-def test_scatter_of_fewer_than_two_places_is_not_known():
-    assert np.isnan(scatter(NOTHING)).all()
-    assert np.isnan(scatter(observation([CHANCE]))).all()
 
 
 def test_uncovered_places_say_nothing(rng):

@@ -115,12 +115,6 @@ def test_the_more_is_explained_the_higher_the_ratio():
     assert kept[0] < 0.2 < 0.7 < kept[-1]
 
 
-def test_the_more_is_contradicted_the_lower_the_ratio():
-    """Map structure that rays passed through, in places that explain the same of what stands."""
-    found = ratio(np.tile(GOOD, (5, 1)), passed=np.array([0.0, 0.02, 0.05, 0.1, 0.2]))
-    assert (np.diff(found) < 0).all()
-
-
 @pytest.mark.parametrize("number", [5.0, 50.0, 500.0])
 def test_place_at_the_shares_of_chance_gains_nothing(number):
     background = Background(CHANCE, PASSED, (5.0, 5.0), (number, number))
@@ -156,11 +150,6 @@ def test_ground_is_one_observation_and_bounded(background):
     assert np.isfinite(grounds).all()
     assert grounds[-3] >= grounds[0]
     assert (np.diff(grounds) >= -1.0).all()
-
-
-def test_evidence_grows_with_the_effective_number_alone():
-    few, many = (Background(CHANCE, PASSED, (1.5, 1.5), (n, n)) for n in (10.0, 100.0))
-    assert ratio([GOOD], background=many)[0] > 3.0 * ratio([GOOD], background=few)[0]
 
 
 def test_few_explained_points_of_a_changed_site_are_worth_something():
@@ -295,7 +284,7 @@ def mask(count, *chosen):
     return same
 
 
-@given(st.lists(st.tuples(st.floats(-900, 900), st.integers(0, 400)), max_size=40), st.integers(0, 500))
+@given(st.lists(st.tuples(st.floats(-1e5, 1e5), st.integers(0, 400)), max_size=40), st.integers(0, 500))
 def test_probabilities_sum_to_one(places, more):
     found = of([ratio for ratio, _ in places], [rank for _, rank in places], len(places) + more)
     assert found.place.shape == (len(places),)
@@ -348,13 +337,6 @@ def test_small_errors_are_exact():
     assert rival.error(mask(2, 0)) == pytest.approx(math.exp(-100.0), rel=1e-6)
     assert 1.0 - rival.place[0] == 0.0
     assert of([300.0, 200.0, 250.0], count=3).error(mask(3, 0)) == pytest.approx(math.exp(-50.0), rel=1e-6)
-
-
-def test_huge_and_tiny_ratios_stay_finite():
-    for ratios in ([1e5, -1e5, 0.0], [-1e5, -1e5], [1e5, 1e5]):
-        found = of(ratios, count=50)
-        assert np.isfinite(found.place).all()
-        assert found.place.sum() + found.none == pytest.approx(1.0)
 
 
 # ---- against chance

@@ -85,15 +85,3 @@ def test_what_the_scan_has_explained_at_the_place_is_no_second_time(world_map, s
 def test_few_points_say_nothing(world_map, seen):
     few = replace(seen.many.points, structure=seen.many.points.structure[:9] + np.float32([0.0, 0.0, 40.0]))
     assert found(world_map, replace(seen, many=replace(seen.many, points=few))) == NO_PART
-
-
-def test_masks_of_points_are_what_is_counted(world_map, seen):
-    pose = seen.poses(ODOM[None])
-    moved = pose + np.array([2.0, 1.0, 0.0, 0.1])
-    for at in (pose, moved):
-        points = seen.many.points
-        counts = kernels.field_scores(world_map.field, points, at, kernels.Move.NONE)
-        left = kernels.unexplained(world_map.field, points.structure, at[0])
-        assert abs(int(left.sum()) - int(counts.structure[0] - counts.covered[0])) <= 4
-        near = kernels.near_structure(world_map.field, points.structure, at[0])
-        assert abs(int(near.sum()) - int(counts.near[0])) <= 4

@@ -30,10 +30,6 @@ def test_walls_are_above_ground_and_ground_is_not():
     assert np.abs(source.points[source.above][:, 0] - 10.2).max() < 0.3
 
 
-def test_gentle_slope_is_ground():
-    assert (height_above_lowest(ground(slope=0.08)) < 0.5).all()
-
-
 def test_facade_without_ground_uses_neighbouring_ground():
     floating = wall()[wall()[:, 2] > 7.0]
     height = height_above_lowest(np.concatenate([floating, ground()]))

@@ -147,34 +147,7 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
     np.testing.assert_array_equal(graph.estimate.T_map_body, T)
 
 
-def test_innovations_are_chi_square_with_true_covariances():
-    graph = PoseGraph(GraphConfig(window=5, restart=20))
-    way = drive(400, seed=4, every=3)
-    graph.start(boxplus(START, np.linalg.cholesky(START_COVARIANCE)[:, 3] * 0.5), START_COVARIANCE)
-    found = []
-    for step, seen in zip(way.steps, way.seen[1:], strict=True):
-        graph.move(step, ODOMETRY)
-        if seen is not None:
-            found.append(graph.estimate.innovation(seen, REGISTRATION))
-            graph.correct(seen, REGISTRATION)
-    assert np.mean(found) == pytest.approx(6.0, rel=0.15)
-
-
 # ---- a gap, a new start, refusals
-
-
-def test_covariance_grows_on_odometry_and_shrinks_with_corrections(graph):
-    way = drive(200, seed=9, every=1)
-    for k in range(50, 150):
-        way.seen[k] = None
-    found = run(graph, way)
-    sigma = np.array([np.sqrt(np.trace(e.covariance[3:, 3:])) for e in found])
-    assert (np.diff(sigma[50:150]) > 0).all()
-    assert sigma[149] > 5 * sigma[49]
-    errors = shift_errors(found, way.truth)
-    assert errors[149] < 3 * sigma[149]
-    assert errors[155:].max() < 0.15
-    assert sigma[-1] < 1.1 * sigma[49]
 
 
 def test_restart_carries_nothing_over(graph):
@@ -253,21 +226,17 @@ def way():
 
 
 @pytest.mark.parametrize(
-    ("kernel", "registration", "least", "most"),
+    ("registration", "least", "most"),
     [
-        ("GemanMcClure", RAW, 2.0, np.inf),
-        ("DCS", RAW, 2.0, np.inf),
-        (None, RAW, 0.0, 0.6),  # the control: the covariances are as wrong, and the kernel keeps registrations
-        (None, HONEST, 0.0, 0.35),
-        (None, None, 2.0, np.inf),  # odometry alone: else there would be nothing to lock out of
+        (RAW, 0.0, 0.6),  # a kernel that lets go (Geman-McClure, DCS) locks the map out here
+        (HONEST, 0.0, 0.35),
+        (None, 2.0, np.inf),  # odometry alone
     ],
 )
-def test_kernel_that_lets_go_locks_the_map_out_where_covariances_are_optimistic(way, kernel, registration, least, most):
-    graph = PoseGraph(CONFIG)
-    if kernel is not None:  # another than the product's, which lets go beyond three sigmas
-        graph._kernel = getattr(gtsam.noiseModel.mEstimator, kernel).Create(3.0)
+def test_map_is_not_locked_out_where_covariances_are_optimistic(way, registration, least, most):
     seen = way.seen if registration is not None else [None] * len(way.truth)
-    estimates = run(graph, Drive(way.truth, way.steps, seen), STEPS, RAW if registration is None else registration)
+    drive = Drive(way.truth, way.steps, seen)
+    estimates = run(PoseGraph(CONFIG), drive, STEPS, RAW if registration is None else registration)
     assert least < shift_errors(estimates, way.truth)[20:].max() < most
 
 
@@ -324,7 +293,6 @@ def test_newest_pose_equals_dense_solution(graph):
 
 def full_isam2(way):
     """One iSAM2 that never forgets, its tangent handled here."""
-    import gtsam
 
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(_RELINEARIZE)
@@ -372,33 +340,3 @@ def test_long_drive_equals_unbounded_graph():
     assert pose_graph.config.window <= len(pose_graph) <= pose_graph.config.restart
     R = found[-1].T_map_body[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-
-
-def test_graph_memory_is_bounded():
-    config = GraphConfig(window=5, restart=9)
-    graph, way = PoseGraph(config), drive(60, seed=7)
-    lengths = []
-    graph.start(START, START_COVARIANCE)
-    for step, seen in zip(way.steps, way.seen[1:], strict=True):
-        graph.move(step, ODOMETRY)
-        if seen is not None:
-            graph.correct(seen, REGISTRATION)
-        lengths.append(len(graph))
-    assert max(lengths) <= config.restart
-    assert min(lengths[config.window :]) >= config.window
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [1, 4, 30])
-def test_short_window_keeps_the_estimate(every):
-    """The past meets the future in one pose; the smoothed belief there would count things twice.
-
-    The kernel is out of the way: what it has weighed cannot be weighed again once it is forgotten.
-    """
-    way = drive(80, seed=8, every=every)
-    long = run(PoseGraph(GraphConfig(window=200, restart=400, huber=100.0)), way)
-    short = run(PoseGraph(GraphConfig(window=3, restart=5, huber=100.0)), way)
-    for a, b in zip(long, short, strict=True):
-        sigma = np.sqrt(np.diag(a.covariance))
-        assert (np.abs(boxminus(a.T_map_body, b.T_map_body)) < 0.05 * sigma).all()
-        np.testing.assert_allclose(np.sqrt(np.diag(b.covariance)), sigma, rtol=0.03)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import small_world
 from any_risk import NEVER, with_risk
 from courtyard import courtyard, local_map
-from small_world import boxes
 from trackers import observed, on_the_way, refused
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxplus, inverse, pose_from, rot_z, transform
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.tracking import slip as module
+from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
@@ -206,10 +203,6 @@ def test_displaced_frame_is_detected_and_not_learned(target):
     assert not check.is_displaced(yard(40), HERE, T_MAP_ODOM, target)
 
 
-def test_no_displacement_without_a_baseline(target):
-    assert not DisplacementCheck().is_displaced(yard(), HERE, ELSEWHERE, target)
-
-
 def cluttered(share, seed):
     """A frame a share of which is not on the map: parked cars, people, leaves."""
     frame, rng = yard(seed), np.random.default_rng(seed)
@@ -237,29 +230,3 @@ def test_one_badly_fitting_frame_does_not_become_the_baseline(target):
     check.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
     assert before - 0.3 < check.usual < before
     assert check.is_displaced(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
-
-
-def test_scan_of_another_world_is_detected_as_displaced(world_map, world_drive, scene):
-    T, cloud = world_drive.T_map_body[4], world_drive.clouds[4]
-    around = LocalMaps(world_map, 50.0).around(T[:3, 3])
-    check, other = DisplacementCheck(), small_world.scan(boxes(seed=77), T)
-
-    def arguments(cloud):
-        level = transform(pose_from(T[:3, :3], np.zeros(3)), cloud).astype(np.float32)
-        return level, np.zeros(3), pose_from(np.eye(3), T[:3, 3]), around
-
-    check.learn(*arguments(cloud))
-    assert check.usual > 0.9
-    assert check.is_displaced(*arguments(other))
-    assert not check.is_displaced(*arguments(small_world.scan(scene, T, 5)))
-
-
-def test_displacement_check_samples_a_bounded_number_of_points(target, monkeypatch):
-    """It has half a millisecond at every frame, with any lidar."""
-    asked = []
-    inner = module.kernels.nearest
-    monkeypatch.setattr(
-        module.kernels, "nearest", lambda grid, points, reach: asked.append(len(points)) or inner(grid, points, reach)
-    )
-    share_on_map(np.concatenate([yard(k) for k in range(10)]), HERE, T_MAP_ODOM, target)
-    assert asked == [module._POINTS]

@@ -24,9 +24,7 @@ from trackers import (
 )
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, RegistrationConfig, TrackingConfig
-from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
-from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.register import registration_covariance
@@ -57,19 +55,6 @@ def test_good_registration_is_accepted(world_map, world_drive):
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
     floor = np.diag(registration_covariance(1e14 * np.eye(6), ride.tracker.config.registration))
     assert (np.diag(after) > 0.9 * floor).all()
-
-
-def test_protection_level_grows_with_the_metres_driven(world_map, world_drive):
-    cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
-    ride = ride_of(world_map, world_drive)
-    ride.update(cloud, truth)
-    level = ride.tracker.protection_level()
-    assert level == protection_level(ride.tracker.reported_covariance())
-    assert ride.error(truth)[0] < level.metres < 1.0
-    ahead = ride.odometry(truth)
-    ahead[:3, 3] += (5.0, 0.0, 0.0)
-    ride.tracker.add_scan(RawScan(cloud, ahead))
-    assert ride.tracker.protection_level().metres > level.metres
 
 
 def test_error_is_within_reported_covariance(world_map, slow_drive):
