@@ -39,32 +39,22 @@ _AROUND = 5  # cells: eaves and crowns hide things within a metre
 _MAX_CELLS = 400_000_000
 
 
-class SurveyCover:
-    """Heights of the highest points of the base map around each place.
+def top_around(base_map: BaseMap, points: Points) -> Floats32:
+    """Return the greatest height (N,) of the map around points (N, 3), minus infinity where it has no points.
 
     A higher object would be in a survey from above; a lower one may have been hidden below a roof or a crown, or be a
     facade.
     """
-
-    def __init__(self, base_map: BaseMap, low: Points, high: Points) -> None:
-        """Cover a rectangle from ``low`` (2,) to ``high`` (2,), relative to the map's origin."""
-        self._low = np.floor(np.asarray(low, dtype=np.float64) - 2.0)
-        shape = np.ceil((np.asarray(high, dtype=np.float64) + 2.0 - self._low) / _CELL).astype(int) + 1
-        if int(shape[0]) * int(shape[1]) > _MAX_CELLS:
-            raise ValueError(f"an area of {shape[0] * _CELL:.0f} x {shape[1] * _CELL:.0f} m")
-        top = np.full(tuple(shape), -np.inf, dtype=np.float32)
-        for begin in range(0, len(base_map.points), _CHUNK):
-            points = np.asarray(base_map.points[begin : begin + _CHUNK])
-            inside, cells = _within_raster(np.floor((points[:, :2] - self._low) / _CELL), top)
-            np.maximum.at(top, cells, points[inside, 2])
-        self._top = max_filter(top, _AROUND)
-
-    def top_around(self, points: Points) -> Floats32:
-        """Return the greatest height (N,) of the map around points (N, 3); minus infinity where it has no points."""
-        inside, cells = _within_raster(np.floor((points[:, :2] - self._low) / _CELL), self._top)
-        heights = np.full(len(points), -np.inf, dtype=np.float32)
-        heights[inside] = self._top[cells]
-        return heights
+    low = np.floor(points[:, :2].min(axis=0).astype(np.float64) - 2.0)
+    shape = np.ceil((points[:, :2].max(axis=0).astype(np.float64) + 2.0 - low) / _CELL).astype(int) + 1
+    if int(shape[0]) * int(shape[1]) > _MAX_CELLS:
+        raise ValueError(f"an area of {shape[0] * _CELL:.0f} x {shape[1] * _CELL:.0f} m")
+    top = np.full(tuple(shape), -np.inf, dtype=np.float32)
+    for begin in range(0, len(base_map.points), _CHUNK):
+        part = np.asarray(base_map.points[begin : begin + _CHUNK])
+        inside, cells = _within_raster(np.floor((part[:, :2] - low) / _CELL), top)
+        np.maximum.at(top, cells, part[inside, 2])
+    return np.asarray(max_filter(top, _AROUND)[_within_raster(np.floor((points[:, :2] - low) / _CELL), top)[1]])
 
 
 def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple[Ints, ...]]:
@@ -112,19 +102,12 @@ class FuseConfig:
 
 @dataclass(frozen=True)
 class Added:
-    """Contribution of one run.
+    """Contribution of one run: numbers of its frames, and of its points in the fused cloud."""
 
-    Attributes:
-        frames: used.
-        without_pose: frames that have no pose.
-        damaged: frames that could not be read.
-        points: of the run in the fused cloud; a voxel of several runs counts for the first of them.
-    """
-
-    frames: int
+    frames: int  # used
     without_pose: int
-    damaged: int
-    points: int
+    damaged: int  # that could not be read
+    points: int  # a voxel of several runs counts for the first of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,19 +184,18 @@ def fuse(
     n = len(points)
     moving = _seen_through(through[:n], seen[:n], _THROUGH_MOVING)
     to_map = distances(points, lambda centre, radius: base_map.crop(centre, radius)[0], max(_NEAR, config.voxel))
-    cover = SurveyCover(base_map, points[:, :2].min(axis=0), points[:, :2].max(axis=0))
+    top = top_around(base_map, points)
     base_change = np.full(len(base_map.points), SAME, dtype=np.uint8)
     new = np.zeros(n, dtype=bool)
     if config.changes:
         enough = rows["hits"] >= min(2, sum(taken))
-        top = cover.top_around(points)
         surveyed = np.isfinite(top) & (points[:, 2] > top + _ABOVE)  # the survey would have seen it
         new = ~moving & enough & (to_map > _NEAR) & surveyed
         gone = np.flatnonzero(_seen_through(through[n:], seen[n:], _THROUGH_GONE))
         lasting = np.isfinite(distances(base_points[gone], within(points[~moving]), _NEAR))
         base_change[base[gone[~lasting]]] = GONE
     keep = (to_map > config.voxel) & (~moving | config.keep_moving)
-    blind = keep & ~new & (to_map > _NEAR) & np.isfinite(cover.top_around(points))
+    blind = keep & ~new & (to_map > _NEAR) & np.isfinite(top)
     source = rows["source"][keep]
     added = tuple(
         Added(frames, run.without_pose, len(run.damaged), int((source == k).sum()))
@@ -270,6 +252,6 @@ def _base_near(base_map: BaseMap, points: Points) -> Ints:
 
 
 def check_count(runs: int) -> None:
-    """Raise ConfigError for more runs than the 65,535 of a point's source number."""
+    """Raise ConfigError for more runs than a point's source number can have."""
     if runs > np.iinfo(np.uint16).max:
         raise ConfigError(f"{runs} runs: at most 65,535 can be told apart; fuse some of them first")

@@ -30,14 +30,12 @@ from coview_stream.fusion.constraints import (
     path_of,
     submaps_of,
 )
+from coview_stream.fusion.fuse import Progress
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, Poses, along_body, along_map, boxminus, interpolate, inverse
+from coview_stream.geometry.transforms import Poses, along_body, along_map, boxminus, interpolate, inverse
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
-
-Progress = Callable[[str, int, int], None]
-"""Called with (name of the step, how many, of how many)."""
 
 # chosen by hand
 _KERNEL = 3.0  # sigmas, of Cauchy's weights
@@ -49,15 +47,10 @@ _MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # largest growth of the distance to the
 
 @dataclass(frozen=True)
 class Judgement:
-    """Medians of distances between surfaces before and after, metres; NaN where there are none.
+    """Medians of distances between surfaces before and after, metres; NaN where there are none."""
 
-    Attributes:
-        runs: between held-out submaps.
-        to_map: between submaps and the base map.
-    """
-
-    runs: tuple[float, float]
-    to_map: tuple[float, float]
+    runs: tuple[float, float]  # between held-out submaps
+    to_map: tuple[float, float]  # between submaps and the base map
 
     @property
     def better(self) -> bool:
@@ -68,31 +61,18 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Result of a joint adjustment.
+    """Result of a joint adjustment: poses by run, (K, 4, 4) map <- body in the coordinates of the map's sources."""
 
-    Attributes:
-        located: poses by ``locate`` by run, (K, 4, 4) map <- body in the coordinates of the map's sources.
-        adjusted: the adjusted poses, likewise.
-        keyframes: number of keyframes.
-        on_map: number of registrations to the map.
-        odometry: number of steps from keyframe to keyframe.
-        between: number of used pairs of submaps of two runs.
-        loops: number of used pairs of submaps of one run.
-        held_out: number of pairs to judge the result by.
-        residuals: median of |e| in sigmas of the used constraints between submaps: before, after.
-        judgement: distances; None with too few pairs to judge by.
-    """
-
-    located: tuple[Poses, ...]
+    located: tuple[Poses, ...]  # by locate
     adjusted: tuple[Poses, ...]
     keyframes: int
-    on_map: int
-    odometry: int
-    between: int
-    loops: int
-    held_out: int
-    residuals: tuple[float, float]
-    judgement: Judgement | None
+    on_map: int  # registrations
+    odometry: int  # steps from keyframe to keyframe
+    between: int  # used pairs of submaps of two runs
+    loops: int  # used pairs of submaps of one run
+    held_out: int  # pairs to judge the result by
+    residuals: tuple[float, float]  # median of |e| in sigmas of the used pairs: before, after
+    judgement: Judgement | None  # None with too few pairs to judge by
 
     @property
     def accepted(self) -> bool:
@@ -149,8 +129,7 @@ def adjust(
             progress("submaps", number + 1, len(runs))
     registrar = Registrar(submaps, LocalMaps(base_map, 40.0))
     on_map = [constraint for k in range(len(submaps)) if (constraint := registrar.to_map(k))]
-    pairs = []
-    candidates = overlapping(submaps)
+    pairs, candidates = [], overlapping(submaps)
     for done, (k, other) in enumerate(candidates, start=1):
         constraint = registrar.to_submap(k, other)
         if constraint is not None:
@@ -167,14 +146,10 @@ def adjust(
             _medians(lambda at: [registrar.apart(pair.source, pair.target, at) for pair in held_out], before, after),
             _medians(lambda at: [registrar.apart_from_map(k, at[k]) for k in range(len(submaps))], before, after),
         )
-    adjusted = tuple(
-        _spread(run, [(s, T) for s, T in zip(submaps, after, strict=True) if s.run == number], base_map.origin)
-        for number, run in enumerate(runs)
-    )
     loops = sum(submaps[pair.source].run == submaps[pair.target].run for pair in used)
     return Joint(
         tuple(run.poses for run in runs),
-        adjusted,
+        tuple(_spread(run, number, submaps, after, base_map.origin) for number, run in enumerate(runs)),
         keyframes=len(submaps),
         on_map=len(on_map),
         odometry=len(steps),
@@ -253,11 +228,12 @@ def _medians(apart: Callable[[Floats], list[Floats]], before: Floats, after: Flo
     return median(before), median(after)
 
 
-def _spread(run: LocalizedRun, keyframes: Sequence[tuple[Submap, Pose]], origin: Floats) -> Poses:
+def _spread(run: LocalizedRun, number: int, submaps: Sequence[Submap], poses: Floats, origin: Floats) -> Poses:
     """Return poses (K, 4, 4) of all frames: moves of the keyframes around, interpolated by metres driven."""
     driven, _ = path_of(run.odometry)
-    at = np.array([submap.driven for submap, _ in keyframes])
-    moves = [T @ inverse(submap.T_map_body) for submap, T in keyframes]
+    keys = [k for k, submap in enumerate(submaps) if submap.run == number]
+    at = np.array([submaps[k].driven for k in keys])
+    moves = [poses[k] @ inverse(submaps[k].T_map_body) for k in keys]
     old = run.poses.copy()
     old[:, :3, 3] -= origin
     out = np.empty_like(old)

@@ -209,10 +209,8 @@ class CalibrationEstimator:
     def measure_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
         """Add the attitude of a registration at the tracked place (eq. C1).
 
-        Args:
-            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
-            T_odom_body: (4, 4) odometry of the same frame.
-            variance: of the registration's roll and pitch, rad^2.
+        ``T_map_cloud`` (4, 4) is of the cloud in the sensor's axes, the prior removed, ``T_odom_body`` (4, 4) of the
+        same frame, ``variance`` of the registration's roll and pitch, rad^2.
         """
         self._supposed = None
         _measure_attitude(self._known, T_map_cloud, T_odom_body, variance)
@@ -255,7 +253,7 @@ class CalibrationEstimator:
         return pose_from(turn @ step[:3, :3], (1.0 + now.scale) / (1.0 + before.scale) * step[:3, 3])
 
     def measure_frames(self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float) -> Pose:
-        """Add a motion between frames measured by the lidar alone (eq. C4).
+        """Add a motion between frames measured by the lidar alone (eq. C4); return ``step``, newly corrected.
 
         Args:
             motion: (4, 4) of the levelled body.
@@ -263,9 +261,6 @@ class CalibrationEstimator:
             variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
             position: sigma of ``motion``, metres.
             angle: sigma of ``motion``, radians.
-
-        Returns:
-            ``step`` corrected by the new calibration.
         """
         t, before = step[:3, 3], self.calibration
         applied = log_so3(before.R_body_cloud)[:2]

@@ -89,15 +89,7 @@ def register_surfaces(
 ) -> kernels.Registration | None:
     """Register a scan by GICP; None where fewer than 50 points find a partner.
 
-    Args:
-        source: the scan.
-        T_map_source: (4, 4) initial guess.
-        target: the map.
-        pivot: (3,) source-frame point that rotations are about.
-        scales: coarse to fine.
-        keep: share of the pairs in (0, 1].
-        iterations: limit per scale.
-        prior: about the same pivot.
+    Arguments are as for :func:`coview_kernels.align_planes`.
 
     Raises:
         ValueError: the initial guess or the prior is not finite.

@@ -53,16 +53,8 @@ def find_rivals(
     """Return the most probable poses beside a registered one that do not converge to it; perhaps none.
 
     After a slip, registration starts beside the right place, and a wall moved since the survey may hold it there. So
-    the map is looked up on rings of poses around, and the most probable one is registered, too: a place has to explain
-    the scan better than its best rival.
-
-    Args:
-        place: evidence of the tracked place.
-        scan: the registered scan.
-        T_map_odom: (4, 4) its registration.
-        target: the map around it.
-        config: of the registration.
-        count: largest number of rivals; above 1 other headings are tried, too.
+    the map is looked up on rings of poses around, and the ``count`` most probable ones are registered, too: a place has
+    to explain the scan better than its best rival. A count above 1 also tries other headings.
     """
     here = scan.poses(T_map_odom[None])[0]
     poses, ratios = place.look_around(scan, T_map_odom, rings(here, _TURNED if count > 1 else _STRAIGHT))
@@ -162,15 +154,9 @@ class MapMatcher:
         predicted: Estimate,
         rivals_wanted: int = 1,
     ) -> MapMatch:
-        """Register (eq. 13), verify and judge; where registration fails, the belief stays.
+        """Register from ``belief``, which is the prior (eq. 13), verify and judge; without a registration it stays.
 
-        Args:
-            scan: to be registered.
-            belief: pose and covariance that it starts from, and that take part in it as a prior.
-            target: the map around it.
-            scales: largest correspondence distance of each scale, metres.
-            predicted: pose and covariance by the graph, which the innovation is measured from.
-            rivals_wanted: largest number of rivals to search for.
+        ``predicted`` is the graph's estimate, for the innovation; ``rivals_wanted`` limits the search for rivals.
         """
         settings = self._config.registration
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
@@ -206,17 +192,9 @@ class MapMatcher:
     def match_widely(
         self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, predicted: Estimate
     ) -> list[MapMatch]:
-        """Match again, from a wide belief and from the best rival of a match, and hold all against each other.
+        """Match again, from a belief wide enough for a slip and from the best rival; compare these with ``first``.
 
-        Args:
-            first: the match in doubt.
-            scan: to be registered.
-            belief: wide enough for a slip.
-            target: the map around it.
-            predicted: as for :meth:`match`.
-
-        Returns:
-            Two or three matches, ``first`` being the first.
+        Returns ``first`` and one or two more.
         """
         scales = self._config.registration.search[1:]
         tries = [first, self.match(scan, belief, target, scales, predicted, _MAX_RIVALS)]
@@ -238,20 +216,13 @@ class MapMatcher:
         belief: Estimate,
         travelled: float,
     ) -> MapMatch:
-        """Judge a match that fits, but contradicts odometry: the place moves if the scans support it.
+        """Judge the best of ``tries``, which fits, but contradicts odometry: the place moves if the scans support it.
 
         If the two places are near enough for either to be right, the lidar's is believed, without a pose until the next
         frame agrees. Within odometry's drift there is no contradiction. If the headings alone differ, odometry is
         wrong, as moved objects do not turn about the robot. If the heights differ by more than the drift, odometry is
-        right, as no wheel slips upwards.
-
-        Args:
-            match: the best of ``tries``.
-            scan: the registered one.
-            tries: all matches of the scan.
-            T_map_predicted: (4, 4) pose by odometry, or by a match that did not contradict it.
-            belief: pose and covariance that odometry leads to.
-            travelled: metres driven.
+        right, as no wheel slips upwards. ``T_map_predicted`` (4, 4) is by odometry, or by a match that agrees with it;
+        ``belief`` is odometry's.
         """
         rule = self._config.acceptance
         plausible = match.innovation <= rule.max_innovation

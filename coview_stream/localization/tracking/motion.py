@@ -33,21 +33,13 @@ _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standi
 
 @dataclass(frozen=True)
 class Drift:
-    """Sigmas of odometry's errors, of a random walk: per square root of a metre driven.
+    """Sigmas of odometry's errors, of a random walk: metres and radians per square root of a metre driven."""
 
-    Attributes:
-        position: metres, each of x and y.
-        height: metres.
-        tilt: radians, each of roll and pitch.
-        yaw: radians.
-        turn: radians of yaw per radian turned.
-    """
-
-    position: float
+    position: float  # each of x and y
     height: float
-    tilt: float
+    tilt: float  # each of roll and pitch
     yaw: float
-    turn: float
+    turn: float  # radians of yaw per radian turned
 
     @classmethod
     def of(cls, config: TrackingConfig) -> Drift:
@@ -92,11 +84,8 @@ class DriftEstimator:
     def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
         """Add the motion between two registrations, where it is :func:`worth_learning`.
 
-        Args:
-            gap: (6,) over (rx, ry, rz, x, y, z): the later pose less odometry's prediction from the earlier one.
-            noise: (6,) variances of the two registrations alone.
-            driven: metres between them.
-            turned: radians between them.
+        ``gap`` (6,) over (rx, ry, rz, x, y, z) is the later pose less odometry's prediction from the earlier one,
+        ``noise`` (6,) the variances of the two registrations alone; metres ``driven`` and radians ``turned`` between.
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
@@ -190,9 +179,7 @@ class OdometryTracker:
     def learn(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
-        Args:
-            T_map_cloud: (4, 4) registered pose of the cloud in the sensor's axes, the prior removed.
-            covariance: (6, 6) of the pose.
+        ``T_map_cloud`` (4, 4) and its covariance (6, 6) are of the cloud in the sensor's axes, the prior removed.
         """
         self._learn_unconfirmed()
         self._learn(_Registered(T_map_cloud, covariance, self._keyframe))

@@ -59,19 +59,12 @@ class _Gaussian(NamedTuple):
 
 @dataclass
 class _Keyframe:
-    """One pose of the chain.
+    """One pose of the chain."""
 
-    Attributes:
-        T: (4, 4) ``T_map_body``, initial or linearised.
-        between: this body in the frame of the previous one; None for the first.
-        corrections: measured poses in the map.
-        filtered: belief when it was the newest; None for the newest.
-    """
-
-    T: Pose
-    between: _Gaussian | None = None
-    corrections: list[_Gaussian] = field(default_factory=list)
-    filtered: _Gaussian | None = None
+    T: Pose  # (4, 4) T_map_body, initial or linearised
+    between: _Gaussian | None = None  # this body in the frame of the previous one; None for the first
+    corrections: list[_Gaussian] = field(default_factory=list)  # measured poses in the map
+    filtered: _Gaussian | None = None  # belief when it was the newest; None for the newest
 
 
 class PoseGraph:

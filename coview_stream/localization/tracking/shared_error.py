@@ -57,14 +57,9 @@ class SharedErrorModel:
 def clustered_covariance(
     source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, config: RegistrationConfig
 ) -> Floats | None:
-    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None for too few clusters.
+    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) of a registration; None for too few clusters.
 
-    Args:
-        source: the registered points.
-        T_map_source: (4, 4) registered pose.
-        target: the map around it.
-        pivot: (3,) source-frame point that rotations are about.
-        config: the one that the registration had.
+    Rotations are about ``pivot`` (3,) in the source's frame, along the map's axes.
     """
     source = source.every(_EVERY)
     reach = config.track[-1]

@@ -58,12 +58,8 @@ class Dispute:
     ) -> Pose | None:
         """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None: undecided.
 
-        Args:
-            scan: the registered one.
-            T_map_predicted: (4, 4) pose of the body by odometry.
-            T_map_seen: (4, 4) registered poses of the body.
-            travelled: metres driven.
-            risk: accepted probability that another candidate is right, so far off that it matters.
+        The candidates are the pose by odometry and the registered ones ``T_map_seen``; ``risk`` is the accepted
+        probability that another candidate is right, so far off that it matters.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled

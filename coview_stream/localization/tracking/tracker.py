@@ -111,11 +111,8 @@ class Tracker:
     ) -> None:
         """Begin at an accepted place, with a wide covariance.
 
-        Args:
-            registration: of the accepted keyframe.
-            T_odom_body: (4, 4) odometry of the newest frame.
-            travelled: metres driven up to that keyframe.
-            T_odom_found: (4, 4) odometry of that keyframe; None if it is the newest frame.
+        ``registration``, metres ``travelled`` and ``T_odom_found`` (4, 4) are of the accepted keyframe, ``T_odom_body``
+        (4, 4) is of the newest frame, which is the keyframe without a ``T_odom_found``.
         """
         self._matcher.clear()
         self.ground.clear()
