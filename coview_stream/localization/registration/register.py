@@ -81,6 +81,11 @@ def register(
     )  # fmt: skip
 
 
+def gravity_information(sigma: float) -> Floats:
+    """Information (6, 6) of "both frames are level to ``sigma`` radians"."""
+    return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
+
+
 def swap_rotation_translation(covariance: Floats) -> Floats:
     """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
     return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])

@@ -21,7 +21,7 @@ from coview_stream.localization.evidence.background import observe_with_backgrou
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.register import gravity_information, register
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
@@ -75,11 +75,6 @@ def register_place(
         return None
     T = registration.T_map_source
     return replace(place, T_map_odom=T, registration=registration, evidence=scan.evidence(base_map.field, T))
-
-
-def gravity_information(sigma: float) -> Floats:
-    """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
-    return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
 
 
 def find_modes(

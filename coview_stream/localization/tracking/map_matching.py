@@ -16,7 +16,12 @@ from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.evidence.observation import Evidence, ObservedScan
 from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
+from coview_stream.localization.registration.register import (
+    gravity_information,
+    register,
+    registration_covariance,
+    remove_prior,
+)
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
@@ -58,7 +63,7 @@ def find_rivals(
     """
     here = scan.poses(T_map_odom[None])[0]
     poses, ratios = place.look_around(scan, T_map_odom, rings(here, _TURNED if count > 1 else _STRAIGHT))
-    cloud, upright = scan.cloud.every(_EVERY), np.diag([config.gravity_sigma**-2] * 2 + [0.0] * 4)
+    cloud, upright = scan.cloud.every(_EVERY), gravity_information(config.gravity_sigma)
     scales = tuple(scale for scale in config.search if scale <= _WIDEST) or config.search[-1:]
     tried, transforms = [here], [T_map_odom]
     for _ in range(count):

@@ -17,6 +17,7 @@ from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import (
+    gravity_information,
     propagate,
     register,
     registration_covariance,
@@ -181,6 +182,10 @@ def test_propagated_heading_error_becomes_position_error():
     assert np.sqrt(across @ expected @ across) == pytest.approx(sideways, rel=0.1)
     ahead = np.array([0.0, 0.0, 0.0, *shift[:2], 0.0]) / np.hypot(*shift[:2])
     assert np.sqrt(ahead @ expected @ ahead) < 0.2 * sideways
+
+
+def test_gravity_informs_of_roll_and_pitch_alone():
+    np.testing.assert_allclose(gravity_information(0.01), np.diag([1e4, 1e4, 0.0, 0.0, 0.0, 0.0]))
 
 
 # ---- a registration's

@@ -153,6 +153,16 @@ def test_registration_that_odometry_contradicts_teaches_nothing_before_another_o
     assert ride.tracker.drift.position > drift.position
 
 
+def test_jump_after_the_pose_was_forgotten_is_not_driven():
+    ride = Ride(1.0)
+    for x in (0.0, 2.0):
+        ride.drive(x)
+    ride.tracker.forget_pose()
+    ride.drive(500.0)
+    ride.drive(501.0)
+    assert ride.tracker.travelled == pytest.approx(3.0)
+
+
 def test_contradicted_registration_that_is_forgotten_teaches_nothing():
     ride = Ride(1.3)
     ride.drive(0.0)
@@ -178,7 +188,7 @@ def test_tilt_is_that_of_the_cloud_whatever_is_known_already():
     lean = exp_so3(np.radians([0.0, 2.0, 0.0]))
     for known in (0.0, -1.0, -2.0):
         estimator = CalibrationEstimator()
-        estimator.learn(Calibration(pitch=np.radians(known), sigma_tilt=0.01))
+        estimator.learn(Calibration(pitch=np.radians(known), sigma_tilt=np.radians(2.0)))
         for _ in range(20):
             estimator.measure_attitude(pose_from(lean.T, np.zeros(3)), np.eye(4), np.radians(0.05) ** 2)
         assert np.degrees(estimator.calibration.pitch) == pytest.approx(-2.0, abs=0.15), known

@@ -27,8 +27,9 @@ from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig,
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import registration_covariance
+from coview_stream.localization.registration.register import registration_covariance, swap_rotation_translation
 from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.tracker import Tracker
 
 RULE = AcceptanceConfig()
@@ -55,6 +56,8 @@ def test_good_registration_is_accepted(world_map, world_drive):
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
     floor = np.diag(registration_covariance(1e14 * np.eye(6), ride.tracker.config.registration))
     assert (np.diag(after) > 0.9 * floor).all()
+    shared = SharedErrorModel(ride.tracker.config.registration).covariance  # without a registration: the least
+    assert (np.diag(swap_rotation_translation(ride.tracker.reported_covariance()) - shared) > 0.0).all()
 
 
 def test_error_is_within_reported_covariance(world_map, slow_drive):
