@@ -103,12 +103,9 @@ class FoxgloveSink(Sink):
 
     def _log_map(self, view: MapView) -> None:
         self._log("/map", "PointCloud", self._cloud(view.points, 0, view.is_ground.astype(np.float32)))
-        origin = self._messages.FrameTransform(
-            parent_frame_id=_SOURCE,
-            child_frame_id=_FRAME,
-            translation=self._vector(self._origin),
-            rotation=self._messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
-        )
+        place, turn = self._vector(self._origin), self._messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+        frames = {"parent_frame_id": _SOURCE, "child_frame_id": _FRAME}
+        origin = self._messages.FrameTransform(translation=place, rotation=turn, **frames)
         self._log("/tf", "FrameTransforms", self._messages.FrameTransforms(transforms=[origin]))
 
     def pose(self, pose: PoseMessage) -> None:
@@ -116,16 +113,10 @@ class FoxgloveSink(Sink):
         m, stamp, name = self._messages, self._stamp(pose.stamp_ns), pose.robot
         T = pose.T_map_body
         place, (position, turn) = self._pose(T), self._parts(T)
-        at = m.FrameTransform(
-            timestamp=stamp,
-            parent_frame_id=_FRAME,
-            child_frame_id=f"{name}/base_link",
-            translation=position,
-            rotation=turn,
-        )
+        frames = {"parent_frame_id": _FRAME, "child_frame_id": f"{name}/base_link"}
+        at = m.FrameTransform(timestamp=stamp, translation=position, rotation=turn, **frames)
         self._log("/tf", "FrameTransforms", m.FrameTransforms(transforms=[at]), pose.stamp_ns)
-        own = m.PoseInFrame(timestamp=stamp, frame_id=_FRAME, pose=place)
-        self._log(f"/robots/{name}/pose", "PoseInFrame", own)
+        self._log(f"/robots/{name}/pose", "PoseInFrame", m.PoseInFrame(timestamp=stamp, frame_id=_FRAME, pose=place))
         spread = pose.covariance[:3, :3]
         if np.isfinite(spread).all():
             sigmas, axes = np.linalg.eigh(spread)
@@ -133,7 +124,9 @@ class FoxgloveSink(Sink):
             turned = np.eye(4)
             turned[:3, :3], turned[:3, 3] = axes, T[:3, 3]
             size = 2.0 * _SIGMAS * np.sqrt(np.maximum(sigmas, 1e-6))
-            ball = m.SpherePrimitive(pose=self._pose(turned), size=self._vector(size), color=self._colour(name, 0.4))
+            red, green, blue = _COLOURS.get(self._states.get(name, "TRACKING"), _GREY)
+            colour = m.Color(r=red, g=green, b=blue, a=0.4)
+            ball = m.SpherePrimitive(pose=self._pose(turned), size=self._vector(size), color=colour)
             entity = m.SceneEntity(timestamp=stamp, frame_id=_FRAME, id=name, spheres=[ball])
             self._log(f"/robots/{name}/scene", "SceneUpdate", m.SceneUpdate(entities=[entity]))
 
@@ -182,12 +175,9 @@ class FoxgloveSink(Sink):
     def _log(self, topic: str, kind: str, message: Any, stamp_ns: int | None = None) -> None:
         if stamp_ns is not None:
             self._newest_ns = stamp_ns
-        self._channel(topic, kind).log(message, log_time=self._newest_ns if self._by_stamp else None)
-
-    def _channel(self, topic: str, kind: str) -> Any:
         if topic not in self._channels:
             self._channels[topic] = getattr(self._kinds, f"{kind}Channel")(topic, context=self._context)
-        return self._channels[topic]
+        self._channels[topic].log(message, log_time=self._newest_ns if self._by_stamp else None)
 
     def _cloud(self, points: Points, stamp_ns: int, value: Floats | Any) -> Any:
         m = self._messages
@@ -197,14 +187,8 @@ class FoxgloveSink(Sink):
             m.PackedElementField(name=n, offset=4 * k, type=number) for k, n in enumerate(("x", "y", "z", "value"))
         ]
         here = m.Pose(position=self._vector(np.zeros(3)), orientation=m.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
-        return m.PointCloud(
-            timestamp=self._stamp(stamp_ns),
-            frame_id=_FRAME,
-            pose=here,
-            point_stride=16,
-            fields=fields,
-            data=rows.tobytes(),
-        )
+        layout = {"point_stride": 16, "fields": fields, "data": rows.tobytes()}
+        return m.PointCloud(timestamp=self._stamp(stamp_ns), frame_id=_FRAME, pose=here, **layout)
 
     def _pose(self, T: Pose) -> Any:
         position, turn = self._parts(T)
@@ -218,10 +202,6 @@ class FoxgloveSink(Sink):
     def _vector(self, values: Floats) -> Any:
         x, y, z = np.asarray(values, dtype=np.float64).tolist()
         return self._messages.Vector3(x=x, y=y, z=z)
-
-    def _colour(self, robot: str, alpha: float) -> Any:
-        red, green, blue = _COLOURS.get(self._states.get(robot, "TRACKING"), _GREY)
-        return self._messages.Color(r=red, g=green, b=blue, a=alpha)
 
     def _stamp(self, stamp_ns: int) -> Any:
         seconds, rest = divmod(max(0, int(stamp_ns)), _NS)

@@ -72,7 +72,12 @@ class RerunSink(Sink):
         if np.isfinite(spread).all():
             half = _SIGMAS * np.sqrt(np.maximum(np.diag(spread), 1e-6))
             self._log(f"{name}/covariance", self._rerun.Ellipsoids3D(half_sizes=[half], centers=[row[:3]]))
-        self._extend(name, row[:3].tolist())
+        way, piece = self._ways.setdefault(name, []), self._pieces.setdefault(name, 0)
+        way.append(row[:3].tolist())
+        if len(way) > 1:
+            self._log(f"{name}/way/{piece}", self._rerun.LineStrips3D([way]))
+        if len(way) >= _STRIP:
+            self._ways[name], self._pieces[name] = way[-1:], piece + 1
 
     def status(self, robot: str, status: dict[str, Any]) -> None:
         """Log a change of state, with its reason."""
@@ -105,15 +110,6 @@ class RerunSink(Sink):
         self._stream.flush()
         self._stream.disconnect()
 
-    def _extend(self, name: str, place: list[float]) -> None:
-        way = self._ways.setdefault(name, [])
-        way.append(place)
-        piece = self._pieces.setdefault(name, 0)
-        if len(way) > 1:
-            self._log(f"{name}/way/{piece}", self._rerun.LineStrips3D([way]))
-        if len(way) >= _STRIP:
-            self._ways[name], self._pieces[name] = [place], piece + 1
-
     def _local(self, T: Pose) -> Pose:
         out = T.copy()
         out[:3, 3] -= self._zero(T[:3, 3])
@@ -122,8 +118,7 @@ class RerunSink(Sink):
     def _zero(self, place: Floats) -> Floats:
         """Return the map's origin, or the first place while the map is not known."""
         if self._origin is None:
-            first: Floats = np.asarray(np.round(place), dtype=np.float64)
-            self._origin = first
+            self._origin = np.asarray(np.round(place), dtype=np.float64)
         return self._origin
 
     def _at(self, stamp_ns: int) -> None:
@@ -148,13 +143,9 @@ def _start_viewer() -> int:
     )
     if viewer is None:
         raise DependencyError("--rerun: its viewer is not installed; pip install --force-reinstall 'rerun-sdk>=0.20'")
-    process = subprocess.Popen(
-        [str(viewer), "--bind", _HOST, "--port", str(port)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # it stays when we end
-    )
+    command, nothing = [str(viewer), "--bind", _HOST, "--port", str(port)], subprocess.DEVNULL
+    # in a session of its own it stays when we end
+    process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
     deadline = time.monotonic() + _MAX_START
     while time.monotonic() < deadline:
         if process.poll() is not None:

@@ -17,33 +17,29 @@ from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.transforms import Points, Pose, interpolate
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 
-_KEPT = 64  # poses of a robot, to look scans' poses up in
-_TOLERANCE_NS = 150_000_000  # beyond the known poses: the nearest one is near enough to draw by
-_MAX_GAP_NS = 2_000_000_000  # between two poses: across a longer one nothing is interpolated
+_KEPT = 64  # poses of a robot, for its scans
+_TOLERANCE_NS = 150_000_000  # beyond the first or last pose, which then serves
+_MAX_GAP_NS = 2_000_000_000  # between two poses to interpolate
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One lidar frame of a robot, thinned.
-
-    Attributes:
-        robot: name.
-        stamp_ns: sensor time, nanoseconds.
-        points: (N, 3) float32 body frame, metres; no NaN.
-        T_map_body: (4, 4) float64 map <- body at the stamp; None where no pose is known there.
-    """
+    """One lidar frame of a robot, thinned."""
 
     robot: str
     stamp_ns: int
+    """Sensor time."""
     points: Points
+    """(N, 3) body frame, metres; no NaN."""
     T_map_body: Pose | None
+    """At the stamp; None where no pose is known."""
 
 
 class Sink:
-    """Receiver of a session's events; override the methods of those that you show.
+    """Receiver of a session's events; subclasses override the methods that they need.
 
-    All methods are called on the feed's thread and have to return soon: events queue meanwhile, and of a full queue the
-    oldest is dropped. Their errors are logged.
+    All methods are called on the feed's thread and must return soon: events queue meanwhile, and a full queue drops the
+    oldest. Errors are logged.
     """
 
     def map(self, view: MapView) -> None:
@@ -66,7 +62,7 @@ class Sink:
 
 
 class PoseTrack:
-    """Newest poses of one robot, to tell where it was at a scan's stamp."""
+    """Newest poses of one robot, to be interpolated at a scan's stamp."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=_KEPT)

@@ -12,14 +12,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from operator import methodcaller
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from coview_stream.basemap.summary import MAX_WIRE_BYTES, MapView
 from coview_stream.config.mount import Mount
-from coview_stream.errors import CoViewError, MessageError
-from coview_stream.messages.json_messages import decode_hypotheses
+from coview_stream.errors import MessageError
+from coview_stream.messages import decode_cloud, decode_pose
+from coview_stream.messages.json_messages import decode_hypotheses, read_status
 from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
 from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
@@ -54,34 +55,28 @@ TopicKind = Literal["pose", "status", "hypotheses", "cloud"]
 
 
 class Topic(NamedTuple):
-    """One key expression to subscribe to.
-
-    Attributes:
-        key: the expression.
-        kind: of its messages.
-        robot: whose; None if the keys of the samples say.
-        hint: codec of messages without an Encoding; None if there is no such rule.
-        depth: chunks of a sample's key before the robot's name, where ``robot`` is None.
-    """
+    """One key expression to subscribe to."""
 
     key: str
     kind: TopicKind
     robot: str | None = None
+    """Robot of all messages; None to read it from the samples' keys, where ``depth`` chunks precede it."""
     hint: str | None = None
+    """Codec of messages without an Encoding."""
     depth: int = 0
+
+    def robot_of(self, sample: Sample) -> str:
+        """Return the robot that a sample is about."""
+        return self.robot or sample.key.split("/")[self.depth]
 
 
 def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
     """Return the topics of named robots, of any preset."""
-    found = []
+    topics = []
     for k in keys:
-        found += [
-            Topic(k.pose, "pose", k.robot, k.pose_hint),
-            Topic(k.status, "status", k.robot),
-            Topic(k.hypotheses, "hypotheses", k.robot),
-            Topic(k.cloud, "cloud", k.robot, k.cloud_hint),
-        ]
-    return found
+        topics += [Topic(k.pose, "pose", k.robot, k.pose_hint), Topic(k.cloud, "cloud", k.robot, k.cloud_hint)]
+        topics += [Topic(k.status, "status", k.robot), Topic(k.hypotheses, "hypotheses", k.robot)]
+    return topics
 
 
 def topics_of_base(base: str) -> list[Topic]:
@@ -103,7 +98,7 @@ _POLL = 0.05  # seconds
 _SCAN_PERIOD = 0.2  # seconds between two scans of a robot that are decoded
 _SCAN_POINTS = 6_000
 _POSE_WAIT = 0.4  # seconds that a scan waits for a pose of its time
-_JOIN_TIMEOUT = 0.2  # seconds for a thread to end; a map that is being thinned is not waited for
+_JOIN_TIMEOUT = 0.2  # seconds for a thread to end; the map's thread may be busy for longer
 _MAP_RETRY = 5.0  # seconds between two questions for a map
 
 
@@ -112,12 +107,12 @@ class SessionFeed:
 
     Args:
         transport: stays the caller's.
-        topics: to subscribe to.
-        map_view: the map, if it is known; else ``map_source`` is asked.
-        map_source: asked with a robot's name whenever its status names a map that is not known yet; None for no map.
-        clouds: whether to look at clouds too, which are most of the traffic.
-        mount: how lidars sit on their robots, as ``serve --mount`` has it.
-        policy: ``newest`` where a full queue must not hold up the publisher, as within the node's own process.
+        topics: subscriptions.
+        map_view: the map, if it is known.
+        map_source: called with a robot's name when its status names an unknown map; None for no map.
+        clouds: whether to subscribe to clouds, most of the traffic.
+        mount: pose of the lidars on their robots, as in ``serve --mount``.
+        policy: ``newest`` where a full queue must not hold up the publisher, as in the node's own process.
     """
 
     def __init__(
@@ -153,11 +148,11 @@ class SessionFeed:
             self._inbox.put(map_view)
 
     def add(self, sink: Sink) -> None:
-        """Hand everything to a sink from now on, maps that have come before included."""
+        """Hand all further events to a sink, and the known maps."""
         with self._lock:
             self._sinks.append(sink)
             maps = list(self._maps.values())
-        for view in maps:  # on the feed's thread, as all else; those who know it take it in again
+        for view in maps:  # on the feed's thread, and to all sinks again
             self._inbox.put(view)
 
     def start(self) -> None:
@@ -197,7 +192,7 @@ class SessionFeed:
             if topic.kind != "cloud":
                 self._inbox.put((topic, sample))
                 return
-            robot = _robot(topic, sample)
+            robot = topic.robot_of(sample)
             with self._lock:
                 if robot in self._clouds or len(self._clouds) < MAX_ROBOTS:
                     self._clouds[robot] = topic, sample
@@ -221,40 +216,32 @@ class SessionFeed:
             self._hand_out("map", lambda sink: sink.map(item))
             return
         topic, sample = item
-        robot = _robot(topic, sample)
+        robot = topic.robot_of(sample)
         if not self._admits(robot):
             return
         try:
             if topic.kind == "pose":
-                self._take_pose(robot, topic, sample)
+                pose = self._on_view(replace(decode_pose(sample, hint=topic.hint), robot=robot))
+                self._tracks.setdefault(robot, PoseTrack()).add(pose.stamp_ns, pose.T_map_body)
+                self._hand_out("pose", lambda sink: sink.pose(pose))
             elif topic.kind == "status":
-                self._take_status(robot, sample)
+                self._take_status(robot, read_status(sample))
             else:
-                found = self._places_on_view(replace(decode_hypotheses(sample), robot=robot))
-                self._hand_out("hypotheses", lambda sink: sink.hypotheses(found))
+                message = self._places_on_view(replace(decode_hypotheses(sample), robot=robot))
+                self._hand_out("hypotheses", lambda sink: sink.hypotheses(message))
         except MessageError as error:
             self._errors.report(sample.key, error)
 
     def _admits(self, robot: str) -> bool:
-        """Tell whether a robot is looked at: all are, up to the limit."""
-        if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
-            return False
-        self._robots.add(robot)
-        return True
-
-    def _take_pose(self, robot: str, topic: Topic, sample: Sample) -> None:
-        from coview_stream.messages import decode_pose
-
-        pose = self._on_view(replace(decode_pose(sample, hint=topic.hint), robot=robot))
-        self._tracks.setdefault(robot, PoseTrack()).add(pose.stamp_ns, pose.T_map_body)
-        self._hand_out("pose", lambda sink: sink.pose(pose))
+        """Add a robot, up to the limit, and return whether it is one of the robots in view."""
+        if len(self._robots) < MAX_ROBOTS:
+            self._robots.add(robot)
+        return robot in self._robots
 
     def _on_view(self, pose: PoseMessage) -> PoseMessage:
-        """Return a pose in the frame of the view: where several maps are seen side by side, those are in their own."""
+        """Return a pose in the frame of the view, in which several maps lie side by side."""
         view = self._maps.get(pose.map_sha256)
-        if view is None or view.parts is None:
-            return pose
-        for part in view.parts:
+        for part in (view.parts if view else None) or ():
             if part.name == pose.frame_id:
                 return replace(pose, T_map_body=part.joined(pose.T_map_body), T_map_odom=None)
         return pose
@@ -268,10 +255,7 @@ class SessionFeed:
         places[:, :3] += np.array([shifts.get(name, (0.0, 0.0, 0.0)) for name in message.maps]).reshape(-1, 3)
         return replace(message, places=places)
 
-    def _take_status(self, robot: str, sample: Sample) -> None:
-        from coview_stream.messages.json_messages import read_status
-
-        status = read_status(sample)
+    def _take_status(self, robot: str, status: dict[str, Any]) -> None:
         sha256 = status.get("map_sha256")
         if isinstance(sha256, str) and self._map_source is not None and sha256 not in self._maps:
             now = time.monotonic()
@@ -281,7 +265,7 @@ class SessionFeed:
         self._hand_out("status", lambda sink: sink.status(robot, status))
 
     def _take_clouds(self, now: float) -> None:
-        """Decode the clouds whose turn it is, and hand out the scans that have waited for their pose."""
+        """Decode the clouds that are due, and hand out the scans whose wait for a pose is over."""
         with self._lock:
             due = [robot for robot in self._clouds if self._next_scan.get(robot, 0.0) <= now]
             clouds = {robot: self._clouds.pop(robot) for robot in due if robot not in self._pending}
@@ -290,25 +274,20 @@ class SessionFeed:
                 continue
             self._next_scan[robot] = now + _SCAN_PERIOD
             try:
-                scan = self._scan(robot, topic, sample)
+                message = decode_cloud(sample, hint=topic.hint).limited(2 * _SCAN_POINTS)
             except MessageError as error:
                 self._errors.report(sample.key, error)
                 continue
-            self._pending[robot] = now + _POSE_WAIT, scan
+            points = message.points[np.isfinite(message.points).all(axis=1)]
+            points = points[:: max(1, -(-len(points) // _SCAN_POINTS))]
+            points = np.array(self._mount.to_body(points), dtype=np.float32)
+            self._pending[robot] = now + _POSE_WAIT, Scan(robot, message.stamp_ns, points, None)
         for robot, (until, scan) in list(self._pending.items()):
             track = self._tracks.get(robot)
             if now >= until or (track is not None and track.reaches(scan.stamp_ns)):
                 del self._pending[robot]
                 known = scan if track is None else replace(scan, T_map_body=track.at(scan.stamp_ns))
                 self._hand_out("scan", methodcaller("scan", known))
-
-    def _scan(self, robot: str, topic: Topic, sample: Sample) -> Scan:
-        from coview_stream.messages import decode_cloud
-
-        message = decode_cloud(sample, hint=topic.hint).limited(2 * _SCAN_POINTS)
-        points = message.points[np.isfinite(message.points).all(axis=1)]
-        points = points[:: max(1, -(-len(points) // _SCAN_POINTS))]
-        return Scan(robot, message.stamp_ns, np.array(self._mount.to_body(points), dtype=np.float32), None)
 
     def _hand_out(self, event: str, call: Callable[[Sink], None]) -> None:
         with self._lock:
@@ -326,11 +305,5 @@ class SessionFeed:
                 continue
             try:
                 self._inbox.put(self._map_source(robot))
-            except CoViewError as error:
+            except Exception as error:  # the next map may be another one
                 self._errors.report(f"map of {robot}", error)
-            except Exception as error:  # of any kind: the next map may be another one
-                self._errors.report(f"map of {robot}", error)
-
-
-def _robot(topic: Topic, sample: Sample) -> str:
-    return topic.robot or sample.key.split("/")[topic.depth]

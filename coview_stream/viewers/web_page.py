@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib import resources
 
 from coview_stream.stream.transport.http_server import EventStream, HttpServer, Reply, Route
-from coview_stream.viewers.scene import Sink
 from coview_stream.viewers.web_sink import WebHub, WebSink
 
 WEB_ADDRESS = "127.0.0.1:8642"
@@ -32,14 +31,11 @@ class WebPage:
 
     def __init__(self, address: str) -> None:
         self._hub = WebHub()
-        sink = _ClosingSink(self._hub)
-        self.sink: Sink = sink
-        self._maps = sink.maps
+        self.sink = WebSink(self._hub, self.close)
         folder = resources.files("coview_stream.viewers") / "web"
         routes: dict[str, Route] = {f"/{name}": _file((folder / name).read_bytes(), name) for name in _FILES}
         routes |= {"/": routes["/index.html"], "/map/": self._map, "/events": self._events}
         self._server = HttpServer(address, routes, ("--web", WEB_ADDRESS))
-        sink.page = self
         self.url = self._server.url
         self._server.start()
 
@@ -49,7 +45,7 @@ class WebPage:
         self._server.close()
 
     def _map(self, sha256: str) -> Reply:
-        packed = self._maps.get(sha256)
+        packed = self.sink.maps.get(sha256)
         if packed is None:
             return Reply(b"there is no such map\n", code=404)
         return Reply(packed, "application/octet-stream")
@@ -68,14 +64,6 @@ class WebPage:
                 self._hub.close_page(page)
 
         return stream()
-
-
-class _ClosingSink(WebSink):
-    page: WebPage | None = None
-
-    def close(self) -> None:
-        if self.page is not None:
-            self.page.close()
 
 
 def _file(content: bytes, name: str) -> Route:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.summary import MapView
-from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, transform, yaw_of
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan, Sink
@@ -146,14 +145,15 @@ _PARTS = {
 
 
 class WebSink(Sink):
-    """Events of a session for the pages of a hub.
+    """Events of a session for the pages of a hub; ``close`` is called at the end.
 
     Attributes:
         maps: packed maps by hash, see :func:`packed_map`.
     """
 
-    def __init__(self, hub: WebHub) -> None:
+    def __init__(self, hub: WebHub, close: Callable[[], None]) -> None:
         self.maps: dict[str, bytes] = {}
+        self._close = close
         self._hub = hub
         self._trails: dict[str, deque[list[float] | None]] = {}
         self._last: dict[str, float] = {}  # local time of each robot's newest pose
@@ -201,8 +201,7 @@ class WebSink(Sink):
             fields = status.get(part)
             data[part] = {name: _plain(fields.get(name)) for name in names} if isinstance(fields, dict) else {}
         calibration = status.get("calibration")
-        says = calibration.get("says") if isinstance(calibration, dict) else None
-        data["says"] = _texts(says)
+        data["says"] = _texts(calibration.get("says") if isinstance(calibration, dict) else None)
         data["errors"] = _texts(status.get("errors"))
         self._hub.publish("status", robot, data)
 
@@ -241,14 +240,14 @@ class WebSink(Sink):
                 "in_map": scan.T_map_body is not None,
                 "centre": np.round(centre, 3).tolist(),
                 "step": _SCAN_STEP,
-                "points": base64.b64encode(_steps(points, np.zeros(3), _SCAN_STEP)).decode("ascii"),
+                "points": base64.b64encode(_steps(points)).decode("ascii"),
             },
             keep=False,
         )
 
     def close(self) -> None:
         """Close all pages."""
-        self._hub.close()
+        self._close()
 
     def _extend_trail(self, robot: str, x: float, y: float) -> None:
         trail = self._trails.setdefault(robot, deque(maxlen=_TRAIL))
@@ -282,9 +281,8 @@ def packed_map(view: MapView) -> bytes:
     return struct.pack("<I", len(text)) + text + base64.b64decode(data["points"])
 
 
-def _steps(points: Points, centre: Floats, step: float) -> bytes:
-    steps = np.rint((points.astype(np.float64) - centre) / step)
-    return np.clip(steps, -32_767, 32_767).astype("<i2").tobytes()
+def _steps(points: Points) -> bytes:
+    return np.clip(np.rint(points.astype(np.float64) / _SCAN_STEP), -32_767, 32_767).astype("<i2").tobytes()
 
 
 def _finite(value: float) -> float | None:
@@ -297,15 +295,12 @@ def _plain(value: object) -> str | float | bool | None:
         return value[:_MAX_TEXT]
     if isinstance(value, bool):
         return value
-    if isinstance(value, int | float):
-        try:
-            return _finite(float(value))
-        except OverflowError:  # integers of JSON have no limit
-            return None
-    return None
+    try:
+        return _finite(float(value)) if isinstance(value, int | float) else None
+    except OverflowError:  # integers of JSON have no limit
+        return None
 
 
 def _texts(values: object) -> list[str]:
-    return (
-        [text[:_MAX_TEXT] for text in values[:_MAX_TEXTS] if isinstance(text, str)] if isinstance(values, list) else []
-    )
+    texts = values[:_MAX_TEXTS] if isinstance(values, list) else []
+    return [text[:_MAX_TEXT] for text in texts if isinstance(text, str)]

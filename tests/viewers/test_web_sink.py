@@ -27,7 +27,7 @@ def hub():
 
 @pytest.fixture
 def sink(hub):
-    return WebSink(hub)
+    return WebSink(hub, hub.close)
 
 
 @pytest.fixture
