@@ -17,28 +17,26 @@ _MAX_CELLS = 200_000_000  # set by hand: a raster above that (0.8 GB) means stra
 
 def min_filter(raster: Floats32, size: int) -> Floats32:
     """Find the smallest value around each cell of (H, W), in a square of ``size`` cells, an odd number."""
-    return _sliding(np.minimum, raster, size, np.float32(np.inf))
+    return -max_filter(-raster, size)
 
 
 def max_filter(raster: Floats32, size: int) -> Floats32:
-    """Find the greatest value around each cell of (H, W), in a square of ``size`` cells, an odd number."""
-    return _sliding(np.maximum, raster, size, np.float32(-np.inf))
+    """Find the greatest value around each cell of (H, W), in a square of ``size`` cells, an odd number.
 
-
-def _sliding(pick: np.ufunc, raster: Floats32, size: int, outside: np.float32) -> Floats32:
-    """Filter along one axis after the other: the extreme of a square is that of its rows' extremes."""
+    It filters along one axis after the other: the maximum of a square is the maximum of its rows' maxima.
+    """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size must be odd, so that a window has a middle, got {size}")
     out = raster.astype(np.float32, copy=False)
     for axis in range(2):
         reach = [(0, 0), (0, 0)]
         reach[axis] = (size // 2, size // 2)
-        padded = np.pad(out, reach, constant_values=outside)
+        padded = np.pad(out, reach, constant_values=-np.inf)
         length = raster.shape[axis]
         views = [padded[k : k + length] if axis == 0 else padded[:, k : k + length] for k in range(size)]
         out = views[0].copy()
         for view in views[1:]:
-            pick(out, view, out=out)
+            np.maximum(out, view, out=out)
     return out
 
 

@@ -191,22 +191,20 @@ def is_pose(T: Reals) -> bool:
 
 def why_no_pose(T: Reals) -> str:
     """Return the fault of a matrix that is no pose (:func:`is_pose`), and the remedy, as a clause."""
-    return f"is no rigid transform: {_flaw(T)}"
-
-
-def _flaw(T: Reals) -> str:
-    if T.shape != (4, 4):
-        return f"it has shape {T.shape}; give a 4x4 matrix"
-    if not np.isfinite(T).all():
-        return "it holds NaN or infinite numbers; leave such frames out"
-    if is_pose(T.T):
-        return "it is transposed, with its translation in the last row; give its transpose, whose T[:3, 3] it is"
     R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() >= 1e-3:
-        return "its rotation is not orthonormal; check the order of the quaternion (x, y, z, w)"
-    if np.linalg.det(R) < 0:
-        return "it mirrors (determinant -1); axes have to be right-handed"
-    return f"its last row is {T[3].tolist()}; give 0 0 0 1"
+    if T.shape != (4, 4):
+        flaw = f"it has shape {T.shape}; give a 4x4 matrix"
+    elif not np.isfinite(T).all():
+        flaw = "it holds NaN or infinite numbers; leave such frames out"
+    elif is_pose(T.T):
+        flaw = "it is transposed, with its translation in the last row; give its transpose, whose T[:3, 3] it is"
+    elif np.abs(R @ R.T - np.eye(3)).max() >= 1e-3:
+        flaw = "its rotation is not orthonormal; check the order of the quaternion (x, y, z, w)"
+    elif np.linalg.det(R) < 0:
+        flaw = "it mirrors (determinant -1); axes have to be right-handed"
+    else:
+        flaw = f"its last row is {T[3].tolist()}; give 0 0 0 1"
+    return f"is no rigid transform: {flaw}"
 
 
 def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:
@@ -279,13 +277,7 @@ def adjoint(T: Pose) -> Floats:
 
 @dataclass(frozen=True)
 class Circle:
-    """Circle in a horizontal plane.
-
-    Attributes:
-        x, y: its centre, metres.
-        radius: metres.
-        begin, end: of x, beyond which it holds nothing.
-    """
+    """Circle in a horizontal plane, metres; it holds nothing beyond ``begin`` and ``end`` of x."""
 
     x: float
     y: float

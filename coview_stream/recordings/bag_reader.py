@@ -7,6 +7,7 @@ ones.
 from __future__ import annotations
 
 import bz2
+import importlib
 import os
 import struct
 import weakref
@@ -64,7 +65,9 @@ class BagReader:
         self.path = path
         self._ros1 = path.suffix == ".bag" and path.is_file()
         with readable(path):
-            self._reader = _reader_of(path, self._ros1)
+            _bound_rosbags()
+            library = importlib.import_module("rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2")
+            self._reader: Any = library.Reader(path)
             self._reader.open()
         weakref.finalize(self, self._reader.close)
 
@@ -90,17 +93,6 @@ class BagReader:
         for connection, arrived, data in self._reader.messages(connections, start=start):
             payload = ros2.store().ros1_to_cdr(data, connection.msgtype) if self._ros1 else data
             yield connection.topic, arrived, bytes(payload)
-
-
-def _reader_of(path: Path, ros1: bool) -> Any:
-    _bound_rosbags()
-    if ros1:
-        from rosbags.rosbag1 import Reader as Ros1Reader
-
-        return Ros1Reader(path)
-    from rosbags.rosbag2 import Reader
-
-    return Reader(path)
 
 
 def header_stamp(payload: bytes) -> int:

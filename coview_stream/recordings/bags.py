@@ -6,6 +6,7 @@ points have times.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -115,7 +116,11 @@ def open_bag(
     topics = {clouds: ros2.CLOUD}
     if from_clouds is not None:
         survey = _survey(reader, topics)
-        return _pair(reader, clouds, survey, from_clouds(_without_odometry(reader, clouds, survey, mount)), mount)
+        stamps, arrivals, fresh, _ = _in_order(path, survey)
+        identities = np.tile(np.eye(4), (int(fresh.sum()), 1, 1))
+        still = Track(stamps[fresh], identities)
+        bare = BagClouds(reader, clouds, stamps[fresh], arrivals[fresh], still, identities, mount)
+        return _pair(reader, clouds, survey, from_clouds(bare), mount)
     if explicit is not None and odometry_topic is not None:
         raise RunError(f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them")
     # a single scan needs no odometry, as among files
@@ -176,9 +181,10 @@ class BagClouds:
                 start = int(self.arrivals[index])
                 self._pending = self.reader.messages({self.topic: ros2.CLOUD}, start)
             for _, arrived, payload in self._pending:
-                if arrived == self.arrivals[index] and _has_stamp(payload, int(self.stamps[index])):
-                    self._next = index + 1
-                    return payload
+                with contextlib.suppress(MessageError):
+                    if arrived == self.arrivals[index] and header_stamp(payload) == self.stamps[index]:
+                        self._next = index + 1
+                        return payload
             reads_on = False
         raise ValueError("it is not there any more")
 
@@ -190,13 +196,6 @@ class BagClouds:
         begin, end = (stamp + round(t / _NS) for t in (min(0.0, times.min()), max(0.0, times.max())))
         sweep = self.track.around(begin, end, stamp)
         return deskew(points, times, sweep, stamp, self.poses[index], correction)
-
-
-def _has_stamp(payload: bytes, stamp_ns: int) -> bool:
-    try:
-        return header_stamp(payload) == stamp_ns
-    except MessageError:
-        return False
 
 
 @dataclass
@@ -277,38 +276,25 @@ def _steady(path: Path, stamps: Ints, noun: str) -> Bools:
     return ~strays
 
 
-@dataclass(frozen=True)
-class _Order:
-    """Clouds in order of their stamps."""
+def _in_order(path: Path, survey: _Survey) -> tuple[Ints, Ints, Bools, Bools]:
+    """Sort the clouds by their stamps.
 
-    stamps: Ints  # (K,) ns
-    arrivals: Ints  # (K,) ns
-    fresh: Bools  # (K,) no earlier cloud has the same stamp
-    steady: Bools  # (N,) in order of arrival: among the K, since the stamp does not go far back
-
-
-def _in_order(path: Path, survey: _Survey) -> _Order:
+    Returns:
+        Stamps and arrivals (K,), ns; whether no earlier cloud has the same stamp (K,); and, in order of arrival (N,),
+        whether a cloud is among the K: its stamp does not go far back.
+    """
     stamps, arrivals = np.array(survey.stamps, np.int64), np.array(survey.arrivals, np.int64)
     steady = _steady(path, stamps, "clouds")
     order = np.argsort(stamps[steady], kind="stable")
     in_order = stamps[steady][order]
     fresh = np.diff(in_order, prepend=in_order[0] - SAME_NS - 1) > SAME_NS
-    return _Order(in_order, arrivals[steady][order], fresh, steady)
-
-
-def _without_odometry(reader: BagReader, topic: str, survey: _Survey, mount: Mount) -> BagClouds:
-    """Return all clouds with distinct stamps, with the identity as odometry."""
-    order = _in_order(reader.path, survey)
-    stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
-    identities = np.tile(np.eye(4), (len(stamps), 1, 1))
-    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, identities), identities, mount)
+    return in_order, arrivals[steady][order], fresh, steady
 
 
 def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: Mount) -> Run:
     """Return the run of the clouds in order of their stamps, without those that have no odometry."""
     path = reader.path
-    order = _in_order(path, survey)
-    fresh, steady, stamps = order.fresh, order.steady, order.stamps
+    stamps, arrivals, fresh, steady = _in_order(path, survey)
     poses, known = track.at(stamps)
     chosen = fresh & known
     if not chosen.any():
@@ -332,7 +318,7 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: M
             f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
             "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
         )
-    source = BagClouds(reader, topic, stamps[chosen], order.arrivals[chosen], track, poses[chosen], mount)
+    source = BagClouds(reader, topic, stamps[chosen], arrivals[chosen], track, poses[chosen], mount)
     return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes), mount)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,19 +32,16 @@ _LAYOUTS = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Files of a run.
-
-    Attributes:
-        path: the directory, or the single cloud.
-        frames: the clouds in order.
-        odometry: TUM or KITTI poses, if present.
-        times: stamps of the frames, if present.
-    """
+    """Files of a run."""
 
     path: Path
+    """The directory, or the single cloud."""
     frames: tuple[Path, ...]
+    """The clouds in order."""
     odometry: Path | None = None
+    """TUM or KITTI poses."""
     times: Path | None = None
+    """Stamps of the frames."""
 
 
 def find_layout(path: Path) -> Layout:
@@ -69,16 +67,12 @@ def find_layout(path: Path) -> Layout:
             f"{fused}: scans*.pcd, as FAST-LIO saves them, lie in its own world frame: a map, and no run; record its "
             "/cloud_registered_body and /Odometry in a bag, and give that"
         )
-    within = next((sub for sub in sorted(path.iterdir()) if sub.is_dir() and _is_run(sub)), None)
-    if within is not None:
-        raise RunError(f"{path}: is no run; did you mean {within}?")
+    for within in sorted(path.iterdir()):
+        if any((within / folder).is_dir() for folder in _FOLDERS):
+            raise RunError(f"{path}: is no run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
-
-
-def _is_run(path: Path) -> bool:
-    return any((path / folder).is_dir() for folder in _FOLDERS)
 
 
 def find_bag(path: Path) -> Path | None:
@@ -116,9 +110,8 @@ def _frames(folder: Path) -> tuple[Path, ...]:
             raise RunError(f"{file}: is no file (a directory or a broken link); put the cloud itself there")
     if all(file.stem.isdecimal() for file in files):
         files.sort(key=lambda file: int(file.stem))
-        numbers = [int(file.stem) for file in files]
-        for before, after, first, second in zip(files, files[1:], numbers, numbers[1:], strict=False):
-            if first == second:
+        for before, after in pairwise(files):
+            if int(before.stem) == int(after.stem):
                 raise RunError(f"{folder}: {before.name} and {after.name} are the same frame; remove one")
     else:
         files.sort(key=lambda file: file.name)
@@ -172,7 +165,10 @@ def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
     T_camera_body = _calibration(layout.path / "calib.txt")
     if T_camera_body is not None:
         return stamps, inverse(T_camera_body) @ poses @ T_camera_body
-    _refuse_camera_poses(poses, file)
+    steps = np.einsum("nij,ni->nj", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    x, _, z = np.abs(steps).sum(axis=0)
+    if z > 5.0 and z > 5.0 * x:  # a camera's z axis points forward
+        raise RunError(f"{file}: poses drive along z, so they are the camera's; add KITTI's calib.txt with Tr")
     return stamps, poses
 
 
@@ -194,11 +190,3 @@ def _calibration(path: Path) -> Pose | None:
             raise
         raise RunError(f"{path}: unreadable calibration ({error}); restore the file") from error
     return None
-
-
-def _refuse_camera_poses(poses: Poses, file: Path) -> None:
-    """Refuse KITTI's camera poses: their z axis points forward, so as body poses they would drive upwards."""
-    steps = np.einsum("nij,ni->nj", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-    x, _, z = np.abs(steps).sum(axis=0)
-    if z > 5.0 and z > 5.0 * x:
-        raise RunError(f"{file}: poses drive along z, so they are the camera's; add KITTI's calib.txt with Tr")

@@ -57,13 +57,12 @@ class CloudSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _SelectedClouds:
-    """Reader of the clouds ``indices`` of a source."""
+    """The clouds ``indices`` of a source."""
 
     source: CloudSource
     indices: range
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
-        """Read a cloud by its position in ``indices``."""
         return self.source.read(self.indices[index], correction)
 
 
@@ -111,10 +110,17 @@ class Run:
         Raises:
             RunError: the slice is empty or goes backwards.
         """
-        if isinstance(index, slice):
-            return self._selected(index)
-        at = operator.index(index)
-        return self.read(at + len(self) if -len(self) <= at < 0 else at)
+        if not isinstance(index, slice):
+            at = operator.index(index)
+            return self.read(at + len(self) if -len(self) <= at < 0 else at)
+        indices = range(len(self))[index]
+        if not indices or indices.step < 0:
+            fault = "goes backwards" if indices else "holds no frame"
+            part = f"{index.start}:{index.stop}:{index.step}"
+            raise RunError(f"{self.path}: the slice {part} of {len(self)} frames {fault}")
+        source = None if self.source is None else _SelectedClouds(self.source, indices)
+        files, stamps, poses = self.frames_paths[index], self.stamps[index], self.poses[index]
+        return replace(self, frames_paths=files, stamps=stamps, poses=poses, source=source)
 
     def __repr__(self) -> str:
         """Return path, number of frames, duration and distance in one line."""
@@ -122,19 +128,6 @@ class Run:
         return (
             f"Run({str(self.path)!r}: {len(self)} frames, {self.stamps[-1] - self.stamps[0]:.1f} s, "
             f"{driven:.1f} m driven)"
-        )
-
-    def _selected(self, part: slice) -> Run:
-        indices = range(len(self))[part]
-        if not indices or indices.step < 0:
-            fault = "goes backwards" if indices else "holds no frame"
-            raise RunError(f"{self.path}: the slice {part.start}:{part.stop}:{part.step} of {len(self)} frames {fault}")
-        return replace(
-            self,
-            frames_paths=self.frames_paths[part],
-            stamps=self.stamps[part],
-            poses=self.poses[part],
-            source=None if self.source is None else _SelectedClouds(self.source, indices),
         )
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Frame:

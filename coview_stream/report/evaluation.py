@@ -33,19 +33,16 @@ Trajectory = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
-    """Errors of every estimated pose that has a true one.
-
-    Attributes:
-        index: (K,) index of the true pose.
-        distance: (K,) metres driven along the truth up to there.
-        e_r: (K,) rotation errors, radians (eq. 15).
-        e_t: (K,) translation errors, metres (eq. 16).
-    """
+    """Errors of every estimated pose that has a true one."""
 
     index: Indices
+    """(K,) index of the true pose."""
     distance: Floats
+    """(K,) metres driven along the truth up to there."""
     e_r: Floats
+    """(K,) rotation errors, radians (eq. 15)."""
     e_t: Floats
+    """(K,) translation errors, metres (eq. 16)."""
 
     @property
     def right(self) -> Bools:
@@ -55,14 +52,7 @@ class FrameErrors:
 
 @dataclass(frozen=True)
 class ErrorStats:
-    """Statistics of an error, metres or degrees.
-
-    Attributes:
-        mean: of all values.
-        rmse: root mean square.
-        median: of all values.
-        max: greatest value.
-    """
+    """Statistics of an error, metres or degrees."""
 
     mean: float
     rmse: float
@@ -126,7 +116,8 @@ def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
     index, T_est = index[matched], poses[matched]
     T_true = true_poses[index]
     e_t = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
-    e_r = _angles(T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1))
+    turns = T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1)
+    e_r = np.asarray(Rotation.from_matrix(turns).magnitude()) if len(turns) else np.zeros(0)  # precise near zero
     return FrameErrors(index, driven(true_poses)[index], e_r, e_t)
 
 
@@ -148,6 +139,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Po
         InputError: the truth holds no pose.
     """
     errors = frame_errors(estimate, truth)
+    origins = None if T_map_odom is None else [T[:3, 3] for T in T_map_odom]
     right, posed, frames = errors.right, len(errors.index), len(truth[0])
     return Evaluation(
         frames=frames,
@@ -161,17 +153,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Po
         rotation=_stats(np.degrees(errors.e_r[right])),
         worst_t_m=float(errors.e_t.max()) if posed else None,
         worst_r_deg=float(np.degrees(errors.e_r.max())) if posed else None,
-        origin_t_m=None if T_map_odom is None else _origin_error(*T_map_odom),
+        origin_t_m=None if origins is None else float(np.linalg.norm(origins[0] - origins[1])),
     )
-
-
-def _angles(R: Floats) -> Floats:
-    """Return (K,) rotation angles of (K, 3, 3) matrices (eq. 15), in a form precise near zero."""
-    return np.asarray(Rotation.from_matrix(R).magnitude()) if len(R) else np.zeros(0)
-
-
-def _origin_error(T_est: Pose, T_true: Pose) -> float:
-    return float(np.linalg.norm(T_est[:3, 3] - T_true[:3, 3]))
 
 
 def _stats(values: Floats) -> ErrorStats | None:

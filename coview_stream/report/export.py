@@ -23,19 +23,15 @@ _EARLIEST = 3.2e7
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of a run.
-
-    Attributes:
-        name: of the run.
-        stamps: (N,) seconds.
-        poses: (N, 4, 4) map <- body, metres.
-        geodetic: (N, 3) latitude, longitude and height; None where the map has no reference system.
-    """
+    """Poses of a run."""
 
     name: str
     stamps: Floats
+    """(N,) seconds."""
     poses: Poses
+    """(N, 4, 4) map <- body, metres."""
     geodetic: Floats | None = None
+    """(N, 3) latitude, longitude and height; None where the map has no reference system."""
 
 
 def csv(trajectory: Trajectory) -> str:

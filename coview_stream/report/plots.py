@@ -148,17 +148,9 @@ def _axis_label(name: str, shift: float) -> str:
 
 def draw_notice(axes: Any, text: str) -> None:
     """Write a text across the middle of an empty picture."""
-    axes.text(
-        0.5,
-        0.5,
-        text,
-        transform=axes.transAxes,
-        ha="center",
-        va="center",
-        fontsize=13,
-        fontweight="bold",
-        bbox={"facecolor": "white", "edgecolor": STATE_COLOURS["LOST"], "boxstyle": "round,pad=0.6"},
-    )
+    box = {"facecolor": "white", "edgecolor": STATE_COLOURS["LOST"], "boxstyle": "round,pad=0.6"}
+    style = {"ha": "center", "va": "center", "fontsize": 13, "fontweight": "bold", "bbox": box}
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, **style)
 
 
 def legend_below(drawing: Any, axes: Any, title: str | None = None) -> None:
@@ -166,16 +158,7 @@ def legend_below(drawing: Any, axes: Any, title: str | None = None) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         place = {"loc": "outside lower center", "ncols": 2, "title": title}
-        legend = drawing.legend(handles, labels, fontsize=10, title_fontsize=10, **place)
-        _even_marks(legend)
-
-
-def legend_above(axes: Any) -> None:
-    """Put the legend on the right above the axes, next to the title."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-        _even_marks(axes.legend(handles, labels, ncols=len(labels), fontsize=9, **place))
+        _even_marks(drawing.legend(handles, labels, fontsize=10, title_fontsize=10, **place))
 
 
 def _even_marks(legend: Any) -> None:
@@ -275,7 +258,9 @@ def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike
             named = "right poses" if not (~wrong).any() else f"right poses, mean {mean:.3f}"
             axes.scatter(distance[~wrong], values[~wrong], s=7, color=colour, linewidths=0, label=named)
             _draw_false(axes, distance[wrong], values[wrong], limit)
-            legend_above(axes)
+            handles, labels = axes.get_legend_handles_labels()
+            place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}  # next to the title
+            _even_marks(axes.legend(handles, labels, ncols=len(labels), fontsize=9, **place))
         panels[0].set_title("Errors over the distance driven")
         panels[1].set_xlabel("distance driven [m]")
 
@@ -322,14 +307,8 @@ def plot_descriptor_pair(
         for axes, values, title in zip(panels, pair, (titles[0], turned), strict=True):
             axes.set_facecolor("#EEEEEE")
             axes.grid(False)
-            image = axes.pcolormesh(
-                *edges,
-                np.where(np.isfinite(values), values, np.nan),
-                cmap="viridis",
-                vmin=low,
-                vmax=high or 1.0,
-                rasterized=True,
-            )
+            shown = np.where(np.isfinite(values), values, np.nan)
+            image = axes.pcolormesh(*edges, shown, cmap="viridis", vmin=low, vmax=high or 1.0, rasterized=True)
             axes.set_yticks([])
             axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"], color="#555555")
             axes.spines["polar"].set_visible(False)
