@@ -64,9 +64,6 @@ class EngineChild:
     It imports its libraries and loads its kernels, which takes most of its start, and then waits for the arguments of
     :func:`~coview_stream.stream.node.engines.open_engine`: meanwhile the parent reads options, checks the map and opens
     the network. It is a new interpreter: a fork deadlocks once zenoh is open, a spawn imports the host's main module.
-
-    Args:
-        kind: ``track``, ``search`` or ``odometry``.
     """
 
     def __init__(self, kind: str) -> None:
@@ -199,10 +196,7 @@ class EngineProcess:
                 child.pipe.send(self._opening)
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the child has opened the map.
-
-        Args:
-            cancelled: asked ten times a second; True gives up.
+        """Wait until the child has opened the map; ``cancelled`` is asked ten times a second.
 
         Raises:
             CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
@@ -259,11 +253,8 @@ class EngineProcess:
     def watch(self) -> None:
         """Check the child while there is no job, without waiting: it may have become ready, or died.
 
-        A dead child is reaped and reported once; the next call starts another one, in time for the next job. By the
-        thread that runs the jobs.
-
-        Raises:
-            DiedError: it died, or could not open the map, and says why.
+        A dead child, or one that could not open the map, is reaped and reported once (DiedError); the next call starts
+        another one, in time for the next job. By the thread that runs the jobs.
         """
         child = self._child
         if child is None:
@@ -345,12 +336,8 @@ def work(pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None 
     """Load the kernels, open the engine, then answer jobs until the parent closes the pipe; return the exit code.
 
     Kernels of later jobs are loaded one by one while no job waits: a job that comes meanwhile waits a quarter of a
-    second at most with the cache, some seconds on the first run ever.
-
-    Args:
-        pipe: to the parent.
-        kind: of the engine.
-        open_engine: in place of :func:`~coview_stream.stream.node.engines.open_engine`.
+    second at most with the cache, some seconds on the first run ever. ``open_engine`` replaces
+    :func:`~coview_stream.stream.node.engines.open_engine`.
     """
     _set_group_nice(NICE[kind])
     from coview_kernels import warm_up

@@ -74,16 +74,22 @@ class TrackEngine(Engine):
         self._index = SearchIndex.of(base_map, self.config, load=False)
 
     def run(self, job: Job) -> FrameResult:
-        """Take in one frame.
+        """Take in one frame; CloudError or RunError: it is unusable and changes nothing.
 
-        Raises:
-            CloudError, RunError: the frame is unusable and changes nothing. Its search result, hint or demand to
-                verify the place may have been applied; applied again with the next frame they change nothing.
+        Its search result, hint or demand to verify the place may have been applied; applied again with the next frame
+        they change nothing.
         """
         if not isinstance(job, FrameJob):
             raise TypeError(f"{type(job).__name__}: the tracking engine does frames")
         begin = time.perf_counter()
-        localizer = self._localizer(job)
+        first, epoch, localizer = self._robots.get(job.robot, (None, None, None))
+        if localizer is None:
+            localizer = Localizer(self.base_map, self.config, self._local_maps, self._index)
+        if first != job.first_epoch:
+            localizer.reset(job.epoch)
+        elif epoch != job.epoch:
+            localizer.relocalize(job.epoch)  # and keep the calibration
+        self._robots[job.robot] = job.first_epoch, job.epoch, localizer
         if job.search_result is not None:
             localizer.apply_search_result(job.search_result)
         if job.require_verification:
@@ -110,18 +116,6 @@ class TrackEngine(Engine):
         """Import the library of the graph of poses, and load the field that a slip of odometry is judged by."""
         PoseGraph(self.config.graph)
         _ = self.base_map.field.layers
-
-    def _localizer(self, job: FrameJob) -> Localizer:
-        """Return the robot's localizer, which knows of the robot only its calibration with a new epoch."""
-        first, epoch, localizer = self._robots.get(job.robot, (None, None, None))
-        if localizer is None:
-            localizer = Localizer(self.base_map, self.config, self._local_maps, self._index)
-        if first != job.first_epoch:
-            localizer.reset(job.epoch)
-        elif epoch != job.epoch:
-            localizer.relocalize(job.epoch)
-        self._robots[job.robot] = job.first_epoch, job.epoch, localizer
-        return localizer
 
 
 class SearchEngine(Engine):
@@ -156,10 +150,7 @@ class SearchEngine(Engine):
 
 
 class OdometryEngine(Engine):
-    """One :class:`LidarOdometry` per robot.
-
-    Args:
-        registration: made for each robot.
+    """One :class:`LidarOdometry` per robot, each with its own ``registration``.
 
     Raises:
         DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
@@ -172,15 +163,16 @@ class OdometryEngine(Engine):
         registration(LidarOdometryConfig())  # a missing library shows now rather than at the first frame
 
     def run(self, job: Job) -> OdometryResult:
-        """Return the odometry of one frame.
-
-        Raises:
-            CloudError, RunError: it cannot be placed; the next one may be.
-        """
+        """Return the odometry of one frame; CloudError or RunError: it cannot be placed, the next one may be."""
         if not isinstance(job, OdometryJob):
             raise TypeError(f"{type(job).__name__}: the odometry engine makes odometry")
         begin = time.perf_counter()
-        lidar = self._lidar(job)
+        epoch, lidar = self._robots.get(job.robot, (None, None))
+        if lidar is None:
+            lidar = LidarOdometry(job.config, self._registration(job.config))
+        elif epoch != job.epoch:
+            lidar.reset()
+        self._robots[job.robot] = job.epoch, lidar
         pose = lidar.step(job.points, job.times, job.stamp_ns * 1e-9)
         trajectory = job.epoch, lidar.restarts
         restarted = self._trajectories.get(job.robot) != trajectory
@@ -192,16 +184,6 @@ class OdometryEngine(Engine):
         """Drop a robot's odometry."""
         self._robots.pop(robot, None)
         self._trajectories.pop(robot, None)
-
-    def _lidar(self, job: OdometryJob) -> LidarOdometry:
-        """Return the robot's lidar odometry, which begins again with a new epoch."""
-        epoch, lidar = self._robots.get(job.robot, (None, None))
-        if lidar is None:
-            lidar = LidarOdometry(job.config, self._registration(job.config))
-        elif epoch != job.epoch:
-            lidar.reset()
-        self._robots[job.robot] = job.epoch, lidar
-        return lidar
 
 
 KINDS: dict[str, type[Engine]] = {"odometry": OdometryEngine, "track": TrackEngine, "search": SearchEngine}

@@ -164,11 +164,7 @@ def try_out(folder: Path) -> None:
 
 
 def default_folder() -> Path:
-    """Return the directory of this user in which programs keep their state from one run to the next.
-
-    Raises:
-        ConfigError: the user has no home directory.
-    """
+    """Return this user's directory for the state of programs between runs; ConfigError without a home directory."""
     folder = Path(os.environ.get("XDG_STATE_HOME", ""))
     if not folder.is_absolute():  # the specification says that a relative one is to be ignored
         try:
@@ -227,9 +223,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess of named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
 
     With ``map``, a name, they are in the frame of that one of several maps; ``within``: as of a :class:`PlaceGuess`.
-
-    Raises:
-        InputError: x or y is missing, a name is unknown, or a value is no number or out of its range.
+    InputError if x or y is missing, a name is unknown, or a value is no number or out of its range.
     """
     unknown = sorted(set(given) - set(_GUESS_FIELDS))
     if unknown or "x" not in given or "y" not in given:
@@ -257,11 +251,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
 
 
 def decode_guess(sample: Sample) -> PlaceGuess:
-    """Read a message: JSON with the fields of :func:`guess_of_fields`, or a PoseWithCovarianceStamped in CDR.
-
-    Raises:
-        InputError: it is neither, or names no place.
-    """
+    """Read JSON with the fields of :func:`guess_of_fields`, or a PoseWithCovarianceStamped in CDR; else InputError."""
     payload = bytes(sample.payload[: _MAX_GUESS_BYTES + 1])
     if len(payload) > _MAX_GUESS_BYTES:
         raise MessageError(f"{sample.key}: an initial pose of more than {_MAX_GUESS_BYTES} bytes")

@@ -57,42 +57,25 @@ class CodecOptions:
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """Options of ``serve``.
+    """Options of ``serve``; ConfigError if robots cannot be told apart by their keys."""
 
-    Attributes:
-        map_path: argument of :func:`~coview_stream.basemap.joined.load_map`.
-        keys: of each robot.
-        network: how the network is reached.
-        codecs: encodings of messages.
-        node: rates and limits.
-        localizer: configuration of the engines.
-        lidar: how odometry is computed from the clouds; None if the robots send theirs.
-        state: directory of the robots' last places; None for none.
-        guesses: of the places of robots, by name: tried, never trusted.
-        mirrors: of the sites elsewhere that the map is made of, whose changes are followed.
-        verify_key: public key that the map has to be signed with, also after a reload; None for any map.
-        fleet: prefix of the keys of the fleet of nodes that share the robots; None: this node serves them all.
-        node_keys: of the node's own; None for none.
-        metrics: ``HOST:PORT`` of health and metrics over HTTP; None for none.
-
-    Raises:
-        ConfigError: robots cannot be told apart by their keys.
-    """
-
-    map_path: Path
-    keys: Sequence[RobotKeys]
-    network: NetworkOptions = field(default_factory=NetworkOptions)
-    codecs: CodecOptions = field(default_factory=CodecOptions)
-    node: NodeConfig = field(default_factory=NodeConfig)
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
-    lidar: LidarOdometryConfig | None = None
-    state: Path | None = None
+    map_path: Path  # argument of :func:`~coview_stream.basemap.joined.load_map`
+    keys: Sequence[RobotKeys]  # of each robot
+    network: NetworkOptions = field(default_factory=NetworkOptions)  # how the network is reached
+    codecs: CodecOptions = field(default_factory=CodecOptions)  # encodings of messages
+    node: NodeConfig = field(default_factory=NodeConfig)  # rates and limits
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)  # configuration of the engines
+    lidar: LidarOdometryConfig | None = None  # how odometry is computed from the clouds; None if the robots send theirs
+    state: Path | None = None  # directory of the robots' last places; None for none
+    # of the places of robots, by name: tried, never trusted
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
-    mirrors: Sequence[Mirror] = ()
+    mirrors: Sequence[Mirror] = ()  # of the sites elsewhere that the map is made of, whose changes are followed
+    # public key that the map has to be signed with, also after a reload; None for any map
     verify_key: VerifyKey | None = None
+    # prefix of the keys of the fleet of nodes that share the robots; None: this node serves them all
     fleet: str | None = None
-    node_keys: NodeKeys | None = None
-    metrics: str | None = None
+    node_keys: NodeKeys | None = None  # of the node's own; None for none
+    metrics: str | None = None  # ``HOST:PORT`` of health and metrics over HTTP; None for none
 
     def __post_init__(self) -> None:
         check_disjoint(self.keys)
@@ -218,12 +201,9 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
 def start_engines(
     options: ServeOptions, children: Mapping[str, EngineChild], base_map: BaseMap | None = None
 ) -> tuple[BaseMap, dict[str, EngineProcess]]:
-    """Check the map and have the engines begin to open it; return it and them.
+    """Check the map and have the engines, which ``children`` become, begin to open it; return it and them.
 
-    Args:
-        options: of the node.
-        children: processes that become the engines; the caller closes them after an error.
-        base_map: the map, if it has been loaded and verified already.
+    ``base_map`` is the map, if it has been loaded and verified already. After an error the caller closes the children.
 
     Raises:
         MapError: the map is unusable. CoViewError: it lacks an array that the options ask for.
@@ -249,12 +229,7 @@ def start_engines(
 
 
 def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) -> OpenedMap | None:
-    """Open the map's file again, in new engines, until they would not keep a job waiting; None if it is the one served.
-
-    Args:
-        options: of the node.
-        served: hash of the map that is served.
-        cancelled: asked now and then; True gives up.
+    """Open the map's file again, in new engines, until they would not keep a job waiting; None if it is ``served``.
 
     Raises:
         MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.

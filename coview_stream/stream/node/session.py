@@ -120,10 +120,7 @@ class Session:
             self._record_state()
 
     def restart_search(self, reason: str, forget: bool = False) -> None:
-        """Search from nothing in a new epoch: frames from before no longer fit. Odometry that has come stays.
-
-        ``forget``: a client asks, who knows that the robot is not at its last place.
-        """
+        """Search from nothing in a new epoch; odometry stays. ``forget``: a client says that the last place is wrong."""
         with self.lock:
             if forget:
                 self.hints.forget()
@@ -134,10 +131,7 @@ class Session:
             self._record_state()
 
     def reset(self, forget: bool = True) -> None:
-        """Begin again without anything: counters, odometry, places.
-
-        ``forget``: a client asks, and places from before the reset are refused from now on.
-        """
+        """Begin again without anything. ``forget``: a client asks, and places from before are refused from now on."""
         with self.lock:
             if forget:
                 self.hints.forget()
@@ -159,8 +153,8 @@ class Session:
         Returns False, and does nothing, as long as the place is one of odometry that has not come yet.
         """
         with self.lock:
-            T_map_body = place.T_map_body
-            if T_map_body is None and place.T_map_odom is not None and (newest := self.inputs.odometry.newest):
+            T_map_body, newest = place.T_map_body, self.inputs.odometry.newest
+            if T_map_body is None and place.T_map_odom is not None and newest is not None:
                 T_map_body = place.T_map_odom @ newest.T_odom_body
             if T_map_body is None:
                 return False
@@ -171,8 +165,7 @@ class Session:
     def guess_place(self, guess: PlaceGuess) -> bool:
         """Have the search try somebody's guess; return False, and do nothing, while a place is known.
 
-        Raises:
-            InputError: one of several maps has to be named, and none of that name is there.
+        InputError: one of several maps has to be named, and none of that name is there.
         """
         if self.parts is not None:
             part = self.parts.named(guess.map)

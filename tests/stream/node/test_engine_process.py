@@ -62,6 +62,20 @@ def test_failed_engine_forgets_the_robot_and_returns_traceback():
     assert Runner(engine).run(job()).fix.state is State.TRACKING
 
 
+@pytest.fixture
+def engine():
+    """Make engine processes, and close them at the end."""
+    made = []
+
+    def make(kind, path="unused", sha256="0" * 64, **more):
+        made.append(EngineProcess(kind, str(path), sha256, **more))
+        return made[-1]
+
+    yield make
+    for process in made:
+        process.close()
+
+
 @contextlib.contextmanager
 def checked(process):
     """Check a process as the feed of the engines does, but more often; a stopped one is left alone."""
@@ -87,8 +101,8 @@ def alive(pid):
 
 
 @pytest.mark.slow
-def test_killed_engine_process_is_restarted(world_file, world_drive):
-    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
+def test_killed_engine_process_is_restarted(engine, world_file, world_drive):
+    process = engine("track", world_file, BaseMap.load(world_file).sha256)
     good = job(world_drive.clouds[0])
     try:
         process.start()
@@ -117,92 +131,79 @@ def test_killed_engine_process_is_restarted(world_file, world_drive):
     until(lambda: not alive(second), 5.0)
     with pytest.raises(DiedError, match="closed"):
         process.run(good)
-    process.close()
 
 
 @pytest.mark.slow
-def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(world_file):
-    process = EngineProcess("search", str(world_file), BaseMap.load(world_file).sha256)
-    try:
-        process.start()
-        process.wait_prepared()
-        process.watch()
-        first = process.pid
-        os.kill(first, signal.SIGKILL)
-        with pytest.raises(DiedError, match=r"search engine died \(by signal 9\)"):
-            until(process.watch, 10.0)
-        assert not alive(first)  # nor a zombie
-        assert process.pid is None
-        process.watch()
-        assert process.pid not in (None, first)
-        until(lambda: process.watch() or process.ready, 60.0)  # ready before a job asks
-    finally:
-        process.close()
+def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine, world_file):
+    process = engine("search", world_file, BaseMap.load(world_file).sha256)
+    process.start()
+    process.wait_prepared()
+    process.watch()
+    first = process.pid
+    os.kill(first, signal.SIGKILL)
+    with pytest.raises(DiedError, match=r"search engine died \(by signal 9\)"):
+        until(process.watch, 10.0)
+    assert not alive(first)  # nor a zombie
+    assert process.pid is None
+    process.watch()
+    assert process.pid not in (None, first)
+    until(lambda: process.watch() or process.ready, 60.0)  # ready before a job asks
     with pytest.raises(DiedError, match="closed"):
         process.watch()
 
 
 @pytest.mark.slow
-def test_idle_engine_that_cannot_open_its_map_says_why(world_file):
-    process = EngineProcess("track", str(world_file), "0" * 64)
-    try:
-        process.start()
-        with pytest.raises(DiedError, match="replaced by another map"):
-            until(process.watch, 60.0)
-    finally:
-        process.close()
+def test_idle_engine_that_cannot_open_its_map_says_why(engine, world_file):
+    process = engine("track", world_file)
+    process.start()
+    with pytest.raises(DiedError, match="replaced by another map"):
+        until(process.watch, 60.0)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_stopped_engine_is_ended_during_a_job(world_file, world_drive):
-    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
-    try:
-        process.start()
-        process.wait_prepared()
-        process.end_stopped()
-        process.end_stopped()
-        assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
-        os.kill(process.pid, signal.SIGSTOP)
-        failed = []
+def test_stopped_engine_is_ended_during_a_job(engine, world_file, world_drive):
+    process = engine("track", world_file, BaseMap.load(world_file).sha256)
+    process.start()
+    process.wait_prepared()
+    process.end_stopped()
+    process.end_stopped()
+    assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
+    os.kill(process.pid, signal.SIGSTOP)
+    failed = []
 
-        def run():
-            with pytest.raises(DiedError) as caught:
-                process.run(job(world_drive.clouds[0]))
-            failed.append(str(caught.value))
+    def run():
+        with pytest.raises(DiedError) as caught:
+            process.run(job(world_drive.clouds[0]))
+        failed.append(str(caught.value))
 
-        thread = threading.Thread(target=run)
-        thread.start()
-        until(lambda: process.end_stopped() or failed, 10.0)  # not thirty seconds
-        thread.join(10.0)
-        assert process.run(job(world_drive.clouds[0])).request is not None
-    finally:
-        process.close()
+    thread = threading.Thread(target=run)
+    thread.start()
+    until(lambda: process.end_stopped() or failed, 10.0)  # not thirty seconds
+    thread.join(10.0)
+    assert process.run(job(world_drive.clouds[0])).request is not None
 
 
 @pytest.mark.slow
-def test_child_that_was_started_before_is_the_first(world_file, world_drive):
+def test_child_that_was_started_before_is_the_first(engine, world_file, world_drive):
     child = EngineChild("track")
-    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, child=child)
-    try:
-        process.start()
-        assert process.pid == child.process.pid
-        assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
-        os.kill(process.pid, signal.SIGKILL)
-        with pytest.raises(DiedError):
-            process.run(job())
-        assert process.run(job(world_drive.clouds[0])).request is not None  # another one
-    finally:
-        process.close()
+    process = engine("track", world_file, BaseMap.load(world_file).sha256, child=child)
+    process.start()
+    assert process.pid == child.process.pid
+    assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
+    os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(DiedError):
+        process.run(job())
+    assert process.run(job(world_drive.clouds[0])).request is not None  # another one
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adopted", [False, True])
-def test_child_without_a_map_ends_when_it_is_closed(adopted):
+def test_child_without_a_map_ends_when_it_is_closed(engine, adopted):
     child = EngineChild("search")
     pid = child.process.pid
     assert alive(pid)
-    EngineProcess("search", "unused", "0" * 64, child=child).close() if adopted else child.close()
+    engine("search", child=child).close() if adopted else child.close()
     assert not alive(pid)
     child.close()
 
@@ -216,22 +217,19 @@ def test_child_ends_with_its_parent():
 
 
 @pytest.mark.slow
-def test_hung_worker_is_killed_during_send(world_file, world_drive):
-    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, job_timeout=30.0)
+def test_hung_worker_is_killed_during_send(engine, world_file, world_drive):
+    process = engine("track", world_file, BaseMap.load(world_file).sha256, job_timeout=30.0)
     good = job(world_drive.clouds[0])
-    try:
-        process.start()
-        process.run(good)
-        first = process.pid
-        os.kill(first, signal.SIGSTOP)
-        process.job_timeout = 0.3
-        with checked(process), pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
-            process.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
-        until(lambda: not alive(first), 5.0)
-        process.job_timeout = 30.0
-        assert process.run(good).request is not None
-    finally:
-        process.close()
+    process.start()
+    process.run(good)
+    first = process.pid
+    os.kill(first, signal.SIGSTOP)
+    process.job_timeout = 0.3
+    with checked(process), pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+        process.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
+    until(lambda: not alive(first), 5.0)
+    process.job_timeout = 30.0
+    assert process.run(good).request is not None
 
 
 READY = "[pipe.send((name, None)) for name in ('ready', 'prepared')]\n"
@@ -254,20 +252,19 @@ class Program:
 
 
 @pytest.mark.slow
-def test_truncated_answer_kills_the_worker():
+def test_truncated_answer_kills_the_worker(engine):
     child = Program(READY + "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
-    process = EngineProcess("search", "unused", "0" * 64, child=child, job_timeout=0.3)
+    process = engine("search", child=child, job_timeout=0.3)
     pid = child.process.pid
     with checked(process), pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
         process.run(job())
     until(lambda: not alive(pid), 5.0)
-    process.close()
 
 
 @pytest.mark.slow
-def test_opening_has_its_own_timeout_and_can_be_cancelled():
+def test_opening_has_its_own_timeout_and_can_be_cancelled(engine):
     child = Program("time.sleep(60)")
-    process = EngineProcess("track", "unused", "0" * 64, child=child, job_timeout=0.01, open_timeout=0.3)
+    process = engine("track", child=child, job_timeout=0.01, open_timeout=0.3)
     process.start()
     asked = []
 
@@ -279,22 +276,20 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled():
         process.wait_ready(cancelled)
     with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
         process.wait_ready()
-    process.close()
 
 
 @pytest.mark.slow
-def test_engine_that_cannot_prepare_says_why():
+def test_engine_that_cannot_prepare_says_why(engine):
     child = Program("pipe.send(('ready', None)); pipe.send(('error', 'ground.onnx: no weights; train them'))")
-    process = EngineProcess("search", "unused", "0" * 64, child=child)
+    process = engine("search", child=child)
     with pytest.raises(DiedError, match="no weights; train them"):
         process.run(job())
     assert process.pid is None
-    process.close()
 
 
 @pytest.mark.slow
-def test_close_ends_a_running_job():
-    process = EngineProcess("track", "unused", "0" * 64, child=Program(READY + "time.sleep(60)"))
+def test_close_ends_a_running_job(engine):
+    process = engine("track", child=Program(READY + "time.sleep(60)"))
     timer = threading.Timer(0.5, process.close)
     timer.start()
     with pytest.raises(DiedError, match="died"):
@@ -336,15 +331,12 @@ work(pipe, "odometry", lambda *args: Engine())
 
 
 @pytest.mark.slow
-def test_library_that_is_missing_is_the_jobs_error():
-    process = EngineProcess("odometry", "map", "hash", child=Program(LACKING))
+def test_library_that_is_missing_is_the_jobs_error(engine):
+    process = engine("odometry", child=Program(LACKING))
 
     def error():
         with pytest.raises(RejectedError, match="no gtsam") as caught:
             process.run(job())
         return str(caught.value)
 
-    try:
-        until(lambda: error() == "no gtsam, also later", 20.0)
-    finally:
-        process.close()
+    until(lambda: error() == "no gtsam, also later", 20.0)

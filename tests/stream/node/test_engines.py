@@ -110,21 +110,6 @@ def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_
         assert asked[engine] | ({"field"} if engine is track else set()) == launched
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
-def test_frames_of_a_robot_without_a_place_need_first_kernels_only(world_map, world_drive, launched):
-    """So that they wait for nothing when the node has just said that it is ready."""
-    track = TrackEngine(world_map)
-    launched.clear()
-    for k in range(FRAMES):
-        frame = FrameJob("fresh", 1, k * 10**8, world_drive.clouds[k], world_drive.T_odom_body[k])
-        assert track.run(frame).fix.state is State.SEARCHING
-    asked = set(launched)
-    launched.clear()
-    coview_kernels.warm_up(*track.kernels)
-    assert asked == launched
-
-
 def same(fix, other):
     assert fix.state is other.state
     assert (fix.T_map_body is None) == (other.T_map_body is None)

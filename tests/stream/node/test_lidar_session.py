@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
+import fake_robot
 import numpy as np
 import pytest
-from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, state, tracking
+from fake_robot import POINTS, cloud, counted, ends, message, ns, state
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engine_queue import OdometryResult
-from coview_stream.stream.node.session import Session
 
 TIMES = np.linspace(0.0, 0.1, len(POINTS))
 
 
-class Robot:
+class Robot(fake_robot.Robot):
     """A session and the two engines that work for it, at 10 Hz."""
 
     def __init__(self, config=None):
-        self.session = Session(KEYS, SHA, config, lidar=LidarOdometryConfig())
-        self.now = 1000.0
+        super().__init__(config, lidar=LidarOdometryConfig())
         self.first = True
-
-    @property
-    def counters(self):
-        return self.session.counters
-
-    def saw(self, seconds, **fields):
-        self.now = 1000.0 + seconds
-        self.session.on_cloud(cloud(seconds, codec="foxglove", **fields), self.now)
 
     def placed(self, restarted=None, **place):
         """Play the odometry engine for one frame; it drives 2 m/s."""
@@ -42,17 +33,10 @@ class Robot:
         self.session.handle_result(job, OdometryResult(pose, deskewed, restarted, 0.01), self.now + 0.04)
         return job
 
-    def tracked(self):
-        """Play the tracking engine for one frame."""
-        job = self.session.take_job("track")
-        if job is not None:
-            self.session.handle_result(job, tracking(job), self.now + 0.06)
-        return job
-
     def frame(self, seconds, **more):
-        self.saw(seconds)
+        self.saw(seconds, codec="foxglove")
         self.placed(**more)
-        return self.tracked()
+        return self.answered()
 
     def drive(self, begin, end):
         for k in range(round(10 * begin), round(10 * end) + 1):
@@ -72,15 +56,15 @@ def test_frame_is_paired_with_its_own_lidar_odometry():
 
 def test_sweep_is_forwarded_deskewed():
     robot = Robot()
-    robot.saw(0.0, times=TIMES)
+    robot.saw(0.0, codec="foxglove", times=TIMES)
     assert robot.placed().times is not None
-    job = robot.tracked()
+    job = robot.answered()
     assert (job.times, job.segment) == (None, None)
     assert np.allclose(job.points, POINTS + 1.0)
     plain = Robot(NodeConfig(deskew=False))
-    plain.saw(0.0, times=TIMES)
+    plain.saw(0.0, codec="foxglove", times=TIMES)
     assert plain.placed().times is None
-    assert np.allclose(plain.tracked().points, POINTS)
+    assert np.allclose(plain.answered().points, POINTS)
 
 
 def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
@@ -91,7 +75,7 @@ def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
     stamps = []
     while (job := robot.placed()) is not None:
         stamps.append(job.stamp_ns)
-        robot.tracked()
+        robot.answered()
     assert stamps == [ns(0.6), ns(0.7)]
     assert robot.counters.dropped == 5
     assert ends(robot.counters) == robot.counters.received
@@ -139,7 +123,7 @@ def test_lidar_odometry_restart_restarts_search():
     robot.placed(restarted=True, x=0.0)
     assert robot.session.state() == (State.LOST, "lidar odometry began anew")
     assert robot.session.pose() is None
-    assert robot.tracked().epoch > 1
+    assert robot.answered().epoch > 1
     assert state(robot) is State.TRACKING
     assert robot.counters.odometry_jumps == 0  # it is no surprise
 

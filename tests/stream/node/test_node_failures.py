@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -158,15 +159,11 @@ def test_robots_are_served_round_robin():
 
 
 def test_search_engine_failure_is_reported(site):
-    class Broken:
-        def run(self, job):
-            raise ValueError("the spectra are gone")
-
-        def forget(self, robot):
-            pass
+    def fail(job):
+        raise ValueError("the spectra are gone")
 
     site.engine.answer = lambda job: unknown(job, ask=search_request())
-    site.search.engine = Broken()
+    site.search.engine = SimpleNamespace(run=fail, forget=site.engine.forget)
     for k in range(5):
         site.frame("r1", STEP * k)
     status = site.status("r1")
