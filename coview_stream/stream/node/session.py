@@ -120,7 +120,7 @@ class Session:
             self._record_state()
 
     def restart_search(self, reason: str, forget: bool = False) -> None:
-        """Search from nothing in a new epoch; odometry stays. ``forget``: a client says that the last place is wrong."""
+        """Search from nothing in a new epoch; odometry stays; ``forget``: a client says that the place is wrong."""
         with self.lock:
             if forget:
                 self.hints.forget()
