@@ -45,25 +45,15 @@ _FLAT = 0.5  # least planarity of a surface to measure distances from
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """One keyframe and the points around it, about the body, along the map's axes by the poses of ``locate``.
+    """One keyframe and the points around it, about the body, along the map's axes by the poses of ``locate``."""
 
-    Attributes:
-        run: number of the run, from 0.
-        index: of the keyframe among the run's frames with a pose.
-        driven: metres along the run.
-        turned: radians along the run, all turns counted positive.
-        T_map_body: (4, 4) by ``locate``, relative to the map's origin.
-        T_odom_body: (4, 4).
-        points: (N, 3) float32, metres.
-    """
-
-    run: int
-    index: int
-    driven: float
-    turned: float
-    T_map_body: Pose
-    T_odom_body: Pose
-    points: Points
+    run: int  # number of the run, from 0
+    index: int  # of the keyframe among the run's frames with a pose
+    driven: float  # metres along the run
+    turned: float  # radians along the run, all turns counted positive
+    T_map_body: Pose  # (4, 4) by locate, relative to the map's origin
+    T_odom_body: Pose  # (4, 4)
+    points: Points  # (N, 3) float32, metres
 
     @property
     def T_submap_body(self) -> Pose:
@@ -131,19 +121,12 @@ def spaced(driven: Floats, step: float) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """Result of one registration.
+    """Result of one registration."""
 
-    Attributes:
-        source: index of the registered submap.
-        target: index of the submap that it was registered to; -1: the base map.
-        T: (4, 4) pose of the source's body, relative to the target's body or to the map's origin.
-        covariance: (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body.
-    """
-
-    source: int
-    target: int
-    T: Pose
-    covariance: Floats
+    source: int  # index of the registered submap
+    target: int  # index of the submap that it was registered to; -1: the base map
+    T: Pose  # (4, 4) pose of the source's body, relative to the target's body or to the map's origin
+    covariance: Floats  # (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body
 
 
 class Registrar:

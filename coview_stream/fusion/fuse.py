@@ -112,29 +112,17 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The fused cloud; its base map stays in its file until :meth:`chunks` reads it.
+    """The fused cloud; its base map stays in its file until :meth:`chunks` reads it."""
 
-    Attributes:
-        base_map: the map.
-        base_change: (B,) uint8 tags of the map's points: same, or gone.
-        points: (N, 3) float32 of the runs, relative to the map's origin.
-        source: (N,) uint16 number of the run, from 1.
-        change: (N,) uint8 tag: same, or new.
-        stamp: (N,) float64 of the newest frame with the point, seconds.
-        added: by run.
-        filled: square metres, about, of new surface in blind spots of the survey.
-        moving: voxels apart from the map with rays through them; left out without ``keep_moving``.
-    """
-
-    base_map: BaseMap
-    base_change: npt.NDArray[np.uint8]
-    points: Points
-    source: npt.NDArray[np.uint16]
-    change: npt.NDArray[np.uint8]
-    stamp: npt.NDArray[np.float64]
-    added: tuple[Added, ...]
-    filled: float
-    moving: int
+    base_map: BaseMap  # the map
+    base_change: npt.NDArray[np.uint8]  # (B,) uint8 tags of the map's points: same, or gone
+    points: Points  # (N, 3) float32 of the runs, relative to the map's origin
+    source: npt.NDArray[np.uint16]  # (N,) uint16 number of the run, from 1
+    change: npt.NDArray[np.uint8]  # (N,) uint8 tag: same, or new
+    stamp: npt.NDArray[np.float64]  # (N,) float64 of the newest frame with the point, seconds
+    added: tuple[Added, ...]  # by run
+    filled: float  # square metres, about, of new surface in blind spots of the survey
+    moving: int  # voxels apart from the map with rays through them; left out without keep_moving
 
     def __len__(self) -> int:
         """Return the number of points, the map's included."""

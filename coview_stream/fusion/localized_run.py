@@ -28,15 +28,10 @@ _MAX_RESULT = 1 << 28  # bytes of a result.json
 
 @dataclass(frozen=True)
 class RunPair:
-    """A recorded run and the results of ``locate`` for it.
+    """A recorded run and the results of ``locate`` for it."""
 
-    Attributes:
-        run: path of the run.
-        out: directory that ``locate`` wrote, or a trajectory (TUM, map <- body).
-    """
-
-    run: Path
-    out: Path
+    run: Path  # path of the run
+    out: Path  # directory that locate wrote, or a trajectory (TUM, map <- body)
 
     @property
     def trajectory(self) -> Path:
@@ -67,19 +62,12 @@ def parse_pair(text: str) -> RunPair:
 
 @dataclass(frozen=True)
 class PosedFrame:
-    """One frame of a run on the map.
+    """One frame of a run on the map."""
 
-    Attributes:
-        stamp: seconds.
-        points: (N, 3) float32 in the body frame, levelled, metres.
-        T_map_body: (4, 4), relative to the map's origin.
-        eye: (3,) of the lidar in the body frame, levelled.
-    """
-
-    stamp: float
-    points: Points
-    T_map_body: Pose
-    eye: Floats
+    stamp: float  # seconds
+    points: Points  # (N, 3) float32 in the body frame, levelled, metres
+    T_map_body: Pose  # (4, 4), relative to the map's origin
+    eye: Floats  # (3,) of the lidar in the body frame, levelled
 
 
 class LocalizedRun:

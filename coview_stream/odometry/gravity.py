@@ -48,21 +48,13 @@ _UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical along the dire
 
 @dataclass(frozen=True)
 class Ground:
-    """A plane below the sensor.
+    """A plane below the sensor."""
 
-    Attributes:
-        up: (3,) unit vector in the body frame: the plane's normal, corrected by walls.
-        height: of the sensor above it, metres.
-        share: of the cells around with their lowest point in it.
-        cells: number of these cells.
-        walls: number of patches of wall behind ``up``.
-    """
-
-    up: Floats
-    height: float
-    share: float
-    cells: int
-    walls: int = 0
+    up: Floats  # (3,) unit vector in the body frame: the plane's normal, corrected by walls
+    height: float  # of the sensor above it, metres
+    share: float  # of the cells around with their lowest point in it
+    cells: int  # number of these cells
+    walls: int = 0  # number of patches of wall behind up
 
 
 def find_ground(points: Reals) -> Ground | str:
@@ -192,17 +184,11 @@ def _sums(values: Floats, cell_of: Indices, count: int) -> Floats:
 
 @dataclass(frozen=True)
 class Plumb:
-    """The vertical by the surrounding surfaces, in level axes, for a filter.
+    """The vertical by the surrounding surfaces, in level axes, for a filter."""
 
-    Attributes:
-        walls: (2,) x and y of the unit vector along the walls; None without walls.
-        covariance: (2, 2) of it, radians squared, but for a factor.
-        ground: (2,) x and y of the ground's unit normal; None without ground.
-    """
-
-    walls: Floats | None
-    covariance: Floats
-    ground: Floats | None
+    walls: Floats | None  # (2,) x and y of the unit vector along the walls; None without walls
+    covariance: Floats  # (2, 2) of it, radians squared, but for a factor
+    ground: Floats | None  # (2,) x and y of the ground's unit normal; None without ground
 
     def rows(self) -> tuple[Floats, Indices]:
         """Return the measurement (4,), zeros for missing parts, and the indices (K,) of the present components."""
@@ -212,17 +198,11 @@ class Plumb:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Walls and ground around one frame, in its body frame.
+    """Walls and ground around one frame, in its body frame."""
 
-    Attributes:
-        walls: (3,) unit vector along the walls; None without walls.
-        information: (3, 3) of it, 1 / radians squared.
-        ground: None without ground.
-    """
-
-    walls: Floats | None
-    information: Floats
-    ground: Ground | None
+    walls: Floats | None  # (3,) unit vector along the walls; None without walls
+    information: Floats  # (3, 3) of it, 1 / radians squared
+    ground: Ground | None  # None without ground
 
     @classmethod
     def around(cls, points: Reals, up: Floats, near: Ground | None) -> Surfaces:

@@ -70,15 +70,10 @@ _OF_BODY = np.vstack([_ZERO, _ZERO, _EYE])
 
 @dataclass(frozen=True)
 class Since:
-    """Tilt of a frame's body axis z against the axis of the previous frame.
+    """Tilt of a frame's body axis z against the axis of the previous frame."""
 
-    Attributes:
-        tilt: (2,) difference of the axes' x and y in the level frame.
-        sigma: of the body's tilt meanwhile, radians.
-    """
-
-    tilt: Floats
-    sigma: float
+    tilt: Floats  # (2,) difference of the axes' x and y in the level frame
+    sigma: float  # of the body's tilt meanwhile, radians
 
 
 @dataclass

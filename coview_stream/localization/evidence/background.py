@@ -36,17 +36,11 @@ _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structur
 
 @dataclass(frozen=True)
 class Most:
-    """Upper limits of the number of independent observations.
+    """Upper limits of the number of independent observations."""
 
-    Attributes:
-        structure: patches of structure in a scan.
-        free: cubes of free space in a scan.
-        scans: number of scans with different surroundings; 1 where all keyframes see the same.
-    """
-
-    structure: float = np.inf
-    free: float = np.inf
-    scans: float = 1.0
+    structure: float = np.inf  # patches of structure in a scan
+    free: float = np.inf  # cubes of free space in a scan
+    scans: float = 1.0  # number of scans with different surroundings; 1 where all keyframes see the same
 
 
 @dataclass(frozen=True)

@@ -114,15 +114,10 @@ def _beta(x: Floats, a: float, b: float) -> Floats:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probabilities of places.
+    """Probabilities of places."""
 
-    Attributes:
-        place: (P,) probability that the robot is at the place.
-        none: probability that it is at none of them.
-    """
-
-    place: Floats
-    none: float
+    place: Floats  # (P,) probability that the robot is at the place
+    none: float  # probability that it is at none of them
 
     def error(self, same: Bools) -> float:
         """Return the probability that the robot is at none of the places ``same`` (P,), exact near 0."""

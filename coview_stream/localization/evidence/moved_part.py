@@ -38,15 +38,10 @@ _SHARES = (0.05, 0.9)  # range of a patch's chance share
 
 @dataclass(frozen=True)
 class MovedPart:
-    """Part of the scans that fits elsewhere.
+    """Part of the scans that fits elsewhere."""
 
-    Attributes:
-        probability: that such a part exists.
-        metres: length of its shift.
-    """
-
-    probability: float
-    metres: float
+    probability: float  # that such a part exists
+    metres: float  # length of its shift
 
 
 NO_PART = MovedPart(0.0, 0.0)

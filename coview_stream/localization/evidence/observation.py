@@ -98,17 +98,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of the map at H poses.
+    """Observations of the map at H poses."""
 
-    Attributes:
-        poses: (H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians.
-        shares: (H, 7), columns as in :class:`Share`.
-        parts: (H, 5), columns as the fields of :class:`Evidence`.
-    """
-
-    poses: Floats
-    shares: Floats32
-    parts: Floats
+    poses: Floats  # (H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians
+    shares: Floats32  # (H, 7), columns as in Share
+    parts: Floats  # (H, 5), columns as the fields of Evidence
 
     @property
     def scores(self) -> Floats32:
@@ -237,15 +231,10 @@ def surroundings(scans: Sequence[ObservedScan]) -> float:
 
 @dataclass(frozen=True)
 class RangeImage:
-    """Nearest return of one frame by direction, in cells of 2 degrees.
+    """Nearest return of one frame by direction, in cells of 2 degrees."""
 
-    Attributes:
-        nearest: (C,) metres; -inf where there are too few returns.
-        floor: height of the ground relative to the sensor, metres, at most 0.
-    """
-
-    nearest: Floats32
-    floor: float
+    nearest: Floats32  # (C,) metres; -inf where there are too few returns
+    floor: float  # height of the ground relative to the sensor, metres, at most 0
 
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:

@@ -28,17 +28,11 @@ _CROP_STEP = 16.0  # metres between the centres of cached crops
 
 @dataclass(frozen=True)
 class LocalMap:
-    """A crop of the base map; its search structures are made at first use.
+    """A crop of the base map; its search structures are made at first use."""
 
-    Attributes:
-        points: (K, 3) map frame, metres.
-        normals: (K, 3) normals, as long as the planarity around each point: 1 on a surface, 0 in scatter.
-        cells: the points' order by cell, if they have been sorted.
-    """
-
-    points: Points
-    normals: Points
-    cells: Cells | None = None
+    points: Points  # (K, 3) map frame, metres
+    normals: Points  # (K, 3) normals, as long as the planarity around each point: 1 on a surface, 0 in scatter
+    cells: Cells | None = None  # the points' order by cell, if they have been sorted
 
     @cached_property
     def grid(self) -> kernels.PointGrid:

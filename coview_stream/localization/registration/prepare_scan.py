@@ -25,19 +25,12 @@ _SEED = 20240  # of the choice among too many points
 
 @dataclass(frozen=True)
 class RegistrationCloud:
-    """A local scan to register.
+    """A local scan to register."""
 
-    Attributes:
-        points: (N, 3) float32, gravity-aligned frame, metres.
-        above: (N,) whether a point stands above the ground or lies on it.
-        height: (N,) metres above the lowest ground nearby.
-        ground_offset: metres by which the points on the ground have been lowered.
-    """
-
-    points: Points
-    above: Bools
-    height: Floats32
-    ground_offset: float = 0.0
+    points: Points  # (N, 3) float32, gravity-aligned frame, metres
+    above: Bools  # (N,) whether a point stands above the ground or lies on it
+    height: Floats32  # (N,) metres above the lowest ground nearby
+    ground_offset: float = 0.0  # metres by which the points on the ground have been lowered
 
     @property
     def high(self) -> Bools:

@@ -36,15 +36,10 @@ _MAX_RIVALS = 2  # searched for in a doubtful match
 
 @dataclass(frozen=True)
 class Rival:
-    """A probable pose beside a registered one.
+    """A probable pose beside a registered one."""
 
-    Attributes:
-        T_map_odom: (4, 4) as registered there.
-        ratio: log-likelihood ratio of the scan there, against chance around the other.
-    """
-
-    T_map_odom: Pose
-    ratio: float
+    T_map_odom: Pose  # (4, 4) as registered there
+    ratio: float  # log-likelihood ratio of the scan there, against chance around the other
 
 
 def find_rivals(
@@ -99,29 +94,17 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
 
 @dataclass(frozen=True)
 class MapMatch:
-    """Registration while tracking: more than an :class:`Estimate`, as its verdict decides its use.
+    """Registration while tracking: more than an :class:`Estimate`, as its verdict decides its use."""
 
-    Attributes:
-        verdict: the decision and its reason.
-        T_map_body: (4, 4) with the prior removed.
-        covariance: (6, 6) as of an :class:`Estimate`.
-        innovation: squared Mahalanobis distance from the graph's prediction.
-        scan: the registered scan; None if registration failed.
-        target: the map around it; None likewise.
-        rivals: poses metres beside it, the most probable first, if they were searched for.
-        moves_place: it contradicts odometry, and is believed instead.
-        confirms_search: it is the first at an accepted place and adds no evidence to the search's.
-    """
-
-    verdict: MatchVerdict
-    T_map_body: Pose
-    covariance: Floats
-    innovation: float = 0.0
-    scan: ObservedScan | None = None
-    target: LocalMap | None = None
-    rivals: tuple[Rival, ...] = ()
-    moves_place: bool = False
-    confirms_search: bool = False
+    verdict: MatchVerdict  # the decision and its reason
+    T_map_body: Pose  # (4, 4) with the prior removed
+    covariance: Floats  # (6, 6) as of an Estimate
+    innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction
+    scan: ObservedScan | None = None  # the registered scan; None if registration failed
+    target: LocalMap | None = None  # the map around it; None likewise
+    rivals: tuple[Rival, ...] = ()  # poses metres beside it, the most probable first, if they were searched for
+    moves_place: bool = False  # it contradicts odometry, and is believed instead
+    confirms_search: bool = False  # it is the first at an accepted place and adds no evidence to the search's
 
     @classmethod
     def without_registration(cls, verdict: MatchVerdict, belief: Estimate) -> MapMatch:

@@ -58,21 +58,13 @@ _AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TIL
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """Verdict on one registration; only ``cause`` and ``reason`` without one.
+    """Verdict on one registration; only ``cause`` and ``reason`` without one."""
 
-    Attributes:
-        cause: of the decision.
-        reason: one clause for people.
-        evidence: at the registered pose.
-        innovation: squared Mahalanobis distance to the prediction.
-        observation: likelihood of the scan at the pose, against chance.
-    """
-
-    cause: RejectionReason
-    reason: str
-    evidence: Evidence | None = None
-    innovation: float | None = None
-    observation: Observation | None = None
+    cause: RejectionReason  # of the decision
+    reason: str  # one clause for people
+    evidence: Evidence | None = None  # at the registered pose
+    innovation: float | None = None  # squared Mahalanobis distance to the prediction
+    observation: Observation | None = None  # likelihood of the scan at the pose, against chance
 
     @property
     def verified(self) -> bool:
@@ -91,13 +83,9 @@ class MatchVerdict:
 
 
 class EvidenceBaseline:
-    """Usual evidence of the last metres, for reasons in words and for the width of the protection level.
+    """Usual evidence of the last metres, for reasons in words and for the width of the protection level."""
 
-    Attributes:
-        usual: running average; None before the first registration.
-    """
-
-    usual: Evidence | None = None
+    usual: Evidence | None = None  # running average; None before the first registration
 
     def learn(self, evidence: Evidence) -> None:
         """Add the evidence of a registration that was believed."""

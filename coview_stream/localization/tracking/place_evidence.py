@@ -30,17 +30,11 @@ _BESIDE = 0.5  # probability that the right place lies metres beside a wrong one
 
 @dataclass(frozen=True)
 class Observation:
-    """Evidence of a scan for a pose.
+    """Evidence of a scan for a pose."""
 
-    Attributes:
-        ratio: log-likelihood ratio of "the robot is here" against chance.
-        likelihoods: (Q, D, L) log-likelihood ratios by the values of the nuisances.
-        rival: log-likelihood ratio of the most probable pose metres beside it; chance's without any.
-    """
-
-    ratio: float
-    likelihoods: Floats
-    rival: float = 0.0
+    ratio: float  # log-likelihood ratio of "the robot is here" against chance
+    likelihoods: Floats  # (Q, D, L) log-likelihood ratios by the values of the nuisances
+    rival: float = 0.0  # log-likelihood ratio of the most probable pose metres beside it; chance's without any
 
     @property
     def against_elsewhere(self) -> float:

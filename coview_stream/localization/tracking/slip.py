@@ -116,12 +116,9 @@ class DisplacementCheck:
     near them is compared with the usual share, for every frame. Below 0.7 of it were fewer than 1 % of the frames at
     the right pose, more than half of those half a metre off, and more than 98 % anywhere else (measured once, on the
     simulated worlds 5101, 5103, 5106 and 5108; no command prints it).
-
-    Attributes:
-        usual: share in [0, 1]; None before the first registration.
     """
 
-    usual: float | None = None
+    usual: float | None = None  # share in [0, 1]; None before the first registration
 
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
         """Add a frame with a verified registration; with others a slow error would become usual.
