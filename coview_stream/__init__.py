@@ -78,34 +78,25 @@ __all__ = [
     "read_cloud",
 ]
 
-_HOMES = {
-    "BaseMap": "basemap.basemap",
-    "CloudError": "errors",
-    "CoViewError": "errors",
-    "CoViewWarning": "errors",
-    "ConfigError": "errors",
-    "DependencyError": "errors",
-    "Fix": "localization.result",
-    "InputError": "errors",
-    "KeyframeEvidence": "localization.result",
-    "Localizer": "localization.localizer",
-    "LocalizerConfig": "config",
-    "MapConfig": "config",
-    "MapError": "errors",
-    "MapSummary": "basemap.summary",
-    "PlaceGuess": "localization.search.hints",
-    "PoseMessage": "messages.types",
-    "ProtectionLevel": "geometry.protection",
-    "RejectionReason": "localization.tracking.monitor",
-    "RobotClient": "stream.client.client",
-    "Run": "recordings.run",
-    "RunError": "errors",
-    "State": "localization.state",
-    "TransportError": "errors",
-    "fetch_map": "stream.maps.fetch_map",
-    "open_run": "recordings.open_run",
-    "read_cloud": "clouds.files",
+_NAMES = {
+    "basemap.basemap": ("BaseMap",),
+    "basemap.summary": ("MapSummary",),
+    "clouds.files": ("read_cloud",),
+    "config": ("LocalizerConfig", "MapConfig"),
+    "errors": tuple(name for name in __all__ if name.endswith(("Error", "Warning"))),
+    "geometry.protection": ("ProtectionLevel",),
+    "localization.localizer": ("Localizer",),
+    "localization.result": ("Fix", "KeyframeEvidence"),
+    "localization.search.hints": ("PlaceGuess",),
+    "localization.state": ("State",),
+    "localization.tracking.monitor": ("RejectionReason",),
+    "messages.types": ("PoseMessage",),
+    "recordings.open_run": ("open_run",),
+    "recordings.run": ("Run",),
+    "stream.client.client": ("RobotClient",),
+    "stream.maps.fetch_map": ("fetch_map",),
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> _Any:

@@ -1,16 +1,5 @@
 """Errors of the package, as one tree, and the import of libraries that only some installations have.
 
-CoViewError
-├── ConfigError      an option or a configuration field is out of its range
-├── InputError       a file, run or array that the caller gave cannot be used
-│   ├── CloudError   a point cloud is unreadable, empty, truncated or of another format
-│   ├── RunError     a run's frames and odometry do not fit together
-│   ├── MapError     a ``.coview`` file is damaged, of another version or not a map
-│   └── MessageError a message from the network cannot be decoded
-│       └── EncodingError   no codec knows its encoding
-├── TransportError   the network session cannot be opened or configured
-└── DependencyError  an optional or native library is missing; the message names the remedy
-
 Every message names the file, field or key and the remedy. The command prints it as one line and exits with 2.
 """
 
@@ -105,15 +94,9 @@ EXTRA_OF = {
 
 
 def require_library(module: str, requirement: str, purpose: str) -> Any:
-    """Import a module that comes with one of the package's extras.
+    """Import a module that one of the package's extras brings; raises DependencyError if it cannot be loaded.
 
-    Args:
-        module: full name of the module.
-        requirement: its distribution with the minimum version, as the package's extra has it.
-        purpose: feature that needs it, for the message.
-
-    Raises:
-        DependencyError: it is not installed, or cannot be loaded.
+    ``requirement`` is its distribution with the minimum version, as in the extra; ``purpose`` is for the message.
     """
     try:
         return import_module(module)
@@ -121,18 +104,16 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
         library = module.partition(".")[0]
         absent = isinstance(error, ImportError) and error.name == library
         if absent and library in EXTRA_OF:
-            raise DependencyError(_not_installed(library, purpose)) from error
+            raise DependencyError(_not_installed(library, purpose, EXTRA_OF[library])) from error
         missing = "is not installed" if absent else f"cannot be loaded ({error})"
         raise DependencyError(f"{purpose}: {_spelt(library)} {missing}; pip install '{requirement}'") from error
 
 
 @contextmanager
 def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator[None]:
-    """Turn the ImportError of a module that an extra brings into a :class:`DependencyError` that names the extra.
+    """Turn the ImportError of a module into a :class:`DependencyError` that names an extra.
 
-    Args:
-        purpose: what needs it, for the message.
-        extra: the one that brings all that this needs; None: the one that brings the module.
+    ``purpose`` is for the message; ``extra`` brings all modules needed, by default the one that brings this module.
     """
     try:
         yield
@@ -140,12 +121,12 @@ def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator
         library = (error.name or "").partition(".")[0]
         if library not in EXTRA_OF:
             raise
-        raise DependencyError(_not_installed(library, purpose, extra)) from error
+        raise DependencyError(_not_installed(library, purpose, extra or EXTRA_OF[library])) from error
 
 
-def _not_installed(library: str, purpose: str, extra: str | None = None) -> str:
-    # pip takes the version that is installed, and looks for no other: it does not matter where this package came from
-    return f"{purpose}: {_spelt(library)} is not installed; pip install 'coview-stream[{extra or EXTRA_OF[library]}]'"
+def _not_installed(library: str, purpose: str, extra: str) -> str:
+    # pip takes the installed version and looks for no other, wherever this package came from
+    return f"{purpose}: {_spelt(library)} is not installed; pip install 'coview-stream[{extra}]'"
 
 
 def _spelt(library: str) -> str:

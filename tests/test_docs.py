@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import builtins
 import importlib.util
 import re
 import shlex
@@ -22,9 +21,7 @@ from coview_stream.cli import build_parser
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.messages import decode_cloud, decode_odometry, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.client import client
 from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
@@ -271,9 +268,8 @@ def test_code_about_frames_runs():
     exec(compile(blocks("locate.md", "python")[0], "locate.md", "exec"), {})
 
 
-def test_client_example_runs(monkeypatch, capsys):
+def test_client_example_runs(capsys):
     net = MemoryTransport()
-    monkeypatch.setattr(client, "open_client", lambda *endpoints, **options: net)
 
     def answer(sample):
         pose = PoseMessage(decode_cloud(sample).stamp_ns, "rover1", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab")
@@ -281,15 +277,14 @@ def test_client_example_runs(monkeypatch, capsys):
 
     net.subscribe("coview/rover1/in/cloud", answer, "newest")
     code = re.search(r"<!-- client -->\n```python\n(.*?)```\n<!-- end -->", text_of("python.md"), re.DOTALL)[1]
-    names = {"T_odom_body": np.eye(4), "points": np.ones((3, 3)), "stamp": 2.5}
-    exec(compile(code.replace("timeout=1.0", "timeout=0"), "python.md", "exec"), names)
+    code = code.replace("timeout=1.0", "timeout=0").replace('"tcp/127.0.0.1:7447"', "transport=net")
+    names = {"T_odom_body": np.eye(4), "points": np.ones((3, 3)), "stamp": 2.5, "net": net}
+    exec(compile(code, "python.md", "exec"), names)
     assert capsys.readouterr().out.startswith("2500000000 [[1.")
-    assert net.closed  # a client closes what it opened
 
 
-def test_program_of_the_feed_prints_poses(monkeypatch, capsys):
+def test_program_of_the_feed_prints_poses(capsys):
     net = MemoryTransport()
-    monkeypatch.setattr(zenoh_transport, "open_client", lambda: net)
 
     def publish(_):
         pose = PoseMessage(0, "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, "ab" * 32)
@@ -297,8 +292,8 @@ def test_program_of_the_feed_prints_poses(monkeypatch, capsys):
         printed = []
         until(lambda: printed.append(capsys.readouterr().out) or "r1 [0. 0. 0.]" in "".join(printed))
 
-    monkeypatch.setattr(builtins, "input", publish)
-    exec(compile(blocks("serve.md", "python")[0], "serve.md", "exec"), {})
+    code = blocks("serve.md", "python")[0].replace("open_client()", "net")
+    exec(compile(code, "serve.md", "exec"), {"net": net, "input": publish})
 
 
 class Asked:

@@ -9,13 +9,11 @@ import json
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 from nightly import nightly
 
-from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
-from coview_stream.clouds.trajectory import read_tum, write_tum
+from coview_stream.clouds.trajectory import read_tum
 from coview_stream.report.evaluation import evaluate
 
 pytestmark = pytest.mark.realdata
@@ -85,39 +83,3 @@ def test_real_run_on_wrong_map_gets_no_pose(located, tmp_path):
     assert code == 1
     assert (tmp_path / "trajectory.tum").read_text() == ""
     assert json.loads((tmp_path / "result.json").read_text())["state"] in ("SEARCHING", "AMBIGUOUS")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("located", ["kitti04"], indirect=True)
-def test_far_odometry_origin_changes_nothing(located, tmp_path):
-    """UTM-like odometry of a real run: the same poses to a millimetre or so."""
-    _, _, folder, out = located
-    stamps, poses = read_tum(folder / "run" / "odometry.tum")
-    away = poses.copy()
-    away[:, :3, 3] += [443_000.0, 5_900_000.0, -60.0]
-    write_tum(tmp_path / "far.tum", stamps, away)
-    code = main(
-        [
-            *("locate", str(out / "site.coview"), str(folder / "run"), "-o", str(tmp_path), "--no-pictures"),
-            *("--odometry", str(tmp_path / "far.tum")),
-        ]
-    )
-    assert code == 0
-    here, there = read_tum(out / "trajectory.tum"), read_tum(tmp_path / "trajectory.tum")
-    np.testing.assert_array_equal(here[0], there[0])
-    np.testing.assert_allclose(there[1], here[1], atol=5e-3)
-
-
-@pytest.mark.slow
-def test_utm_coordinates_of_a_real_site_are_kept(tmp_path):
-    """The map of a road at UTM-like coordinates lies where its source says."""
-    import laspy
-
-    source = data("riverside_a", "base.laz")
-    base_map = BaseMap.build(source, outlier_neighbours=0, radius=30.0, block=4.0)
-    with laspy.open(source) as reader:
-        low, high = np.array(reader.header.mins), np.array(reader.header.maxs)
-    there = base_map.points + base_map.origin
-    np.testing.assert_allclose(there.min(axis=0), low, atol=0.5)
-    np.testing.assert_allclose(there.max(axis=0), high, atol=0.5)
-    assert np.abs(base_map.points).max() < 2000

@@ -264,13 +264,9 @@ def _log_odds(gap: float, far: float, farther: float, sigma: float) -> float:
 
 
 def _fit(pairs: Sequence[_Pair], R_up: Floats, change: Change | None = None, R_body: Floats | None = None) -> _Fit:
-    """Compare the lidar's motion with odometry's.
+    """Compare the lidar's motion, in axes levelled by ``R_up`` (3, 3), with odometry's, mended by ``change``.
 
-    Args:
-        pairs: motions; the lidar's are in the axes that ``R_up`` makes.
-        R_up: (3, 3) levelled <- cloud, by the smallest turn.
-        change: mends odometry.
-        R_body: (3, 3) body <- cloud; None where the clouds have the body's axes.
+    ``R_body`` (3, 3), body <- cloud, is None where the clouds have the body's axes.
     """
     R = R_up if R_body is None else R_body
     heading = yaw_of(pose_from(R @ R_up.T, np.zeros(3)))

@@ -50,7 +50,10 @@ def machine_findings(probed: Callable[[str], dict[str, Any]] | None = None) -> I
     """Judge the machine; takes some seconds, to compile the kernels. ``probed`` replaces :func:`probe`."""
     probed = probed or probe
     yield python_finding(sys.version_info[:3])
-    yield processor_finding(_model(), cores(), _quota())
+    cpu = (line.partition(":") for line in _read("/proc/cpuinfo").splitlines())
+    models = [" ".join(value.split()) for name, _, value in cpu if name.strip() in ("model name", "Model")]
+    model = models[0] if models else platform.processor() or platform.machine()
+    yield processor_finding(model, cores(), _quota())
     yield memory_finding(*memory())
     yield blas_finding(os.environ.get("OPENBLAS_NUM_THREADS", ""))
     lacking = lacking_modules()
@@ -162,18 +165,18 @@ def codecs_finding(result: dict[str, Any]) -> Finding:
 
 def open3d_finding(result: dict[str, Any]) -> Finding:
     """Judge Open3D: normals and outliers of new maps, and ray casting in simulated worlds."""
-    if "error" in result:
-        text, _, remedy = str(result["error"]).removeprefix("DependencyError: ").partition("; ")
-        return Finding("warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy)
-    return Finding("ok", "open3d", str(result["version"]))
+    if "error" not in result:
+        return Finding("ok", "open3d", str(result["version"]))
+    text, _, remedy = str(result["error"]).removeprefix("DependencyError: ").partition("; ")
+    return Finding("warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy)
 
 
 def matplotlib_finding(result: dict[str, Any]) -> Finding:
     """Judge Matplotlib, which only draws pictures."""
-    if "error" in result:
-        text = f"{result['error']}: no pictures from locate, demo, info and eval"
-        return Finding("warn", "matplotlib", text, "pip install 'coview-stream[plot]'")
-    return Finding("ok", "matplotlib", str(result["version"]))
+    if "error" not in result:
+        return Finding("ok", "matplotlib", str(result["version"]))
+    text = f"{result['error']}: no pictures from locate, demo, info and eval"
+    return Finding("warn", "matplotlib", text, "pip install 'coview-stream[plot]'")
 
 
 def memory() -> tuple[int | None, int | None]:
@@ -185,14 +188,6 @@ def memory() -> tuple[int | None, int | None]:
     if total is not None and available is not None and limit.isdigit() and used.isdigit() and int(limit) < total:
         return int(limit), min(available, max(0, int(limit) - int(used)))
     return total, available
-
-
-def _model() -> str:
-    for line in _read("/proc/cpuinfo").splitlines():
-        name, _, value = line.partition(":")
-        if name.strip() in ("model name", "Model"):
-            return " ".join(value.split())
-    return platform.processor() or platform.machine()
 
 
 def _quota() -> float | None:

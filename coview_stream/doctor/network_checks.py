@@ -73,11 +73,8 @@ def discover(transport: Transport, wait: Callable[[float], object] = time.sleep)
 def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "", served: Iterable[str] = ()) -> str:
     """Name the candidates of a channel, with the options that subscribe to them; empty if there are none.
 
-    Args:
-        candidates: on the network.
-        channel: ``cloud`` or ``odometry``.
-        like: a silent key; candidates spelt most like it come first.
-        served: robots that have a node; their data is named only without any other.
+    Those spelt most like the silent key ``like`` come first; data of ``served`` robots, which have a node, is named
+    only without any other.
     """
     others = set(served)
     fitting = [c for c in candidates if c.channel == channel]

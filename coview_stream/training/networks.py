@@ -188,13 +188,8 @@ def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
     Activations have eight bits in the range that the images cause, weights seven, one scale for each channel: sums
     of eight would overflow on CPUs without VNNI. The aerial network is not quantised: maps are built once.
 
-    Args:
-        directory: with the weights and their card.
-        images: (LAYERS, H, W) of typical scans, a hundred or so.
-        note: their description, for the card.
-
-    Raises:
-        InputError: there are no weights. DependencyError: ONNX is not installed.
+    ``directory`` holds the weights and their card, which takes the ``note`` on the images: a hundred typical scans
+    (LAYERS, H, W). Raises InputError without weights, DependencyError without ONNX.
     """
     onnx = require_library("onnx", "onnx>=1.16", "quantisation (extra learn-train)")
     from onnxruntime import quantization as tools

@@ -84,6 +84,13 @@ def test_standing_robot_is_told_to_drive(frames):
     assert "drive" in motion.remedy
 
 
+@pytest.mark.parametrize(("count", "words"), [(4, "too few frames"), (7, "too few frames"), (10, "odometry follows")])
+def test_three_motions_that_agree_are_sure_and_two_are_not(frames, count, words):
+    motion = next(f for f in frame_findings(frames[:count]) if f.what == "motion")
+    assert motion.verdict == "ok"
+    assert motion.found.startswith(words)
+
+
 def test_remedy_of_an_upside_down_lidar_is_its_mount(frames):
     spoil, _ = FAULTS["upside down"]
     (finding,) = frame_findings([spoil(f) for f in frames])

@@ -83,13 +83,10 @@ class Gravity:
 
 
 def spoilt(odometry: Floats, turns: Floats, factors: Floats, first: Floats | None = None) -> Floats:
-    """Return poses (N, 4, 4) chained from spoilt motions.
+    """Return poses (N, 4, 4) chained from spoilt motions of ``odometry`` (N, 4, 4), ``T_odom_body``.
 
-    Args:
-        odometry: (N, 4, 4) ``T_odom_body``.
-        turns: (N - 1, 3, 3) rotation of the odometry's axes after each motion, in place of none.
-        factors: (N - 1,) on the length of each motion.
-        first: (3, 3) rotation of the axes at the first pose, the identity if None.
+    ``turns`` (N - 1, 3, 3) rotate the odometry's axes after each motion, ``first`` (3, 3) at the first pose;
+    ``factors`` (N - 1,) scale each motion.
     """
     axes = np.concatenate([(np.eye(3) if first is None else first)[None], turns])
     moved = np.diff(odometry[:, :3, 3], axis=0) * factors[:, None]

@@ -49,12 +49,9 @@ class Recording:
         self._writer.close()
 
     def add(self, points: Points, times: Floats, segment: Segment) -> None:
-        """Add a sweep that bears the stamp of its segment's end, and the odometry of the segment before it.
+        """Add a sweep that bears the stamp of its segment's end, and new samples of the segment's odometry before it.
 
-        Args:
-            points: (N, 3) float32, each in the body frame at its own time, metres.
-            times: (N,) seconds after the stamp.
-            segment: odometry of the sweep; samples that were written before are left out.
+        ``points`` (N, 3) float32 metres are each in the body frame at their ``times`` (N,), seconds after the stamp.
         """
         for stamp, pose in zip(segment.stamps.tolist(), segment.poses, strict=True):
             if stamp > self._newest:
@@ -98,11 +95,7 @@ class Surfaces:
     """Scene for the robot's beams, with the cover of its ground and with windows in some walls."""
 
     def __init__(self, scene: Scene, cover: Cover | None, glass: Glass | None, rng: np.random.Generator) -> None:
-        """Use the present state of the scene; ``rng`` draws the buildings with windows.
-
-        Raises:
-            DependencyError: Open3D cannot be loaded.
-        """
+        """Use the present state of the scene; ``rng`` draws the buildings with windows."""
         self._site, self._cover, self._glass = scene.site, cover, glass
         parts = drawn_parts(scene)[1]
         with_windows = rng.random(len(scene.houses)) < (0.0 if glass is None else glass.share)
@@ -158,11 +151,7 @@ class Scanner:
     def __init__(
         self, scene: Scene, sensor: Sensor, dirt: Dirt, height: float, rng: Callable[[Stream], np.random.Generator]
     ) -> None:
-        """Use the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's.
-
-        Raises:
-            DependencyError: Open3D cannot be loaded.
-        """
+        """Use the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's."""
         self._sensor, self._dirt, self._height = sensor, dirt, height
         covered = dirt.snow is not None or dirt.grass is not None
         cover = Cover(scene.site, dirt.snow, dirt.grass, rng(Stream.COVER)) if covered else None
@@ -174,13 +163,9 @@ class Scanner:
     def frames(
         self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses, recording: Recording | None = None
     ) -> Iterator[Points]:
-        """Yield frames (N, 3) float32 metres, in the robot's assumed body frame.
+        """Yield frames (N, 3) float32 metres, in the robot's assumed body frame, at stamps (N,), seconds.
 
-        Args:
-            stamps: (N,) seconds.
-            T_scene_body: (N, 4, 4) true poses.
-            T_odom_body: (N, 4, 4) odometry, by which raw sweeps are deskewed.
-            recording: takes the raw sweeps as well, where the robot moves during a sweep.
+        The odometry (N, 4, 4) deskews raw sweeps, which ``recording`` takes as well where the robot moves meanwhile.
         """
         motion = self._dirt.motion
         track = None if motion is None else Track(stamps, T_scene_body, T_odom_body)
