@@ -1,4 +1,4 @@
-"""Frames as the localizer uses them: checked, with their odometry corrected by the calibration."""
+"""Preparation of frames: the checks of a frame, and its odometry corrected by the calibration."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from coview_stream.localization.calibration.calibration import Calibration, RawS
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.frame_motion import FrameMotion, Variances
 
-_LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one
-_PLACE_TILT = math.radians(0.5)  # sigma of an accepted place's roll and pitch, as the search has registered it
+# sigmas of roll and pitch of a registered place
+_LEADER_TILT = math.radians(1.0)  # that leads the search, if it is the right one
+_PLACE_TILT = math.radians(0.5)  # that is accepted
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One frame, checked.
+class PreparedFrame:
+    """One frame, checked and corrected.
 
     Attributes:
         cloud: (N, 3) float32, the sensor's own axes.
-        T_odom_body: (4, 4) odometry about the anchor, corrected.
+        T_odom_body: (4, 4) corrected odometry about the anchor.
         T_odom_raw: (4, 4) odometry as it came.
         stamp: seconds.
         scan: one point per voxel.
@@ -40,15 +41,14 @@ class Frame:
 
 
 class FramePreparation:
-    """Preparation of a robot's frames by the calibration, which is estimated from them.
+    """Preparation of a robot's frames, and the estimate of its calibration.
 
     Attributes:
-        estimator: of the calibration; learns from registrations, too.
-        anchor: (3,) origin of odometry in use, so that float32 stays exact; None before the first frame.
+        estimator: of the calibration; learns from registrations too.
+        anchor: (3,) origin of the odometry in use: near it float32 is exact; None before the first frame.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
-        """Begin with nothing known of the robot."""
         self.estimator = CalibrationEstimator(config.sensor_leans)
         self.anchor: Floats | None = None
         self._odometry = OdometryCorrection()
@@ -74,18 +74,18 @@ class FramePreparation:
         self.anchor = None
 
     def forget_keyframe(self) -> None:
-        """Measure no motion between the next keyframe and the one before."""
+        """Measure no motion from the newest keyframe to the next."""
         self._motion.clear()
 
-    def prepare(self, cloud: Points, T_odom_body: Pose, stamp: float, drift: Variances | None = None) -> Frame:
+    def prepare(self, cloud: Points, T_odom_body: Pose, stamp: float, drift: Variances | None = None) -> PreparedFrame:
         """Check and correct a frame.
 
         Args:
-            cloud: (N, 3) as :meth:`coview_stream.localization.localizer.Localizer.step` takes it.
-            T_odom_body: (4, 4) likewise.
-            stamp: seconds.
-            drift: of odometry; a keyframe's motion is then mended by its registration to the keyframe before, if one is
-                due. None while a place is known, for registrations to the map measure the motion better.
+            cloud: as of :meth:`coview_stream.localization.localizer.Localizer.step`.
+            T_odom_body: likewise.
+            stamp: likewise.
+            drift: of odometry, to correct a keyframe's motion by its registration to the last keyframe. None while a
+                place is known, as registrations to the map measure the motion better.
 
         Raises:
             CloudError, RunError: the frame is unusable; nothing has changed.
@@ -100,15 +100,15 @@ class FramePreparation:
             T = self._motion.refine(self._voxels(raw, np.eye(4)), T, self.estimator, drift)
             self._odometry.move_to(pose_from(T[:3, :3], T[:3, 3] + self.anchor))
         points = self._voxels(raw, T @ self.calibration.T_body_cloud)
-        return Frame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration))
+        return PreparedFrame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration))
 
     def learn_place(self, T_map_cloud: Pose, T_odom_body: Pose, probability: float | None = None) -> Pose:
-        """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) by the calibration that follows.
+        """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) by the new calibration.
 
         Args:
             T_map_cloud: (4, 4) registered pose of a keyframe's cloud in the sensor's own axes.
-            T_odom_body: (4, 4) corrected odometry of the same keyframe.
-            probability: of a place that leads the search; None if it has been accepted.
+            T_odom_body: (4, 4) corrected odometry of the keyframe.
+            probability: of a place that leads the search; None for an accepted place.
         """
         if probability is None:
             self.estimator.measure_attitude(T_map_cloud, T_odom_body, _PLACE_TILT**2)
@@ -121,13 +121,13 @@ class FramePreparation:
 
 
 class OdometryCorrection:
-    """Odometry with its scale and its heading corrected, step by step; corrected steps stay as they are.
+    """Correction of odometry's scale and heading, step by step; turns are about the vertical.
 
-    Gravity stays odometry's: turns are about the vertical.
+    A corrected step does not change when the calibration does.
     """
 
     def __init__(self) -> None:
-        self._before: Pose | None = None  # as it came
+        self._before: Pose | None = None  # not corrected
         self._position = np.zeros(3)
         self._turned = 0.0
 
@@ -145,7 +145,7 @@ class OdometryCorrection:
         return self._corrected(T_odom_body)
 
     def move_to(self, T_odom_body: Pose) -> Pose:
-        """Go on from another pose (4, 4) than the newest corrected one; its roll and pitch stay odometry's."""
+        """Go on from another pose (4, 4) than the newest corrected pose; roll and pitch stay odometry's."""
         assert self._before is not None  # there is a newest one
         now = self._corrected(self._before)
         self._turned += float(log_so3(T_odom_body[:3, :3] @ now[:3, :3].T)[2])
@@ -153,7 +153,4 @@ class OdometryCorrection:
         return self._corrected(self._before)
 
     def _corrected(self, T_odom_body: Pose) -> Pose:
-        T = np.eye(4)
-        T[:3, :3] = exp_so3(np.array([0.0, 0.0, self._turned])) @ T_odom_body[:3, :3]
-        T[:3, 3] = self._position
-        return T
+        return pose_from(exp_so3(np.array([0.0, 0.0, self._turned])) @ T_odom_body[:3, :3], self._position)

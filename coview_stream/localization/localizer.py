@@ -14,7 +14,7 @@ from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.frame import Frame, FramePreparation
+from coview_stream.localization.frame import FramePreparation, PreparedFrame
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
@@ -28,7 +28,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
-_DEFERRED = 3.0  # times as far apart are registrations that are deferred
+_DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
 
 
 class Localizer:
@@ -37,8 +37,8 @@ class Localizer:
     Attributes:
         base_map: the map; may be shared by many localizers.
         config: how decisions are made.
-        state: the newest fix's state.
-        search: names its recognizers (``search.names``) and has the newest descriptors (``search.last_query``).
+        state: of the newest fix.
+        search: has the names of its recognizers (``names``) and the newest descriptors (``last_query``).
     """
 
     def __init__(
@@ -48,13 +48,13 @@ class Localizer:
         local_maps: LocalMaps | None = None,
         index: SearchIndex | None = None,
     ) -> None:
-        """Localize on a map, or on the one in a file.
+        """Localize on a map.
 
         Args:
             base_map: the map, or the path of its ``.coview`` file, which is loaded and checked.
             config: how decisions are made; None takes the defaults.
             local_maps: cache of crops of the map; localizers of one thread may share it.
-            index: likewise, of the search.
+            index: of the search; may be shared likewise.
 
         Raises:
             ConfigError: ``config`` is something else.
@@ -63,18 +63,18 @@ class Localizer:
             MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
         """
         if not isinstance(config, LocalizerConfig | None):
-            what = type(config).__name__
-            raise ConfigError(f"config is a {what}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")
+            kind = type(config).__name__
+            raise ConfigError(f"config is a {kind}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")
         if isinstance(base_map, str | os.PathLike):
             base_map = BaseMap.load(base_map)
         if not isinstance(base_map, BaseMap):
-            what = type(base_map).__name__
-            raise InputError(f"base_map is a {what}; give a BaseMap or the path of a .coview file")
+            kind = type(base_map).__name__
+            raise InputError(f"base_map is a {kind}; give a BaseMap or the path of a .coview file")
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
         self.search = GlobalSearch(base_map, self.config, self._local_maps, index)
-        self._restarts = itertools.count(1)  # of the search, numbered through
+        self._restarts = itertools.count(1)
         self.reset()
 
     def reset(self, epoch: int = 0) -> None:
@@ -89,7 +89,7 @@ class Localizer:
         The calibration of sensor and odometry and the site's ground offset stay.
 
         Args:
-            epoch: number of the odometry frame that follows; None if it is the same one.
+            epoch: number of the odometry frame that follows; None if odometry goes on.
         """
         odometry = self._requests.epoch.odometry if epoch is None else epoch
         ground = self._tracker.ground.metres
@@ -101,16 +101,16 @@ class Localizer:
         self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
         self._tracker.ground.restore(ground)
         self.state = State.SEARCHING
-        self._events: list[Event] = []  # that have changed the state since take_events
+        self._events: list[Event] = []  # since take_events
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
-        self._newest: Frame | None = None
+        self._newest: PreparedFrame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search's acceptance
-        self._wrong = 0.0  # probability that the place is wrong, by the newest registration
+        self._wrong = 0.0  # probability of a wrong place, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
     def __repr__(self) -> str:
-        """Return state, stamp of the newest frame, and map, in one line."""
+        """Return the state, the stamp of the newest frame and the map, in one line."""
         newest = "no frame yet" if self._newest is None else f"frame of {self._newest.stamp:.3f} s"
         return f"Localizer({self.state}, {newest}, on {self.base_map!r})"
 
@@ -126,7 +126,7 @@ class Localizer:
         return replace(self._frames.calibration, ground=self._tracker.ground.metres)
 
     def prepare(self) -> None:
-        """Compile and load now what the first search would: some seconds on a large map, once.
+        """Do the work that the first search would wait for: some seconds on a large map, once.
 
         Raises:
             InputError, DependencyError: the network of the learned features cannot be loaded.
@@ -137,7 +137,7 @@ class Localizer:
     # ---- one frame
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
-        """Localize by one more frame. Its steps are the headings of docs/method.md.
+        """Localize by one more frame; docs/method.md has the steps.
 
         Args:
             cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres, or (N, 4) with intensities that
@@ -163,21 +163,17 @@ class Localizer:
         return self.fix()
 
     def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
-        """:meth:`step` without the search, and so quick.
+        """:meth:`step` without the search: its arguments, and its errors.
 
         Args:
-            cloud: as for :meth:`step`.
-            T_odom_body: as for :meth:`step`.
-            stamp: as for :meth:`step`.
-            defer: the caller is behind: while tracking, put registrations off that can wait, to every third metre.
+            cloud: see there.
+            T_odom_body: see there.
+            stamp: see there.
+            defer: the caller is behind: while tracking, register every third metre where that is enough.
 
         Returns:
-            The search request, if any: hand it to a :class:`GlobalSearch`, on another thread or in
-            another process if you like, and its result to :meth:`apply_search_result`, between two frames. Meanwhile
-            frames go on.
-
-        Raises:
-            CloudError, RunError: as for :meth:`step`.
+            The search request, if any: give it to a :class:`GlobalSearch`, in any thread or process, and its result to
+            :meth:`apply_search_result` between two frames. Frames go on meanwhile.
         """
         frame, request = self._predict(cloud, T_odom_body, stamp)
         match = self._match_to_map(frame, defer) if self.state.has_place else None
@@ -186,9 +182,9 @@ class Localizer:
         return request
 
     def apply_search_result(self, result: SearchResult) -> None:
-        """Start tracking where a search has accepted a place, or keep its reason for not doing so.
+        """Track the place that a search has accepted, or note why it has accepted none.
 
-        A result from before a loss or a :meth:`reset` is ignored, and so is one that comes while a place is known.
+        A result from before a loss or a :meth:`reset` is ignored, as are all results while a place is known.
         """
         newest = self._newest
         if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
@@ -196,7 +192,7 @@ class Localizer:
         self._evidence = result.evidence
         registration = None if result.accepted is None else result.accepted.registration
         if registration is None:
-            if result.T_map_cloud is not None and result.evidence.evidence is not None:  # it has been registered
+            if result.T_map_cloud is not None and result.evidence.evidence is not None:  # a registered place leads
                 probability = result.evidence.confidence or 0.0
                 leader = self._frames.learn_place(result.T_map_cloud, result.T_odom_body, probability)
                 if self._frames.anchor is not None:
@@ -206,7 +202,7 @@ class Localizer:
             return
         self._handle(Event.PLACE_ACCEPTED)
         self._confidence = result.evidence.confidence or 0.0
-        assert result.T_map_cloud is not None  # the accepted place leads
+        assert result.T_map_cloud is not None  # an accepted place leads
         T_map_odom = self._frames.learn_place(result.T_map_cloud, result.T_odom_body)
         registration = registration._replace(T_map_source=T_map_odom)
         self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
@@ -226,8 +222,7 @@ class Localizer:
         calibration = self.calibration
         if self.state is not State.TRACKING or self._frames.anchor is None:
             return Fix(newest.stamp, self.state, evidence=evidence, calibration=calibration)
-        T_map_local = orthonormal(self._tracker.T_map_odom)
-        T_map_local = T_map_local @ newest.T_odom_body
+        T_map_local = orthonormal(self._tracker.T_map_odom) @ newest.T_odom_body
         T_map_body = pose_from(T_map_local[:3, :3], T_map_local[:3, 3] + self.base_map.origin)
         return Fix(
             newest.stamp,
@@ -250,13 +245,13 @@ class Localizer:
     # ---- knowledge of the caller
 
     def hint_pose(self, T_map_body: Pose) -> None:
-        """Hint that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
+        """Hint that the robot may be here at the next frame; holds until a place is accepted or :meth:`reset`.
 
-        A hint is never trusted: the search scores and judges it like any other hypothesis, as the one that votes name
-        last. Ignored while a place is known.
+        A hint is never trusted: the search judges it like the last hypothesis of the votes. Ignored while a place is
+        known.
 
         Args:
-            T_map_body: (4, 4) in the frame of the map's sources, as :attr:`Fix.T_map_body`, metres.
+            T_map_body: (4, 4) as :attr:`Fix.T_map_body`.
 
         Raises:
             RunError: it is not a finite rigid transform, or no place on this planet.
@@ -266,15 +261,15 @@ class Localizer:
             self._requests.hints.robot_at(local)
 
     def guess_place(self, guess: PlaceGuess, check: bool = True) -> None:
-        """Have the search try, from the next frame on, where somebody says that the robot is.
+        """Have the search try a guess of the robot's place, from the next frame on.
 
-        Never trusted: poses tried there are judged like those that the descriptors name; but with ``guess.within``
-        nothing outside that circle, widened by the metres driven meanwhile, is searched, until a place is accepted,
-        another guess comes or the search begins anew (:meth:`relocalize`). Ignored while a place is known.
+        A guess is never trusted: its poses are judged like the descriptors' hypotheses. But ``guess.within`` limits the
+        search to a circle, widened by the metres driven, until a place is accepted, another guess comes or the search
+        starts again (:meth:`relocalize`). Ignored while a place is known.
 
         Args:
             guess: of the place.
-            check: refuse one of no use; without, nothing is found where the map has no ground in the circle.
+            check: refuse a guess where the map has no ground; without, such a circle ends in no pose.
 
         Raises:
             InputError: it is no guess, or the map has no ground there.
@@ -291,9 +286,9 @@ class Localizer:
             self._requests.guess(guess)
 
     def hint_calibration(self, earlier: Calibration) -> None:
-        """Begin with an earlier calibration of this robot, less certain; it goes on being measured.
+        """Begin with an earlier calibration of this robot, less certain, and go on measuring it.
 
-        Ignored while a place is known, and as far as it is known better here.
+        Ignored while a place is known, and where the present calibration is more certain.
         """
         if self.state.has_place:
             return
@@ -302,18 +297,15 @@ class Localizer:
             self._tracker.ground.restore(earlier.ground)
 
     def require_verification(self) -> None:
-        """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
+        """Give no pose until new frames alone have verified the place: the robot may have been carried."""
         self._tracker.forget_scans()
         self._monitor.require_verification()
         self._handle(Event.VERIFICATION_REQUIRED)
 
     # ---- the steps
 
-    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Frame, SearchRequest | None]:
-        """Check a frame and move the predicted pose on by its odometry; return it and the search request, if any.
-
-        Nothing is searched for while a place is known.
-        """
+    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
+        """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
         searching = not self.state.has_place
         drift = self._tracker.odometry.drift.variances if searching else None
         frame = self._newest = self._frames.prepare(cloud, T_odom_body, stamp, drift)
@@ -331,8 +323,8 @@ class Localizer:
         self._evidence = KeyframeEvidence(stamp, self.state, request.reason, cause=request.cause)
         return frame, None
 
-    def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
-        """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
+    def _match_to_map(self, frame: PreparedFrame, defer: bool = False) -> MapMatch | None:
+        """Register the newest scans after a metre, a second, or when something looks wrong."""
         patience = _DEFERRED if defer else 1.0
         due = self._tracker.needs_registration(patience)
         waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds
@@ -343,9 +335,9 @@ class Localizer:
         return None
 
     def _update(self, match: MapMatch, ruling: Ruling) -> None:
-        """Correct the pose by a registration that is believed, and move on to the state that follows.
+        """Correct the pose by a registration that is believed, and change the state.
 
-        Its evidence is the next fix's, unless it only confirms the search's.
+        The next fix has its evidence, unless it only confirms the search's.
         """
         assert self._newest is not None  # the match is of the newest frame
         verdict, stamp = match.verdict, self._newest.stamp
@@ -364,13 +356,13 @@ class Localizer:
     # ---- states
 
     def _handle(self, event: Event) -> None:
-        """Move on to the state that an event leads to (docs/tracking.md has the table)."""
+        """Change the state by an event (docs/tracking.md has the table)."""
         before, self.state = self.state, next_state(self.state, event)
         if self.state is before:
             return
         self._events.append(event)
         if self.state is State.LOST:
-            # odometry may have jumped; or the sensor or the map is to blame, and where odometry leads is worth a try
+            # odometry may have jumped, or the sensor or the map is wrong: then odometry's way is worth a try
             self._requests.place_lost(self._tracker.T_map_odom)
             self._frames.forget_odometry()
             self._tracker.ground.restore(self._tracker.ground.metres)

@@ -1,4 +1,4 @@
-"""Localization of a recorded run, offline, and its files: trajectory, evidence, timings."""
+"""Offline localization of a recorded run, and its files: trajectory, evidence, timings."""
 
 from __future__ import annotations
 
@@ -26,11 +26,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.state import State
-from coview_stream.recordings.run import Frame, Run
-
-Progress = Callable[[int, int, Fix | None], None]
-"""Called with (frames done, frames, newest fix)."""
-
+from coview_stream.recordings.run import Run
 
 _TOLD = 3  # stretches without a pose that a summary names
 
@@ -43,10 +39,10 @@ class Interruption:
     """Successive frames after the first fix that have no pose.
 
     Attributes:
-        first: stamp of the first of them, seconds.
-        last: stamp of the last of them.
-        frames: their number.
-        reason: why the first of them has none.
+        first: stamp of the first frame, seconds.
+        last: stamp of the last frame.
+        frames: number of frames.
+        reason: why the first frame has none.
     """
 
     first: float
@@ -65,15 +61,15 @@ class RunResult:
 
     Attributes:
         frames: number of frames in the run.
-        fixes: one per frame that could be used, in order.
+        fixes: one per usable frame, in order.
         keyframes: evidence of every keyframe.
         skipped: file and reason of every frame that could not be used.
-        seconds: time each step took; empty if that is not known.
-        sources: recognizers that named places: "coview", "learned"; empty if that is not known.
-        query: descriptors of the keyframe that won the first fix, if there was one.
-        winner: its evidence: station and shift.
-        mount: where the run's lidar sits; None for the body itself.
-        driven: metres that odometry had driven at the first fix; None if that is not known.
+        seconds: time of each step; empty if not known.
+        query: descriptors of the keyframe of the first fix, if any.
+        winner: evidence of that keyframe.
+        sources: recognizers that named places: "coview", "learned"; empty if not known.
+        driven: metres that odometry had driven at the first fix; None if not known.
+        mount: of the run's lidar; None for the body itself.
     """
 
     frames: int
@@ -109,7 +105,7 @@ class RunResult:
 
     @property
     def interruptions(self) -> list[Interruption]:
-        """Where poses are missing after the first fix, in order; frames that were skipped are told apart."""
+        """Where poses are missing after the first fix, in order; skipped frames do not count."""
         out: list[Interruption] = []
         fixed, going_on = False, False
         for fix in self.fixes:
@@ -154,17 +150,23 @@ def locate(
     base_map: BaseMap,
     run: Run,
     config: LocalizerConfig | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int, Fix | None], None] | None = None,
     guess: PlaceGuess | None = None,
 ) -> RunResult:
     """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
 
-    A frame that cannot be read is skipped and noted. ``guess``, of the place at the first frame, is tried, not trusted
-    but for its circle.
+    A frame that cannot be read is skipped and noted.
+
+    Args:
+        base_map: the map.
+        run: the run.
+        config: of the localizer.
+        progress: called with the number of finished frames, of all frames, and the newest fix.
+        guess: of the place at the first frame; tried, and only its circle is trusted.
 
     Raises:
-        InputError: not one frame could be used; the message ends with the first frame's. Or the map has no ground where
-            the guess is.
+        InputError: no frame could be used (the message ends with the first frame's), or the map has no ground at the
+            guess.
     """
     localizer = Localizer(base_map, config)
     if guess is not None:
@@ -178,16 +180,23 @@ def locate(
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:
-            located.skipped.append(_named(str(error), run.frames_paths[index]))
+            path = run.frames_paths[index]  # which the localizer does not know
+            located.skipped.append(str(error) if path.name in str(error) else f"{path}: {error}")
             if progress:
                 progress(index + 1, len(run), None)
             continue
         located.seconds.append(time.perf_counter() - begin)
         here = frame.T_odom_body[:3, 3]
         driven, before = driven + (0.0 if before is None else float(np.linalg.norm(here - before))), here
-        if located.first is None and fix.T_map_body is not None:
-            located.driven = driven
-        _note(located, localizer, _in_file_frame(fix, frame))
+        if frame.origin.any() and fix.T_map_body is not None and fix.T_map_odom is not None:
+            # a single scan may be stored far from its zero: express the pose in the file's own coordinates
+            away = pose_from(np.eye(3), -frame.origin)
+            fix = replace(fix, T_map_body=fix.T_map_body @ away, T_map_odom=fix.T_map_odom @ away)
+        if located.winner is None and fix.T_map_body is not None:
+            located.driven, located.winner, located.query = driven, fix.evidence, localizer.search.last_query
+        if fix.evidence is not None and (not located.keyframes or located.keyframes[-1] is not fix.evidence):
+            located.keyframes.append(fix.evidence)
+        located.fixes.append(fix)
         if progress:
             progress(index + 1, len(run), fix)
     if not located.fixes:
@@ -200,8 +209,8 @@ def from_stream(
 ) -> RunResult:
     """Sort a node's published messages (JSON poses and statuses) under a run's frames, by stamp in seconds.
 
-    A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
-    have the state that the newest status before them names.
+    A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. Another frame
+    has the state of the newest status before it.
     """
     pose_at = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
     states = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
@@ -235,7 +244,7 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG):  # an earlier run's would contradict the new trajectory
+        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG):  # they would contradict the new trajectory
             (folder / name).unlink(missing_ok=True)
         posed = located.posed
         poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
@@ -247,37 +256,15 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
         raise InputError(f"{folder}: cannot write the results ({error.strerror}); choose another place") from error
 
 
-def _named(message: str, path: Path) -> str:
-    """Lead the message with the file, which the localizer does not know."""
-    return message if path.name in message else f"{path}: {message}"
-
-
-def _note(located: RunResult, localizer: Localizer, fix: Fix) -> None:
-    if fix.evidence is not None and (not located.keyframes or located.keyframes[-1] is not fix.evidence):
-        located.keyframes.append(fix.evidence)
-    if fix.T_map_body is not None and located.winner is None:
-        located.winner = fix.evidence
-        located.query = localizer.search.last_query
-    located.fixes.append(fix)
-
-
-def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
-    """Express the pose in the file's own coordinates: a single scan may be stored far from its zero."""
-    if fix.T_map_body is None or not frame.origin.any():
-        return fix
-    away = pose_from(np.eye(3), -frame.origin)
-    T_map_odom = None if fix.T_map_odom is None else fix.T_map_odom @ away
-    return replace(fix, T_map_body=fix.T_map_body @ away, T_map_odom=T_map_odom)
-
-
 def summary(located: RunResult) -> str:
-    """Say it in a few lines for a person."""
+    """Sum up a result in a few lines for a person."""
     posed = located.posed
     lines = [f"{'state':<18} {located.state.reported}", f"{'localized':<18} {len(posed)} of {located.frames} frames"]
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
-        lines.append(f"{'found':<18} {_found(located, posed[0])}")
+        where = "" if located.driven is None else f"after {located.driven:.1f} m: "
+        lines.append(f"{'found':<18} {where}wrong {one_in(1.0 - posed[0].confidence)}")
         lines.extend(f"{'without a pose':<18} {text}" for text in _interrupted(located))
         if located.calibration is not None:
             lines.extend(f"{'calibration':<18} {clause}" for clause in located.calibration.describe(located.mount))
@@ -292,7 +279,7 @@ def summary(located: RunResult) -> str:
 
 
 def _interrupted(located: RunResult) -> list[str]:
-    """Say where poses are missing after the first one: the longest stretches, in the order of the run."""
+    """Name the longest stretches without a pose after the first fix, in the order of the run."""
     gaps, begin = located.interruptions, located.fixes[0].stamp
     longest = sorted(gaps, key=lambda gap: -gap.frames)[:_TOLD]
     lines = [
@@ -304,8 +291,3 @@ def _interrupted(located: RunResult) -> list[str]:
         rest = sum(gap.frames for gap in gaps) - sum(gap.frames for gap in longest)
         lines.append(f"{rest} frames in {len(gaps) - _TOLD} more places: see result.json")
     return lines
-
-
-def _found(located: RunResult, first: Fix) -> str:
-    where = "" if located.driven is None else f"after {located.driven:.1f} m: "
-    return f"{where}wrong {one_in(1.0 - first.confidence)}"

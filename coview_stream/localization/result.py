@@ -1,4 +1,4 @@
-"""The localizer's answer to a frame: state, pose, covariance, and the evidence behind them."""
+"""Fixes: the localizer's answers to frames, with state, pose, covariance and evidence."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ _SHARES = tuple(f.name for f in fields(Evidence))
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """The evidence of one keyframe, and its decision.
+    """The evidence of one keyframe, and the decision on it.
 
     Attributes:
         stamp: seconds.
-        state: the state it led to.
+        state: after the decision.
         reason: one clause for people.
         score: evidence score of the best hypothesis, 0 if there is none.
-        rival: score of the most probable place elsewhere, as the field has it, 0 if there is none; not registered.
-        evidence: its parts, if a hypothesis could be registered.
-        station: winning station, if this keyframe searched.
-        shift: winning shift of the co-view descriptors; None if the place was found by learned features.
+        rival: score by the field of the most probable place elsewhere, not registered; 0 if there is none.
+        evidence: parts of the score, if a hypothesis could be registered.
+        station: winning station of a search.
+        shift: winning shift of the co-view descriptors; None if learned features named the place.
         cause: of the decision, while tracking; None from a search.
-        innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
-            from the ones before; None where nothing could be registered, and from a search.
-        confidence: posterior probability that the robot is at the most probable place, or where it is tracked.
+        innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and odometry's
+            prediction; None without a registration, and from a search.
+        confidence: posterior probability that the robot is at the most probable or tracked place.
         by_chance: expected number of places of the map that would fit as well by chance; None while tracking.
     """
 
@@ -60,7 +60,7 @@ class KeyframeEvidence:
     by_chance: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for ``result.json`` and the status: always the same keys, None where a value is not known."""
+        """Plain data for ``result.json`` and the status: always the same keys, None for an unknown value."""
         shares = {} if self.evidence is None else vars(self.evidence)
         parts = {n: round(shares[n], 4) if n in shares else None for n in _SHARES}
         return {
@@ -80,10 +80,7 @@ class KeyframeEvidence:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
-        """Read back :meth:`to_json`'s data; KeyError or ValueError if it is something else.
-
-        Earlier versions left out the shares that were not known, the cause, the innovation and the places by chance.
-        """
+        """Read back data of :meth:`to_json`, also with the fewer keys of earlier versions; KeyError or ValueError."""
         has_shares = data.get(_SHARES[0]) is not None
         parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if has_shares else None
         return cls(
@@ -103,7 +100,7 @@ class KeyframeEvidence:
 
 
 def _number(value: float | None, form: str) -> float | None:
-    """Round a number by its format; None where there is none, or none that JSON can say."""
+    """Round a number by its format; None for none, and for a number that JSON cannot hold."""
     return None if value is None or not math.isfinite(value) else float(f"{value:{form}}")
 
 
@@ -112,22 +109,21 @@ class Fix:
     """The localizer's answer to one frame. Two are equal only if they are the same object.
 
     Attributes:
-        stamp: seconds, of the frame.
+        stamp: of the frame, seconds.
         state: see :class:`~coview_stream.localization.state.State`.
         T_map_body: (4, 4) float64 in the frame of the map's sources; None unless TRACKING.
-        T_map_odom: (4, 4) float64, the correction behind it; None unless TRACKING.
+        T_map_odom: (4, 4) float64 correction of odometry; None unless TRACKING.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
             rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
-            map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
-            of x, y and z, metres, is ``fix.stddev[:3]``.
-        confidence: in [0, 1]: probability that the robot is at this place and not at another or none, as the search
-            that found it has it or, if that is less, the newest registration: see docs/integrity.md. 0 unless TRACKING.
+            map, without the error of its georeferencing, and calibrated on simulated drives: see docs/tracking.md. One
+            sigma of x, y and z, metres, is ``fix.stddev[:3]``.
+        confidence: probability in [0, 1] that the robot is at this place, by the search that found it or by the newest
+            registration, whichever is less: see docs/integrity.md. 0 unless TRACKING.
         evidence: of the newest keyframe, None before the first.
-        drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
+        drift: rates of odometry's drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
             see docs/tracking.md; None unless TRACKING.
-        calibration: corrections of the sensor's tilt and of odometry, in any state: it is estimated from the
-            first two keyframes on.
+        calibration: corrections of the sensor's tilt and of odometry, in any state, from the second keyframe on.
     """
 
     stamp: float
@@ -162,10 +158,9 @@ class Fix:
         return None if self.covariance is None else stddev_of(self.covariance)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data, the names as in pose messages: always the same keys, None where a value is not known.
+        """Plain data with the names of pose messages: always the same keys, None for an unknown value.
 
-        ``state`` is the reported one, of four; ``orientation`` is x, y, z, w; ``covariance`` is in rows;
-        ``T_map_odom`` is four rows.
+        ``state`` is one of the four that are reported; ``orientation`` is x, y, z, w; matrices are in rows.
         """
         pose: dict[str, Any] = dict.fromkeys(("position", "orientation", "covariance"))
         if self.T_map_body is not None:

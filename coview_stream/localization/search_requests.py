@@ -10,7 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import RangeImage
-from coview_stream.localization.frame import Frame, FramePreparation
+from coview_stream.localization.frame import FramePreparation, PreparedFrame
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.search.hints import PlaceGuess, PoseHints, robot_position
 from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
@@ -49,7 +49,7 @@ class SearchRequests:
         self._buffer = KeyframeBuffer(config.keyframe, max(radius, spec.reach or 0.0))
         self._odometry_check = OdometryCheck()
 
-    def add(self, frame: Frame, travelled: float) -> SearchRequest | NoSearch | None:
+    def add(self, frame: PreparedFrame, travelled: float) -> SearchRequest | NoSearch | None:
         """Add a frame after ``travelled`` metres; return the request of the keyframe that it completes, if any."""
         anchor, calibration = self._frames.anchor, self._frames.calibration
         assert anchor is not None  # a frame has been prepared

@@ -1,4 +1,4 @@
-"""The decision on a search: a place is accepted once the probability that it is wrong is below the integrity risk."""
+"""Acceptance: a place is accepted once the probability that it is wrong is below the integrity risk."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Considered:
     """The most probable places of a robot at a keyframe, for people to look at; nothing is decided by them.
 
     Attributes:
-        stamp: seconds, of the keyframe.
-        places: (K, 6) float64, the most probable first: x, y, z and yaw of the body in the frame of the map's sources
-            (metres, radians), the posterior probability, and the log-likelihood ratio against chance.
+        stamp: of the keyframe, seconds.
+        places: (K, 6) float64, most probable first: x, y, z and yaw of the body in the frame of the map's sources
+            (metres, radians), posterior probability, log-likelihood ratio against chance.
         none: probability that the robot is at no place of the map.
     """
 
@@ -45,7 +45,7 @@ class Considered:
 
     @classmethod
     def of(cls, scored: Scored, request: SearchRequest, origin: Floats) -> Considered | None:
-        """Sum up a keyframe's places; ``origin`` (3,) is the map's; None without any place."""
+        """Sum up a keyframe's places on a map of ``origin`` (3,); None without any place."""
         rows = []
         for place in sorted(scored.places, key=lambda place: -place.probability)[:MAX_PLACES]:
             T_map_body = place.T_map_odom @ request.T_odom_body
@@ -58,16 +58,15 @@ class SearchResult:
     """Result of one keyframe's search.
 
     Attributes:
-        accepted: the registered place, once there is one.
-        evidence: of the most probable place, with the state it leads to and the reason.
+        accepted: the registered place; None if none is accepted.
+        evidence: of the most probable place, with the resulting state and the reason.
         travelled: metres that odometry had driven at the keyframe.
-        epoch: the request's.
-        rivals: all places that the keyframe was scored at, the most probable among them.
-        leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
-            without any place.
+        epoch: of the request.
+        rivals: all places that the keyframe was scored at.
+        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded; None without any place.
         T_odom_body: (4, 4) of the keyframe.
-        calibration: levelled the keyframe's clouds.
-        considered: the most probable places, for people to look at; None where none was scored.
+        calibration: has levelled the keyframe's clouds.
+        considered: the most probable places, for people to look at; None without any place.
     """
 
     accepted: Hypothesis | None
@@ -82,10 +81,8 @@ class SearchResult:
 
     @property
     def T_map_cloud(self) -> Pose | None:
-        """(4, 4) the leader's pose of the keyframe's cloud in the sensor's own axes; None without a leader."""
-        if self.leader is None:
-            return None
-        return self.leader @ self.T_odom_body @ self.calibration.T_body_cloud
+        """(4, 4) pose of the keyframe's cloud in the sensor's own axes, by the leader; None without a leader."""
+        return None if self.leader is None else self.leader @ self.T_odom_body @ self.calibration.T_body_cloud
 
 
 def decide(
@@ -94,11 +91,11 @@ def decide(
     """Judge a keyframe.
 
     Args:
-        scored: the places, the most probable first.
+        scored: the places.
         leader: the most probable place, registered; None if that failed.
-        request: the keyframe.
+        request: of the keyframe.
         rule: the integrity risk.
-        undecided: metres between poses of the first place that are as probable; 0 if one is more probable than all.
+        undecided: metres between equally probable poses of the first place; 0 if one of them stands out.
     """
     state, reason = _verdict(scored, leader, rule, undecided)
     if request.area is not None and state is not State.TRACKING:
@@ -146,14 +143,10 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
         return State.SEARCHING, f"no place stands out: {scored.by_chance:.0f} places would fit as well by chance"
     best, second = scored.places[0], scored.second
     if second is not None and second.probability > scored.none:
-        return State.AMBIGUOUS, f"two places fit: {_apart(best, second)}"
+        times = best.probability / max(second.probability, 1e-300)
+        ratio = f"{times:,.0f}" if times < 1e6 else "over 1,000,000"
+        lead = "equally" if times < 1.5 else f"the first is {ratio} times as probable"
+        return State.AMBIGUOUS, f"two places fit: {lead}"
     if scored.error >= 0.5:
         return State.AMBIGUOUS, "several places fit, none is more likely than all others"
     return State.AMBIGUOUS, f"one place leads: wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
-
-
-def _apart(best: Hypothesis, second: Hypothesis) -> str:
-    times = best.probability / max(second.probability, 1e-300)
-    if times < 1.5:
-        return "equally"
-    return f"the first is {f'{times:,.0f}' if times < 1e6 else 'over 1,000,000'} times as probable"

@@ -8,13 +8,14 @@ While the error exceeds the risk, the robot drives on along the longest open way
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
+from coview_stream.basemap.progress import Progress
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 from coview_stream.geometry.rasters import min_filter
@@ -54,9 +55,6 @@ _NOISE = 0.03  # metres
 _CHANGE_PATCH = 4.0  # metres: edge of a patch that changes as one
 _MOVED = (3.0, 6.0)  # metres of its shift
 _TABLE = 64  # patches until the random draws repeat
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Global search: from the newest keyframe to scored hypotheses, and the decision when to believe one."""
+"""Global search: hypotheses from a keyframe, their scores, and the decision whether to accept one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from coview_stream.localization.search.request import Epoch, RequestSpec, Search
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
-_GUESSES = 12  # places of a guess that are tried at a keyframe
+_GUESSES = 12  # poses of a guess that are tried at a keyframe
 
 
 class GlobalSearch:
@@ -36,10 +36,9 @@ class GlobalSearch:
     """
 
     KERNELS = (
-        "transform_unique", "polar_bin", "distinct_poses", "field_scores", "align_planes",
-        "crop_points",
+        "transform_unique", "polar_bin", "distinct_poses", "field_scores", "align_planes", "crop_points",
     )  # fmt: skip
-    """Names of the kernels that it runs, for :func:`coview_kernels.warm_up`."""
+    """Names of its kernels, for :func:`coview_kernels.warm_up`."""
 
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, index: SearchIndex | None = None
@@ -48,13 +47,18 @@ class GlobalSearch:
         self.base_map = base_map
         # GICP would have to prepare the map at each of many places, and tracking starts with it anyway
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
-        index = index or SearchIndex.of(base_map, config)
-        self.coview, self.learned = _recognizers(base_map, config, index)
-        self._recognizers: list[CoViewRecognizer | PlaceRecognizer] = [
-            recognizer for recognizer in (self.coview, self.learned) if recognizer is not None
-        ]
+        self._index = index = index or SearchIndex.of(base_map, config)
+        self.coview: CoViewRecognizer | None = None
+        self.learned: PlaceRecognizer | None = None
+        if index.retrieval is not None:
+            peaks = coview_peaks(config.consensus.peaks, len(base_map))
+            self.coview = CoViewRecognizer(base_map, config, index.retrieval, peaks)
+        if index.learned is not None:
+            from coview_stream.localization.search.learned.matcher import LearnedRecognizer
+
+            self.learned = LearnedRecognizer(base_map, config, index.learned)
+        self._recognizers: list[PlaceRecognizer] = [r for r in (self.coview, self.learned) if r is not None]
         self._local_maps = local_maps
-        self._index = index
         self._scorer = PlaceScorer(base_map)
         self._epoch = Epoch()
         self.clear()
@@ -66,7 +70,7 @@ class GlobalSearch:
 
     @property
     def spec(self) -> RequestSpec:
-        """Data that its requests have to bring."""
+        """Data that the search needs in its requests."""
         return RequestSpec(
             None if self.coview is None else self.base_map.descriptor_config,
             None if self.learned is None else self.config.learned.reach,
@@ -78,7 +82,7 @@ class GlobalSearch:
         return {} if self.coview is None else self.coview.last_query
 
     def prepare(self) -> None:
-        """Load and compute now what the first update would wait for.
+        """Do the work that the first update would wait for.
 
         Raises:
             InputError, DependencyError: the network of the learned features cannot be loaded.
@@ -101,7 +105,7 @@ class GlobalSearch:
             self.coview.last_query = {}
 
     def update(self, request: SearchRequest) -> SearchResult:
-        """Search the map for one keyframe; another epoch, or an acceptance, begins a new search."""
+        """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
         if request.epoch != self._epoch:
             self.clear()
             self._epoch = request.epoch
@@ -133,15 +137,13 @@ class GlobalSearch:
 
     def _propose(self) -> tuple[list[Hypothesis], list[int]]:
         """Return the hypotheses of the votes, and the rank of each in its recognizer's votes."""
-        lists = [recognizer.hypotheses() for recognizer in self._recognizers]
-        return [place for ranked in lists for place in ranked], [
-            rank for ranked in lists for rank in range(len(ranked))
-        ]
+        ranked = [(place, rank) for r in self._recognizers for rank, place in enumerate(r.hypotheses())]
+        return [place for place, _ in ranked], [rank for _, rank in ranked]
 
     def _guessed(self, request: SearchRequest, scan: ObservedScan) -> list[Hypothesis]:
-        """Return the best few poses of a guess, on the ground; seldom, once they have been tried.
+        """Return the best few poses of a guess, on the ground, each time that they are due.
 
-        All of them, around one place, would be taken for the chance places of this map.
+        All poses around one place would be taken for the chance places of this map.
         """
         due = self._guesses.due(request.guesses)
         if not due:
@@ -156,7 +158,7 @@ class GlobalSearch:
         return [guesses[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
     def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Hypothesis | None:
-        """Register the most probable place; None if it comes to another one, or leans."""
+        """Register the most probable place; None if that leads to another place or leans."""
         if not scored.places:
             return None
         best = scored.places[0]
@@ -177,22 +179,8 @@ class GlobalSearch:
 
 
 def coview_peaks(configured: int, stations: int) -> int:
-    """Return how many hypotheses the co-view votes on so many stations come to.
+    """Return the number of co-view hypotheses on a map of so many stations.
 
-    On an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums, too.
+    On an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums too.
     """
     return round(configured * math.sqrt(math.sqrt(max(1.0, stations / _ORDINARY))))
-
-
-def _recognizers(
-    base_map: BaseMap, config: LocalizerConfig, index: SearchIndex
-) -> tuple[CoViewRecognizer | None, PlaceRecognizer | None]:
-    """Return the recognizers by descriptors and by learned features, each None where it is not used."""
-    learned: PlaceRecognizer | None = None
-    if index.learned is not None:
-        from coview_stream.localization.search.learned.matcher import LearnedRecognizer
-
-        learned = LearnedRecognizer(base_map, config, index.learned)
-    peaks = coview_peaks(config.consensus.peaks, len(base_map))
-    coview = None if index.retrieval is None else CoViewRecognizer(base_map, config, index.retrieval, peaks)
-    return coview, learned

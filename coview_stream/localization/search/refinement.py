@@ -1,8 +1,8 @@
-"""Refinement: registration of the most probable place (eq. 13), and the modes of an accepted one.
+"""Refinement: registration of the most probable place (eq. 13), and the modes of a place that may be accepted.
 
-A place is all poses within two metres of its best. Registration converges to the nearest fitting pose; where the scan
-shows little, or the site has changed, that may lie a metre off. So an accepted place is registered from poses all
-around, and the results are weighed by the log-likelihood ratio of the scan, as places are.
+A place is all poses within two metres of its best pose. Registration converges to the nearest fitting pose; where the
+scan shows little, or the site has changed, that may be a metre off. So registration also starts from poses all around,
+and the results are weighed by the scan's log-likelihood ratio, as places are.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 
-_WIDEST = 1.0  # metres: coarser scales are not needed, as places are scored at the best pose near them
-_EVERY = 3  # of the scan's points is registered: the score is the same to 0.002 and the pose to a centimetre
-_AROUND = 1.2  # metres between a place and the poses around it: a little more than registration reaches
+_WIDEST = 1.0  # metres: coarser scales are not needed after scoring, which moves to the best pose nearby
+_EVERY = 3  # one of three points is registered: it changes the score by 0.002 and the pose by a centimetre
+_AROUND = 1.2  # metres to the other starts: a little more than registration reaches
 _DIRECTIONS = 8
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # nearer poses are one mode
 
@@ -38,9 +38,9 @@ class Modes:
     """The modes of a place.
 
     Attributes:
-        best: the most probable one.
-        distances: (M,) metres from the best one.
-        probabilities: (M,), which add up to one.
+        best: the most probable mode.
+        distances: (M,) metres from the best mode.
+        probabilities: (M,) sum up to one.
     """
 
     best: Hypothesis
@@ -62,14 +62,15 @@ def register_place(
 ) -> Hypothesis | None:  # fmt: skip
     """Register a scan at a place; None off the map, with too few pairs, or if the result leans.
 
-    ``start`` (4, 4) is the ``T_map_odom`` that registration begins at, by default the place's.
+    Registration starts at ``start`` (4, 4), a ``T_map_odom``, by default the place's.
     """
     settings, T = config.registration, place.T_map_odom if start is None else start
     scales = tuple(scale for scale in settings.search if scale <= _WIDEST) or settings.search[-1:]
     target = local_maps.around(transform(T, scan.body[None])[0])
     if target is None:
         return None
-    upright = Prior(pose_from(rot_z(yaw_of(T)), T[:3, 3]), gravity_information(settings.gravity_sigma))
+    level = settings.gravity_sigma**-2  # over (rx, ry, rz, x, y, z): both frames are level
+    upright = Prior(pose_from(rot_z(yaw_of(T)), T[:3, 3]), np.diag([level, level, 0.0, 0.0, 0.0, 0.0]))
     registration = register(scan.cloud.every(_EVERY), T, target, settings, scales, upright, scan.body)
     if registration is None or tilt_of(registration.T_map_source) > config.acceptance.max_tilt:
         return None
@@ -93,21 +94,17 @@ def find_modes(
     _, background = observe_with_background(base_map.field, scan, poses[:1])
     observed = scan.many.look_up(base_map.field, scan.poses(poses), Move.NONE)
     ratios = log_likelihood_ratios(observed.shares, background)
+
+    def gap(k: int, other: int) -> tuple[float, float]:
+        """Metres and radians between two poses of the robot."""
+        step = boxminus(poses[k] @ scan.T_odom_body, poses[other] @ scan.T_odom_body)
+        return float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3]))
+
     modes: list[int] = []
-    for k in np.argsort(-ratios, kind="stable"):
-        if not any(_same(poses[k], poses[j], scan.T_odom_body) for j in modes):
-            modes.append(int(k))
+    for k in np.argsort(-ratios, kind="stable").tolist():
+        gaps = (gap(k, mode) for mode in modes)
+        if not any(metres < _SAME_METRES and radians < _SAME_RADIANS for metres, radians in gaps):
+            modes.append(k)
     weights = np.exp(ratios[modes] - ratios[modes[0]])
-    metres = [_apart(poses[k], poses[modes[0]], scan.T_odom_body)[0] for k in modes]
+    metres = [gap(k, modes[0])[0] for k in modes]
     return Modes(candidates[modes[0]], np.array(metres), weights / weights.sum())
-
-
-def _same(T_map_odom: Pose, T_other: Pose, T_odom_body: Pose) -> bool:
-    metres, radians = _apart(T_map_odom, T_other, T_odom_body)
-    return metres < _SAME_METRES and radians < _SAME_RADIANS
-
-
-def _apart(T_map_odom: Pose, T_other: Pose, T_odom_body: Pose) -> tuple[float, float]:
-    """Return the distance between the robot's poses: metres, radians."""
-    gap = boxminus(T_map_odom @ T_odom_body, T_other @ T_odom_body)
-    return float(np.linalg.norm(gap[3:])), float(np.linalg.norm(gap[:3]))
