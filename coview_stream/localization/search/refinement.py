@@ -69,8 +69,7 @@ def register_place(
     target = local_maps.around(transform(T, scan.body[None])[0])
     if target is None:
         return None
-    level = settings.gravity_sigma**-2  # over (rx, ry, rz, x, y, z): both frames are level
-    upright = Prior(pose_from(rot_z(yaw_of(T)), T[:3, 3]), np.diag([level, level, 0.0, 0.0, 0.0, 0.0]))
+    upright = Prior(pose_from(rot_z(yaw_of(T)), T[:3, 3]), gravity_information(settings.gravity_sigma))
     registration = register(scan.cloud.every(_EVERY), T, target, settings, scales, upright, scan.body)
     if registration is None or tilt_of(registration.T_map_source) > config.acceptance.max_tilt:
         return None
