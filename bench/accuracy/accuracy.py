@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered
-from bench.harness.rows import Row, bounded, informs, judged, number, table
+from bench.harness.rows import Row, bounded, informs, judged, listed
 from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, prepared_run, world_name
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
@@ -52,12 +52,6 @@ DIRTY_WORLDS = (
 """Two drives at 8 m/s and two at walking pace, on seeds that nothing was tuned on; the first is the quick one."""
 
 _OF_THE_MAP = frozenset(("strips", "density", "seasons", "years"))  # kinds that need a map of their own
-
-_HEAD = (
-    "world", "size", "changed", "UTM", "driven m", "map Mpts", "success", "false", "posed %", "e_t m",
-    "e_r deg", "first m", "p50 ms", "locate s", "MB",
-)  # fmt: skip
-_DIRT_HEAD = ("dirt", "found", "false", "posed %", "first m", "rmse t m", "rmse r deg", "last reason where not found")
 
 Run = dict[str, Any]  # figures of ``evaluate`` and of the process
 
@@ -91,8 +85,6 @@ def measure(world: Path, site: Path, inside: bool) -> Run:
         "p50_ms": round(1e3 * float(np.median(located.seconds)), 2),
         "megabytes": peak_megabytes(),
         "map_points": len(base_map.points),
-        "state": located.state.reported,
-        "reason": located.keyframes[-1].reason if located.keyframes else "",
         "frames": located.frames,
         "posed": len(located.posed),
     }
@@ -131,18 +123,29 @@ def run_one(below: Path, run: SimulationConfig, site: SimulationConfig, call: Ca
     return result | {"name": name, "run": run.to_dict(), "outside": outside}
 
 
-def cells(run: Run) -> list[str]:
-    """One line of the table."""
-    world, frames, points = run["run"], run.get("frames"), run.get("map_points")
+COLUMNS = (
+    ("world", "name", None), ("size", "size", 0), ("changed", "changed", None), ("UTM", "utm", None),
+    ("driven m", "length", 0), ("map Mpts", "map_mpts", 2), ("success", "success", None), ("false", "false_frames", 0),
+    ("posed %", "share", 1), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 3), ("first m", "first_fix_m", 1),
+    ("p50 ms", "p50_ms", 0), ("locate s", "locate_s", 0), ("MB", "megabytes", 0),
+)  # fmt: skip
+DIRT_COLUMNS = (
+    ("dirt", "dirt", None), ("found", "found", None), ("false", "false_frames", 0), ("posed %", "share", 1),
+    ("first m", "first_fix_m", 1), ("rmse t m", "rmse_t", 3), ("rmse r deg", "rmse_r", 3),
+)  # fmt: skip
+
+
+def figures(run: Run) -> Run:
+    """Return the figures of a run for the table."""
+    world, frames = run["run"], run.get("frames")
     means = [(run.get(key) or {}).get("mean") for key in ("translation", "rotation")]
-    return [
-        run["name"] + ("!" if "error" in run else ""), f"{world['size']:.0f}", f"{world['changed']:.0%}",
-        "yes" if any(world["origin"]) else "no", f"{world['length']:.0f}",
-        number(points / 1e6 if points else None, 2), "yes" if run["success"] else "NO", str(run["false_frames"]),
-        number(100 * run["posed"] / frames if frames else None, 1), *(number(mean, 3) for mean in means),
-        number(run.get("first_fix_m"), 1), number(run.get("p50_ms"), 0), number(run.get("locate_s"), 0),
-        number(run.get("megabytes"), 0),
-    ]  # fmt: skip
+    known: Run = dict.fromkeys(key for _, key, digits in COLUMNS if digits is not None)
+    return known | world | run | {
+        "name": run["name"] + "!" * ("error" in run), "changed": f"{world['changed']:.0%}",
+        "utm": "yes" if any(world["origin"]) else "no", "map_mpts": run.get("map_points", np.nan) / 1e6,
+        "success": "yes" if run["success"] else "NO", "share": 100 * run["posed"] / frames if frames else None,
+        "e_t": means[0], "e_r": means[1],
+    }  # fmt: skip
 
 
 def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
@@ -181,39 +184,21 @@ def total(kind: str, runs: Sequence[Run]) -> Row:
     """Row of one kind of dirt over all worlds: means over the runs; the median first fix counts no fix as endless."""
     posed = [100.0 * run["posed"] / run["frames"] if run.get("frames") else 0.0 for run in runs]
     first = [np.inf if run.get("first_fix_m") is None else run["first_fix_m"] for run in runs]
-    rmse = {
-        key: [run[key]["rmse"] for run in runs if run.get(key) and run[key].get("rmse") is not None]
-        for key in ("translation", "rotation")
-    }
-    figures = {
-        "dirt": kind,
-        "found": sum(bool(run["success"]) for run in runs),
-        "runs": len(runs),
-        "false_frames": sum(run["false_frames"] for run in runs),
-        "posed_share": float(np.mean(posed)),
-        "first_fix_m": float(np.median(first)),
-        "rmse_t": float(np.mean(rmse["translation"])) if rmse["translation"] else None,
-        "rmse_r": float(np.mean(rmse["rotation"])) if rmse["rotation"] else None,
-        "each": list(runs),
-    }
-    return informs(f"accuracy/dirt {kind}: posed", figures["posed_share"], "%", figures)
-
-
-def dirt_cells(figures: Run) -> list[str]:
-    """One line of the table of dirt."""
-    first, lost = figures["first_fix_m"], [run for run in figures["each"] if not run["success"]]
-    why = "; ".join(dict.fromkeys(str(run.get("error") or run.get("reason") or "-") for run in lost))
-    return [
-        figures["dirt"], f"{figures['found']} of {figures['runs']}", str(figures["false_frames"]),
-        number(figures["posed_share"], 1), number(first if first is not None and np.isfinite(first) else None, 1),
-        number(figures["rmse_t"], 3), number(figures["rmse_r"], 3), why,
-    ]  # fmt: skip
+    names = {"rmse_t": "translation", "rmse_r": "rotation"}
+    rmse = {key: [run[key]["rmse"] for run in runs if run.get(key)] for key in names.values()}
+    runs_found = sum(bool(run["success"]) for run in runs)
+    about = {
+        "dirt": kind, "found": f"{runs_found} of {len(runs)}", "false_frames": sum(run["false_frames"] for run in runs),
+        "share": float(np.mean(posed)), "first_fix_m": float(np.median(first)), "runs": list(runs),
+        **{name: float(np.mean(rmse[key])) if rmse[key] else None for name, key in names.items()},
+    }  # fmt: skip
+    return informs(f"accuracy/dirt {kind}: posed", about["share"], "%", about)
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the part that is measured, and the dirt."""
     parser.add_argument("--only", choices=("worlds", "dirt"), help="one of the two parts")
-    parser.add_argument("--kinds", nargs="+", default=list(DIRTS), choices=DIRTS, metavar="DIRT")
+    parser.add_argument("--kinds", nargs="+", default=list(DIRTS), choices=DIRTS, metavar="DIRT", help="of dirt (all)")
     drives = range(1, len(DIRTY_WORLDS) + 1)
     parser.add_argument("--drives", type=int, default=drives[-1], choices=drives, help="so many of the dirty drives")
 
@@ -239,7 +224,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """All runs, and all kinds of dirt."""
-    runs = [row.details for row in rows if row.details and "dirt" not in row.details]
+    runs = [figures(row.details) for row in rows if row.details and "dirt" not in row.details]
     kinds = [row.details for row in rows if "dirt" in row.details]
-    out = {"": table(_HEAD, [cells(run) for run in runs])} if runs else {}
-    return out | ({"dirt": table(_DIRT_HEAD, [dirt_cells(kind) for kind in kinds])} if kinds else {})
+    parts = {"": (COLUMNS, runs), "dirt": (DIRT_COLUMNS, kinds)}
+    return {name: listed(columns, found) for name, (columns, found) in parts.items() if found}

@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bench.harness.rows import Row, informs, number, table
+from bench.harness.rows import Row, informs, listed
 from coview_stream.basemap.ground import GroundConfig, ground_mask
 from coview_stream.clouds import read_cloud
 from coview_stream.errors import InputError
@@ -34,15 +34,11 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for method in METHODS:
             mask = ground_mask(cloud.points, GroundConfig(method=method))
             errors = [100 * each.mean() for each in (~mask[label], mask[~label], label != mask)]
-            about = {"file": file.name, "errors": errors}
+            about = {"file": file.name, "method": method, "I": errors[0], "II": errors[1], "total": errors[2]}
             yield informs(f"ground/{file.name}, {method}: total error", errors[2], "%", about)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """One line per file, both methods side by side."""
-    shown: dict[str, list[str]] = {}
-    for row in rows:
-        errors = " / ".join(number(each, 2) for each in row.details["errors"])
-        shown.setdefault(row.details["file"], []).append(errors)
-    head = ("file", *(f"{method} I / II / total" for method in METHODS))
-    return {"": table(head, [[file, *cells] for file, cells in shown.items()])}
+    """One line per file and method."""
+    heads = (("file", "file", None), ("method", "method", None), ("I", "I", 2), ("II", "II", 2), ("total", "total", 2))
+    return {"": listed(heads, [row.details for row in rows])}

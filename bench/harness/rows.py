@@ -155,7 +155,7 @@ def listed(columns: Sequence[tuple[str, str, int | None]], figures: Iterable[Map
 
 def number(value: float | None, digits: int) -> str:
     """Write a number, or a dash for none."""
-    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
+    return NOTHING if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def _figure(value: float | None) -> str:
