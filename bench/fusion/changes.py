@@ -1,4 +1,4 @@
-"""What ``fuse --changes`` tags, and what it leaves out as moving, against the truth of simulated worlds.
+"""Points that ``fuse --changes`` tags or leaves out as moving, against the truth of simulated worlds.
 
 Sites surveyed from the air, ten years later, after one drive of 60 m. Truth is the distance of each point to all
 surfaces of the world then and now. A point of the run is truly new if it lies on a surface now (within 0.4 m: crowns
@@ -10,6 +10,7 @@ the map within 25 m of the way, seen or not.
 
 from __future__ import annotations
 
+import itertools
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,17 +29,13 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.localization.offline import locate, write
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig, parse_dirt, simulate
-from coview_stream.sim.mesh import Mesh
 from coview_stream.sim.scenes import SceneState
 from coview_stream.sim.simulate import scene_of
 
 _WORLDS = (("town", "os64", 6101), ("village", "vlp16", 6102), ("industrial", "os64", 6103), ("campus", "vlp16", 6104))
 _DIRT = "traffic,years"
 _ON, _OFF, _APART = 0.4, 0.3, 0.5  # metres
-_COLUMNS = (
-    *("new", "precision", "recall", "gone", "precision", "recall"),
-    *("left out as moving", "of these standing", "of all that stands"),
-)
+_TAGS = ("new", "gone")
 
 
 def options(parser: ArgumentParser) -> None:
@@ -52,21 +49,20 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for scene, sensor, seed in chosen:
         config = SimulationConfig(scene, sensor, seed, size=160.0, length=60.0, changed=0.4, dirt=parse_dirt(_DIRT, 0))
         figures = measure(config, folder() / f"changes-{scene}-{sensor}-{seed}")
-        said = f"new {_pair(figures['new'])}, gone {_pair(figures['gone'])}"
-        yield Row(f"changes/{scene}, {sensor}", text=said, details={"world": f"{scene}, {sensor}", **figures})
+        text = ", ".join(f"{tag}: precision {p:.0%}, recall {r:.0%}" for tag in _TAGS for _, p, r in [figures[tag]])
+        yield Row(f"changes/{scene}, {sensor}", text=text, details={"world": f"{scene}, {sensor}", **figures})
 
 
 def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
     """Lay out a line for each world."""
     lines = []
     for figures in (row.details for row in rows):
-        cells = [str(figures["world"])]
-        for name in ("new", "gone"):
-            count, precision, recall = figures[name]
-            cells += [f"{count:,}", f"{precision:.0%}", f"{recall:.0%}"]
+        tags = [(f"{n:,}", f"{precision:.0%}", f"{recall:.0%}") for n, precision, recall in map(figures.get, _TAGS)]
         count, standing, lost = figures["moving"]
-        lines.append([*cells, f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
-    return {"": table(("world", *_COLUMNS), lines)}
+        lines.append([figures["world"], *itertools.chain(*tags), f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
+    heads = [(tag, "precision", "recall") for tag in _TAGS]
+    moving = ("left out as moving", "of these standing", "of all that stands")
+    return {"": table(("world", *itertools.chain(*heads), *moving), lines)}
 
 
 def measure(config: SimulationConfig, place: Path) -> dict[str, Any]:
@@ -116,22 +112,15 @@ def _moving(whole: Fused, fused: Fused, now: SceneState, origin: Floats) -> tupl
 
 def distance(state: SceneState, points: Floats) -> Floats32:
     """Return the distance (N,) of points (N, 3), scene frame, to the nearest surface, foliage included."""
-    return np.minimum(_to_mesh(state.solid, points), _to_mesh(state.foliage, points))
-
-
-def _to_mesh(mesh: Mesh, points: Floats) -> Floats32:
-    library = open3d()
+    library, tensor = open3d(), open3d().core.Tensor
     scene = library.t.geometry.RaycastingScene(nthreads=2)
-    if not len(mesh.triangles) or not len(points):
+    meshes = [mesh for mesh in (state.solid, state.foliage) if len(mesh.triangles)]
+    if not meshes or not len(points):
         return np.full(len(points), np.inf, dtype=np.float32)
-    tensor = library.core.Tensor
-    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+    for mesh in meshes:
+        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
     return np.asarray(scene.compute_distance(tensor(points.astype(np.float32))).numpy(), dtype=np.float32)
 
 
-def _share(what: Bools, of: Bools) -> float:
-    return float(what[of].mean()) if of.any() else float("nan")
-
-
-def _pair(figures: tuple[int, float, float]) -> str:
-    return f"precision {figures[1]:.0%}, recall {figures[2]:.0%}"
+def _share(good: Bools, of: Bools) -> float:
+    return float(good[of].mean()) if of.any() else float("nan")

@@ -1,8 +1,8 @@
 """Other libraries on the same queries, on this machine.
 
-The queries are those of a robot that was switched on eight metres ago; the classes below say how each peer is
-set, docs/results.md what the columns mean. A trial ends after ``--limit`` seconds, so that a slow peer answers
-the first queries only; both sides' shares are of those. Extra ``peers``; one that is missing gets a line that says so.
+The queries are those of a robot that was switched on eight metres ago. A trial ends after ``--limit`` seconds, so a
+slow peer answers the first queries only, and the shares of both sides are of those. Extra ``peers``; a peer that is
+missing gets a line with the remedy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import coview_kernels
 from bench.__main__ import run
 from bench.harness.files import folder, isolated
-from bench.harness.rows import Row, bounded, failed, informs, number, table
+from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import WORLDS, Place, map_of, places
 from coview_stream import BaseMap
 from coview_stream.clouds.filters import open3d
@@ -38,7 +38,6 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
 OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking starts, metres and radians
@@ -68,32 +67,24 @@ def started(place: Place) -> Pose:
 
 
 class Keyframes:
-    """The search over the keyframes of a drive."""
+    """The search over the keyframes of a drive; with ``one_scan`` all points of the drive as if they were one scan."""
 
-    def __init__(self, site: BaseMap) -> None:
+    def __init__(self, site: BaseMap, one_scan: bool = False) -> None:
         coview_kernels.warm_up()
         config = LocalizerConfig()
+        self._one_scan = one_scan
         self._search = GlobalSearch(site, config, LocalMaps(site, config.registration.source_range))
 
     def answer(self, place: Place) -> Answer:
         """Search until a keyframe's verdict accepts a place."""
         self._search.clear()
-        for query in self._queries(place):
+        newest = place.queries[-1]
+        whole = replace(newest, submap=place.submap + newest.position.astype(np.float32))
+        for query in [whole] if self._one_scan else place.queries:
             accepted = self._search.update(query).accepted
             if accepted is not None:
                 return Answer(accepted.T_map_odom @ place.T_odom_submap, True)
         return Answer(None, False)
-
-    def _queries(self, place: Place) -> list[SearchRequest]:
-        return place.queries
-
-
-class OneScan(Keyframes):
-    """The search from one submap alone: all points of the drive as if they were one scan."""
-
-    def _queries(self, place: Place) -> list[SearchRequest]:
-        newest = place.queries[-1]
-        return [replace(newest, submap=place.submap + newest.position.astype(np.float32))]
 
 
 class Tracking:
@@ -123,11 +114,9 @@ class Tracking:
 class KissMatcher:
     """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
 
-    Settings in its favour: of voxels of 0.7, 1, 1.5 and 2 m (its authors advise one that grows with the map; at 0.5 m
-    the whole map takes minutes), each with its default solver and with Quatro, made for level clouds, the pair that
-    was right most often on six places of either world; radii, noise bounds and 5,000 correspondences of its defaults.
-    Both clouds are its own to thin; nothing can be prepared but the cloud. It vouches by its own example's rule: a
-    valid solution with five final inliers or more.
+    Settings in its favour: of voxels of 0.7, 1, 1.5 and 2 m (at 0.5 m the whole map takes minutes), with its default
+    solver and with Quatro, made for level clouds, the pair that was right most often on six places of either world;
+    the rest by default. It vouches by its own example's rule: a valid solution with five final inliers or more.
     """
 
     VOXEL, INLIERS = 1.0, 5
@@ -149,10 +138,9 @@ class KissMatcher:
 class MapClosures:
     """MapClosures 2.2 (MIT): ORB features of density images, a tree of binary words, 2D RANSAC.
 
-    The map is cut into local maps, and the submap is the query that may close a loop with one of them. Settings in its
-    favour: local maps of the submap's own reach (60 m about their centre) every 15 m, much denser than its pipeline
-    makes them; its own 0.5 m voxels, density threshold, Hamming distance and ground alignment; the best of all closures
-    counts. It vouches by its pipeline's rule: more than five inliers.
+    The map is cut into local maps; the submap is the query that may close a loop with one. Settings in its favour: local
+    maps of 60 m, the submap's reach, every 15 m, much denser than its pipeline makes them; the best of all closures
+    counts; the rest by default. It vouches by its pipeline's rule: more than five inliers.
     """
 
     SPACING, REACH, VOXEL = 15.0, 60.0, 0.5
@@ -201,11 +189,10 @@ class MapClosures:
 class Features:
     """Open3D (MIT): FPFH features, then RANSAC or fast global registration; the submap against the whole map.
 
-    Settings as its tutorial on global registration gives them, with a voxel for outdoor clouds: 1 m, normals within
-    2 voxels, features within 5, correspondences within 1.5 (RANSAC; 4 points, edge length 0.9, mutual filter off, 10^5
-    iterations at confidence 0.999) or half a voxel (FGR). The map's features are made once. It has no rule of its own
-    for when to believe a result; the tutorial looks at the fitness (share of points with a partner), so it vouches from
-    0.5.
+    Settings of its tutorial on global registration, with a voxel for outdoor clouds: 1 m, normals within 2 voxels,
+    features within 5, correspondences within 1.5 (RANSAC; 4 points, edge length 0.9, mutual filter off, 10^5 iterations
+    at confidence 0.999) or half a voxel (FGR). The map's features are made once. It has no rule of its own for when to
+    believe a result; the tutorial looks at the fitness (share of points with a partner), so it vouches from 0.5.
     """
 
     VOXEL, FITNESS = 1.0, 0.5
@@ -280,10 +267,9 @@ class SmallGicp:
 class NearbyGicp(SmallGicp):
     """small_gicp: the submap to the map, from a pose nearby.
 
-    Settings of its documentation: correspondences within 1 m. The map is prepared once, at 0.25 m. In its favour, the
-    submap is cut to 50 m and thinned to 0.5 m, as our registration does it: at its default of 0.25 m and without a cut
-    it is as exact and takes two to four times as long (measured). Thinning and covariances of the submap are part of a
-    query, as ours are. All cores. It vouches when it says that it has converged.
+    Correspondences within 1 m, as documented; all cores. The map is prepared once, at 0.25 m. In its favour the submap
+    is cut to 50 m and thinned to 0.5 m, as in our registration: without that it is as exact and takes two to four times
+    as long (measured). Thinning and covariances of the submap are part of a query. It vouches when it has converged.
     """
 
     MAP, SUBMAP, REACH, NEAR = 0.25, 0.5, 50.0, 1.0
@@ -300,10 +286,6 @@ class NearbyGicp(SmallGicp):
 
 NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
-_HEAD = (
-    "peer", "world", "right < 3 m", "< 1 m", "false accepts", "found", "e_t m", "e_r deg", "query ms", "map s"
-)  # fmt: skip
-
 
 class Peer(NamedTuple):
     """A method with its name, and how it is made for a map; ``tracking`` starts from a pose nearby, not nowhere."""
@@ -317,7 +299,7 @@ OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
 
 PEERS = (
     Peer(OURS, Keyframes),
-    Peer("coview_stream, one scan", OneScan),
+    Peer("coview_stream, one scan", partial(Keyframes, one_scan=True)),
     Peer("KISS-Matcher", KissMatcher),
     Peer("MapClosures", MapClosures),
     Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),
@@ -330,49 +312,39 @@ PEERS = (
 
 @dataclass
 class Trial:
-    """What one peer did on one world's queries, or why it did nothing.
+    """The answers of one peer to one world's queries, as far as it came, or the reason why it gave none.
 
-    ``answers`` are of the queries that it came to, in order: ``seconds``, ``vouched``, and ``metres`` and ``degrees``
-    from the truth, None without a pose.
+    An answer has ``seconds``, ``vouched``, and ``metres`` and ``degrees`` from the truth, None without a pose.
     """
 
     peer: str
     scene: str
     asked: int
-    prepare_s: float | None = None
     answers: list[dict[str, Any]] = field(default_factory=list)
     trouble: str = ""
 
-    def _near(self, metres: float = NEAR) -> list[dict[str, Any]]:
-        posed = (a for a in self.answers if a["metres"] is not None)
-        return [a for a in posed if a["metres"] < metres and a["degrees"] < ALIGNED]
-
-    def succeeded(self, metres: float = NEAR) -> int:
-        """Count answers that it vouches for and that are right."""
-        return sum(a["vouched"] for a in self._near(metres))
+    def right(self) -> list[dict[str, Any]]:
+        """Return the answers that the peer vouches for and that are right."""
+        posed = (a for a in self.answers if a["vouched"] and a["metres"] is not None)
+        return [a for a in posed if a["metres"] < NEAR and a["degrees"] < ALIGNED]
 
     def false_accepts(self) -> int:
-        """Count answers that it vouches for and that are wrong."""
-        return sum(a["vouched"] for a in self.answers) - self.succeeded()
+        """Count answers that the peer vouches for and that are wrong."""
+        return sum(a["vouched"] for a in self.answers) - len(self.right())
 
-    def found(self) -> int:
-        """Count right answers, vouched for or not: what a perfect check would make of it."""
-        return len(self._near())
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the table; counts are of the queries that were asked."""
+        return {
+            "peer": self.peer, "scene": self.scene, "right": f"{len(self.right())} of {self.asked}",
+            "false": self.false_accepts(), "ms": milliseconds([self]),
+            "metres": float(np.median([a["metres"] for a in self.right()] or [math.nan])),
+        }  # fmt: skip
 
-    def median_error(self) -> tuple[float, float]:
-        """Metres and degrees, over the right answers that it vouches for; NaN without one."""
-        right = [(a["metres"], a["degrees"]) for a in self._near() if a["vouched"]]
-        metres, degrees = np.median(right, axis=0) if right else (np.nan, np.nan)
-        return float(metres), float(degrees)
 
-    def cells(self) -> list[str]:
-        """One line of the table; counts are of the queries that were asked."""
-        right, near, found = (f"{n} of {self.asked}" for n in (self.succeeded(), self.succeeded(1.0), self.found()))
-        metres, degrees = self.median_error()
-        return [
-            self.peer, self.scene, right, near, str(self.false_accepts()), found, number(metres, 2),
-            number(degrees, 2), number(milliseconds([self]), 0), number(self.prepare_s, 1),
-        ]  # fmt: skip
+COLUMNS = (
+    ("peer", "peer", None), ("world", "scene", None), ("right < 3 m", "right", None), ("false accepts", "false", 0),
+    ("e_t m", "metres", 2), ("query ms", "ms", 0),
+)  # fmt: skip
 
 
 def milliseconds(trials: Sequence[Trial]) -> float:
@@ -382,7 +354,7 @@ def milliseconds(trials: Sequence[Trial]) -> float:
 
 def share(trials: Sequence[Trial]) -> float:
     """Return how many of the answered queries have a right answer that the peer vouches for, %."""
-    return 100.0 * sum(t.succeeded() for t in trials) / max(1, sum(len(t.answers) for t in trials))
+    return 100.0 * sum(len(t.right()) for t in trials) / max(1, sum(len(t.answers) for t in trials))
 
 
 def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) -> Iterator[Row]:
@@ -419,22 +391,18 @@ def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: P
         for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file)], None, limit_s):
             if row.holds is False:
                 trial.trouble = row.name.removeprefix("peers: ")
-            elif row.details:
-                trial.answers.append(row.details)
             else:
-                trial.prepare_s = row.ours
+                trial.answers.append(row.details)
     except CoViewError as error:  # it is not installed
         trial.trouble = str(error)
     return trial
 
 
 def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
-    """Yield the seconds of a peer's preparation, then those of each query with its answer."""
+    """Yield the seconds of a query with its answer."""
     peer = next(peer for peer in PEERS if peer.name == name)
     found, site = pickle.loads(Path(places_file).read_bytes()), BaseMap.load(Path(map_file))
-    begin = time.perf_counter()
     method = peer.make(site)
-    yield informs("trial/prepare", time.perf_counter() - begin, "s")
     for k, place in enumerate(found):
         begin = time.perf_counter()
         answer = method.answer(place)
@@ -488,4 +456,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     trials = [Trial(**values) for row in rows for values in row.details.get("trials", ())]
     trials.sort(key=lambda trial: list(WORLDS).index(trial.scene))
     troubles = [f"{trial.peer}, {trial.scene}: {trial.trouble}" for trial in trials if trial.trouble]
-    return {"worlds": "\n\n".join([table(_HEAD, [trial.cells() for trial in trials]), *troubles])}
+    return {"worlds": "\n\n".join([listed(COLUMNS, [trial.figures() for trial in trials]), *troubles])}

@@ -212,6 +212,4 @@ def test_lidar_odometry_leans_and_shakes():
     assert (leaning["lean"], leaning["tilt"]) == (pytest.approx(2.0), pytest.approx(0.0, abs=1e-6))
     shaken = truth.copy()
     shaken[1::2, :3, :3] = shaken[1::2, :3, :3] @ exp_so3([0.0, np.radians(1.0), 0.0])
-    assert odometry.scored(shaken, truth)["tilt"] == pytest.approx(
-        np.sqrt(0.5), abs=0.01
-    )  # pitch alone
+    assert odometry.scored(shaken, truth)["tilt"] == pytest.approx(np.sqrt(0.5), abs=0.01)  # pitch alone

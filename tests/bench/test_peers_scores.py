@@ -12,21 +12,19 @@ def answer(metres, degrees=0.5, vouched=True, seconds=0.1):
 
 
 def tried(name, *answers, scene="town", trouble=""):
-    return Trial(name, scene, 5, 1.0, list(answers), trouble)
+    return Trial(name, scene, 5, list(answers), trouble)
 
 
 def test_right_and_vouched_for_are_two_things():
     far = answer(40.0)
     done = tried("X", answer(0.2), answer(2.9), answer(0.1, 5.1), far, answer(0.3, vouched=False), answer(None, None))
-    assert done.succeeded() == 2
-    assert done.succeeded(1.0) == 1
+    assert len(done.right()) == 2
     assert done.false_accepts() == 3
-    assert done.found() == 3
-    assert done.median_error() == pytest.approx((1.55, 0.5))
+    assert done.figures()["metres"] == pytest.approx(1.55)
     assert milliseconds([done]) == pytest.approx(100.0)
     nothing = tried("X", answer(None, None, vouched=False))
     assert nothing.false_accepts() == 0
-    assert math.isnan(nothing.median_error()[0])
+    assert math.isnan(nothing.figures()["metres"])
 
 
 def test_rows_put_every_peer_beside_ours():
