@@ -138,9 +138,9 @@ class KissMatcher:
 class MapClosures:
     """MapClosures 2.2 (MIT): ORB features of density images, a tree of binary words, 2D RANSAC.
 
-    The map is cut into local maps; the submap is the query that may close a loop with one. Settings in its favour: local
-    maps of 60 m, the submap's reach, every 15 m, much denser than its pipeline makes them; the best of all closures
-    counts; the rest by default. It vouches by its pipeline's rule: more than five inliers.
+    The map is cut into local maps; the submap is the query that may close a loop with one. Settings in its favour:
+    local maps of 60 m, the submap's reach, every 15 m, much denser than its pipeline makes them; the best of all
+    closures counts; the rest by default. It vouches by its pipeline's rule: more than five inliers.
     """
 
     SPACING, REACH, VOXEL = 15.0, 60.0, 0.5
