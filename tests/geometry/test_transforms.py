@@ -68,11 +68,6 @@ def test_transform_maps_source_to_target_in_dtype_of_points():
     assert g.transform(T_map_body, np.empty((0, 3), np.float32)).shape == (0, 3)
 
 
-def test_exp_se3_rotates_then_translates():
-    T = exp_se3(np.array([0, 0, np.pi / 2, 1, 0, 0]))
-    np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 1, 0, 1], atol=1e-12)
-
-
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-4, 1.0, np.pi / 2, 3.0, np.pi])
 def test_rotation_angle_is_exact_near_zero_and_pi(turn):
     assert g.rotation_angle(g.pose_from(g.rot_z(turn), [9, 9, 9])) == pytest.approx(turn, rel=1e-6, abs=1e-12)
@@ -83,15 +78,6 @@ def test_rotation_angle_is_exact_near_zero_and_pi(turn):
 )
 def test_wrap_angle(given_, wrapped):
     assert g.wrap_angle(given_) == pytest.approx(wrapped)
-
-
-def test_orthonormalize_removes_accumulated_rounding():
-    T = exp_se3(np.array([0.1, 0.2, 0.3, 1, 2, 3]))
-    tired = T.copy()
-    tired[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
-    fresh = g.orthonormal(tired)
-    np.testing.assert_allclose(fresh[:3, :3] @ fresh[:3, :3].T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(fresh, T, atol=1e-3)
 
 
 def test_is_pose_accepts_only_rigid_transforms():

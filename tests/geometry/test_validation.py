@@ -9,14 +9,6 @@ from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.validation import check_covariance, check_rigid, check_stamp, cloud_rows, finite_rows
 
 
-@pytest.mark.parametrize(
-    "bad", [None, np.zeros(3), np.zeros((4, 2)), np.zeros((4, 5)), [["a", "b", "c"]], [[1, 2, 3], [4]]]
-)
-def test_cloud_of_another_shape_or_without_numbers_is_refused(bad):
-    with pytest.raises(CloudError, match="cloud"):
-        cloud_rows(bad)
-
-
 def test_cloud_with_intensities_is_its_first_three_columns():
     rows = np.arange(16, dtype=np.float32).reshape(4, 4)
     np.testing.assert_array_equal(cloud_rows(rows), rows[:, :3])
@@ -25,12 +17,14 @@ def test_cloud_with_intensities_is_its_first_three_columns():
 @pytest.mark.parametrize(
     ("bad", "remedy"),
     [
+        *((bad, "cloud") for bad in (None, np.zeros(3), np.zeros((4, 2)), [["a", "b", "c"]], [[1, 2, 3], [4]])),
+        *((np.ones((20, 3), kind), "not an array of numbers") for kind in (bool, complex, "datetime64[s]")),
         (np.zeros((9, 6)), r"\(9, 6\); expected .*: give cloud\[:, :3\]$"),
         (np.zeros((3, 900)), r"give cloud\.T$"),
         (np.zeros((16, 900, 3)), r"give cloud\[\.\.\., :3\]\.reshape\(-1, 3\)$"),
     ],
 )
-def test_cloud_of_another_shape_is_refused_with_what_to_give(bad, remedy):
+def test_cloud_of_another_shape_or_without_numbers_is_refused_with_a_remedy(bad, remedy):
     with pytest.raises(CloudError, match=remedy):
         cloud_rows(bad)
 
@@ -46,26 +40,23 @@ def test_finite_rows_are_a_copy_with_the_mask():
     np.testing.assert_array_equal(finite, rows[mask])
 
 
-@pytest.mark.parametrize("bad", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1])])
-def test_invalid_pose_is_refused_by_name(bad):
-    with pytest.raises(InputError, match="T_here"):
+MOVED = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("bad", "flaw"),
+    [
+        (np.eye(3), "it has shape"),
+        (np.full((4, 4), np.nan), "it holds NaN"),
+        (np.diag([2.0, 1, 1, 1]), "not orthonormal"),
+        (np.diag([1.0, 1, -1, 1]), "it mirrors"),
+        (MOVED.T, "it is transposed"),
+        (MOVED + np.diag([0.0, 0, 0, 1]), "its last row is"),
+    ],
+)
+def test_invalid_pose_is_refused_by_name_and_flaw(bad, flaw):
+    with pytest.raises(InputError, match=f"T_here is no rigid transform: .*{flaw}"):
         check_rigid(bad, "T_here")
-
-
-def test_transposed_pose_is_refused_and_called_so():
-    T = np.eye(4)
-    T[:3, 3] = 5.0, 6.0, 7.0
-    with pytest.raises(InputError, match="T_here is no rigid transform: it is transposed"):
-        check_rigid(T.T, "T_here")
-    T[3, 0] = 1.0
-    with pytest.raises(InputError, match="its last row is"):
-        check_rigid(T, "T_here")
-
-
-@pytest.mark.parametrize("bad", [np.ones((20, 3), bool), np.ones((20, 3), complex), np.ones((20, 3), "datetime64[s]")])
-def test_cloud_of_no_real_numbers_is_refused(bad):
-    with pytest.raises(CloudError, match="not an array of numbers"):
-        cloud_rows(bad)
 
 
 @pytest.mark.parametrize(

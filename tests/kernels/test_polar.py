@@ -102,16 +102,6 @@ def test_polar_index_rotates_with_the_cloud(seed):
     np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
 
 
-def test_empty_cloud_and_cloud_in_one_bin():
-    grid, dropped = polar_bin(np.empty((0, 3)), (0, 0, 0), 20, 60, 50.0)
-    assert dropped == 0
-    assert not any(a.any() for a in grid)
-    one = np.tile(np.array([[3.0, 1.0, -2.0]], dtype=np.float32), (1000, 1))
-    grid, _ = polar_bin(one, (0, 0, 0), 20, 60, 50.0)
-    assert grid.count.max() == grid.count.sum() == 1000
-    assert grid.max_height.min() == -2.0
-
-
 @pytest.mark.slow
 def test_polar_bin_of_two_million_points():
     points = np.random.default_rng(2).normal(0, 20, (2_000_000, 3)).astype(np.float32)

@@ -137,10 +137,6 @@ def test_second_tier_adds_what_the_first_leaves_out(known):
     assert (both - expected).std() < 0.95 * (alone - expected).std()
 
 
-def test_a_station_takes_512_bytes(known):
-    assert known[0].codes.nbytes == 512 * M
-
-
 def test_two_tiers_keep_few_rings_whole():
     descriptors, _ = scene(6, r=8, s=24, channels=2)  # 16 rings, of which the first tier keeps 12
     columns = stacked([each[9] for each in descriptors])

@@ -8,16 +8,21 @@ import struct
 
 import numpy as np
 import pytest
-from test_web_hub import events
 
 from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 from coview_stream.viewers.scene import Scan
-from coview_stream.viewers.web_sink import WebHub, WebSink, packed_map
+from coview_stream.viewers.web_sink import MAX_PAGES, WebHub, WebSink, encode_event, packed_map
 
 EAST = 593_000.0
+
+
+def events(taken):
+    """Kinds and data of what a page takes."""
+    lines = [block.split(b"\n") for block in taken.split(b"\n\n") if block]
+    return [(kind[len(b"event: ") :].decode(), json.loads(data[len(b"data: ") :])) for kind, data in lines]
 
 
 @pytest.fixture
@@ -117,3 +122,47 @@ def test_few_maps_are_kept(sink):
     for name in "abcdef":
         sink.map(MapView(np.zeros(3), np.zeros((1, 3), dtype=np.float32), np.array([True]), None, name))
     assert list(sink.maps) == list("cdef")
+
+
+def test_what_a_page_has_not_taken_is_replaced_by_newer():
+    hub = WebHub()
+    page = hub.open_page()
+    for k in range(10_000):
+        hub.publish("pose", "r1", {"k": k})
+        hub.publish("pose", "r2", {"k": -k})
+    assert events(page.take(0.0)) == [("pose", {"k": 9999}), ("pose", {"k": -9999})]
+    assert page.take(0.0) == b""
+
+
+def test_a_new_page_is_told_what_is_kept():
+    hub = WebHub()
+    hub.tell_first(lambda: [encode_event("trail", {"points": []})])
+    hub.publish("status", "r1", {"state": "LOST"})
+    hub.publish("scan", "r1", {}, keep=False)
+    assert events(hub.open_page().take(0.0)) == [("trail", {"points": []}), ("status", {"state": "LOST"})]
+
+
+def test_names_from_the_network_fill_no_memory():
+    hub = WebHub()
+    page = hub.open_page()
+    for k in range(20_000):
+        hub.publish("pose", f"r{k}", {})
+    assert len(events(page.take(0.0))) == 4000
+    assert len(events(hub.open_page().take(0.0))) == 4000
+
+
+def test_pages_are_limited_and_come_free():
+    hub = WebHub()
+    pages = [hub.open_page() for _ in range(MAX_PAGES)]
+    assert hub.open_page() is None
+    hub.close_page(pages[0])
+    assert hub.open_page() is not None
+    hub.close()
+    assert pages[1].closed
+    assert pages[1].take(5.0) == b""  # at once
+    assert hub.open_page() is None
+
+
+def test_nan_is_no_event():
+    with pytest.raises(ValueError, match="JSON"):
+        encode_event("pose", {"x": float("nan")})
