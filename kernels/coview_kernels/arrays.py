@@ -50,9 +50,8 @@ class OverheadGrid(NamedTuple):
     """Square cells seen from above; row along y, column along x."""
 
     x: float
-    """of the lower corner of cell (0, 0), metres; float32 in use."""
     y: float
-    """likewise."""
+    """Lower corner of cell (0, 0), metres; float32 in use."""
     cell: float
     """Edge of a cell, metres."""
     shape: tuple[int, int]

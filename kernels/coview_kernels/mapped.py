@@ -48,7 +48,6 @@ class Windows:
         self._release(slice(0, self._rows))
 
     def __iter__(self) -> Iterator[slice]:
-        """Yield slices of rows, in order."""
         for start in range(0, self._rows, max(1, self._step)):
             part = slice(start, min(start + self._step, self._rows))
             try:

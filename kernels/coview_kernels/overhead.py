@@ -19,11 +19,7 @@ def lowest_heights(points: npt.ArrayLike, grid: OverheadGrid) -> F32:
 def offsets_near(points: npt.ArrayLike, grid: OverheadGrid, level: F32, band: float) -> tuple[I64, F64]:
     """Count the points (N, 3) less than ``band`` metres from the level (H, W) of their cell.
 
-    Returns:
-        Their numbers (H, W), and the sums (H, W) of their heights above it, metres.
-
-    Raises:
-        ValueError: an array has another shape.
+    Returns their numbers (H, W), and the sums (H, W) of their heights above it, metres.
     """
     cloud, levels = as_float32("points", points, None, 3), as_float32("level", level, *grid.shape)
     return runtime.dispatch(_near, reference.offsets_near, cloud, grid, levels, band)

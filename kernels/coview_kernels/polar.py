@@ -85,9 +85,7 @@ class _PolarBins:
         return PolarGrid(top, count), int(self._count[:, size + 1].sum())
 
 
-@lru_cache(maxsize=8)
-def _bins(rings: int, sectors: int, r_max: float) -> _PolarBins:
-    return _PolarBins(rings, sectors, r_max)
+_bins = lru_cache(maxsize=8)(_PolarBins)
 
 
 def station_bins(

@@ -49,8 +49,7 @@ def unit_columns(desc: npt.ArrayLike) -> F32:
 def column_spectra(desc: npt.ArrayLike) -> C64:
     """Spectra over the sectors of the unit columns of (M, R, S) descriptors; ValueError unless there are three axes.
 
-    Returns:
-        (F, M, R) complex64 with F = S // 2 + 1; each frequency is one contiguous matrix.
+    Returns (F, M, R) complex64 with F = S // 2 + 1; each frequency is one contiguous matrix.
     """
     fft = _fft()
     candidates = as_float32("desc", desc, None, None, None)

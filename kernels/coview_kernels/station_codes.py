@@ -212,7 +212,6 @@ class StationCodes:
         self.norm[-1] = max(self.norm[-1], np.sqrt(((whole * self.step) ** 2).sum(axis=(1, 2, 3)).max()))
 
     def __len__(self) -> int:
-        """Return the number of stations M."""
         return len(self.codes)
 
     def subset(self, stations: npt.ArrayLike) -> StationCodes:

@@ -48,7 +48,6 @@ class WindowImages:
         self.spans = np.stack([first, np.where(used.any(axis=1), last, 0)], axis=1).astype(np.int32)
 
     def __len__(self) -> int:
-        """Return the number of images K."""
         return len(self.padded)
 
     @property

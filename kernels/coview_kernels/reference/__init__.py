@@ -1,7 +1,7 @@
 """NumPy twins of the kernels, with the same names and signatures.
 
 They are the oracle of the tests, and the implementation where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
-Functions here trust their arguments; the public twins in :mod:`coview_kernels` check them first.
+They trust their arguments: the public functions of :mod:`coview_kernels` check them.
 """
 
 from __future__ import annotations
