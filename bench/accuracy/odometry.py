@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -40,6 +40,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for folder in asked.runs:
         run = open_bare_run(folder / "run")
         stamps, truth = read_tum(folder / "truth.tum")
+        ways: dict[str, Callable[[Run], tuple[list[int], Poses]]]
         ways = {"KISS-ICP": plain, "registration": partial(ours, False), "levelled": partial(ours, True)}
         for name, odometry in ways.items():
             frames, poses = odometry(run)

@@ -57,7 +57,7 @@ def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
     """Lay out a line for each world."""
     lines = []
     for figures in (row.details for row in rows):
-        tags = [(f"{n:,}", f"{precision:.0%}", f"{recall:.0%}") for n, precision, recall in map(figures.get, _TAGS)]
+        tags = [(f"{n:,}", f"{precision:.0%}", f"{recall:.0%}") for n, precision, recall in (figures[t] for t in _TAGS)]
         count, standing, lost = figures["moving"]
         lines.append([figures["world"], *itertools.chain(*tags), f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
     heads = [(tag, "precision", "recall") for tag in _TAGS]

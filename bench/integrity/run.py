@@ -59,7 +59,9 @@ def mirrored() -> World:
     """Return the mirrored world: no pose on the map is right."""
     world = np.diag([-1.0, 1.0, 1.0, 1.0])
     body = np.diag([1.0, -1.0, 1.0, 1.0])  # two mirrors: a rotation again
-    return World(lambda scene: world @ scene @ body, lambda points: points * np.float32([1, -1, 1]), right=False)
+    return World(
+        lambda scene: world @ scene @ body, lambda points: points * np.array([1, -1, 1], dtype=np.float32), right=False
+    )
 
 
 def scaled(factor: float) -> World:

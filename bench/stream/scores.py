@@ -56,22 +56,11 @@ def false_poses(metres: Floats, degrees: Floats) -> int:
     return int(np.sum(~((metres <= FALSE_METRES) & (degrees <= FALSE_DEGREES))))
 
 
-def tracking_intervals(
-    arrivals: Sequence[float], told: Sequence[Told], without: Sequence[tuple[float, float]] = ()
-) -> Floats:
-    """Seconds between successive poses, where no status in between said that the robot is not tracked.
-
-    ``without`` are periods (begin, end) that are left out, such as the absence of the router: an interval that
-    touches one does not count. Any other silence does, however long: that is the point of measuring.
-    """
+def tracking_intervals(arrivals: Sequence[float], told: Sequence[Told]) -> Floats:
+    """Seconds between successive poses, however long, without a status in between of a robot that is not tracked."""
     untracked = [status.arrival for status in told if status.state != "TRACKING"]
-    counted = [
-        end - begin
-        for begin, end in itertools.pairwise(arrivals)
-        if not any(begin < at < end for at in untracked)
-        and not any(begin < last and first < end for first, last in without)
-    ]
-    return np.array(counted)
+    pairs = itertools.pairwise(arrivals)
+    return np.array([end - begin for begin, end in pairs if not any(begin < at < end for at in untracked)])
 
 
 def rate_hz(intervals: Floats) -> float | None:

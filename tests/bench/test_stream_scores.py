@@ -40,8 +40,6 @@ def test_intervals_count_unless_the_robot_was_known_to_be_untracked():
     np.testing.assert_allclose(everything, [0.1, 0.1, 2.8, 0.1, 1.5])
     known = stream_scores.tracking_intervals(arrivals, [told(0.15), told(1.0, "LOST"), told(2.9)])
     np.testing.assert_allclose(known, [0.1, 0.1, 0.1, 1.5])
-    without = stream_scores.tracking_intervals(arrivals, [], [(4.0, 4.2)])
-    np.testing.assert_allclose(without, [0.1, 0.1, 2.8, 0.1])
     assert stream_scores.rate_hz(known[:3]) == pytest.approx(10.0)
     assert stream_scores.rate_hz(np.array([0.2, 0.3])) == pytest.approx(4.0)
     assert stream_scores.rate_hz(np.array([])) is None
