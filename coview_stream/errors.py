@@ -41,7 +41,7 @@ class MapError(InputError):
 
 
 class MessageError(InputError):
-    """A message from the network is malformed: truncated, oversized, or not what its encoding says."""
+    """A message from the network is malformed: truncated, oversized, or unlike its encoding."""
 
 
 class EncodingError(MessageError):

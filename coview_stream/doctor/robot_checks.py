@@ -329,17 +329,15 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
     if isinstance(errors, list) and errors:
         return Finding("warn", "node", f"{found}; reports: {str(errors[-1])[:200]}", robot=robot)
     if status.get("state") != "TRACKING" and _number(status, "uptime_s") > _LONG_SEARCH:
-        return Finding("warn", "node", found, _not_found(_text(status, "reason")), robot)
+        reason = _text(status, "reason")
+        if "waiting for" in reason or reason.startswith("no clouds"):
+            remedy = "its data does not come: see clouds and odometry above"
+        elif "two places" in reason or "several places" in reason or "leads" in reason:
+            remedy = "drive on, to where these places differ; `info --ambiguity` shows where that takes long"
+        else:
+            remedy = "drive ten metres; if all else here is ok: is it on this map? docs/reasons.md"
+        return Finding("warn", "node", found, remedy, robot)
     return Finding("ok", "node", found, robot=robot)
-
-
-def _not_found(reason: str) -> str:
-    """Return the remedy for a robot that is not localized."""
-    if "waiting for" in reason or reason.startswith("no clouds"):
-        return "its data does not come: see clouds and odometry above"
-    if "two places" in reason or "several places" in reason or "leads" in reason:
-        return "drive on, to where these places differ; `info --ambiguity` shows where that takes long"
-    return "drive ten metres; if all else here is ok: is it on this map? docs/reasons.md"
 
 
 def _text(status: dict[str, Any], name: str) -> str:

@@ -13,7 +13,7 @@ from coview_stream.training.worlds import QUERY_CELLS, WorldViews
 
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
-# chosen by hand, like the ranges below
+# probabilities and ranges of plausible changes, not measured
 _CHANCE = 0.5  # of each change
 _MAX_FALLEN = 0.004  # disks per square metre: 40 a hectare
 _RADII = (1.0, 2.5)  # metres
@@ -62,7 +62,6 @@ def _fell(image: Image, rng: np.random.Generator) -> None:
 PIECE = 272
 """Cells of a piece of the map: 136 m."""
 
-# set by hand
 _REACH = 36.0  # metres from a piece's middle within which queries stand: their 30 m must lie on it
 _ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarters
 _NARROWED = 0.4  # share of the queries that are cut at a random radius

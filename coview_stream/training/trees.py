@@ -79,7 +79,6 @@ FAMILIES = ("lumpy", "cone", "storeys", "umbrella", "clumps", "column")
 
 PATTERNS = ("random", "clustered", "hard-core", "rows")
 
-# set by hand
 _EVERGREEN = {"cone": 0.9, "storeys": 0.95, "umbrella": 0.5, "column": 0.6}  # chance, else never
 _MIN_SPACING = 0.8  # metres between two stems
 
