@@ -148,6 +148,7 @@ def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine,
     process.watch()
     assert process.pid not in (None, first)
     until(lambda: process.watch() or process.ready, 60.0)  # ready before a job asks
+    process.close()
     with pytest.raises(DiedError, match="closed"):
         process.watch()
 

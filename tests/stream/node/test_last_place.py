@@ -15,6 +15,7 @@ from se3 import exp_se3
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, load, remove_parts, save
 
 SHA = "0123456789abcdef" * 4
@@ -35,8 +36,14 @@ def test_last_pose_round_trip(tmp_path):
     assert loaded.T_map_body.dtype == np.float64
 
 
-def test_calibration_comes_back_with_the_pose(tmp_path):
-    known = Calibration(0.01, -0.05, 0.03, 1e-4, 0.002, 0.001, 1e-5)
+@pytest.mark.parametrize(
+    "known",
+    [
+        Calibration(0.01, -0.05, 0.03, 1e-4, 0.002, 0.001, 1e-5),
+        CalibrationEstimator(sensor_leans=False).calibration,  # lidar odometry knows the tilt: its sigma is zero
+    ],
+)
+def test_calibration_comes_back_with_the_pose(tmp_path, known):
     save(tmp_path, "r1", replace(LAST, calibration=known))
     assert load(tmp_path, "r1", SHA).calibration == known
     save(tmp_path, "r1", LAST)

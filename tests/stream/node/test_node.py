@@ -198,9 +198,11 @@ def test_pause_explained_by_network_outage_keeps_the_place(away, losses):
     site = Site("r1")
     site.node.declare()
     site.frame("r1", 0.0)
+    site.status("r1")
     if away:
         site.net.go_away()
         site.node.reporter.publish(time.monotonic())
         site.net.come_back()
     site.frame("r1", 4.0)
-    assert site.status("r1")["counters"]["losses"] == losses
+    status = site.status("r1")
+    assert (status["counters"]["losses"], status["connection"]["reconnects"]) == (losses, int(away))

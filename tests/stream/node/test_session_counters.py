@@ -62,12 +62,12 @@ def test_out_of_order_and_duplicate_frames_are_counted(robot):
 def test_waiting_frames_are_sorted_by_stamp(robot):
     """The network may change their order; that alone loses nothing."""
     robot.drive(0.0, 0.1)
-    for t in (0.3, 0.2):
+    for t in (0.3, 0.2, 0.3):
         robot.saw(t, now=1000.3)
     robot.moved(0.25, now=1000.3)
     assert robot.session.take_job("track").stamp_ns == ns(0.2)
     robot.moved(0.35, now=1000.35)
-    assert counted(robot) == {"received": 2, "odometry_received": 5}
+    assert counted(robot) == {"received": 3, "duplicate": 1, "odometry_received": 5}
 
 
 def test_frame_without_odometry_is_counted(robot):
