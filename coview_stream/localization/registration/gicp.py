@@ -28,8 +28,6 @@ from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, norms, orthonormal, pose_from, skew
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 _NEIGHBOURS = 10  # of a point's covariance: small_gicp's default
 _MIN_POINTS = 20  # fewer of a kind have no surfaces
@@ -78,18 +76,21 @@ def surfaces(points: Points) -> Surfaces | None:
 
 
 def register_surfaces(
-    source: RegistrationCloud,
+    kinds: list[Surfaces],
     T_map_source: Pose,
-    target: LocalMap,
+    target: Surfaces,
+    grid: kernels.PointGrid,
+    normals: Points,
     pivot: Floats,
     scales: list[kernels.Scale],
+    *,
     keep: float,
     iterations: int,
     prior: kernels.Prior | None = None,
 ) -> kernels.Registration | None:
     """Register a scan by GICP; None where fewer than 50 points find a partner.
 
-    Arguments are as for :func:`coview_kernels.align_planes`.
+    ``kinds`` are the points above the ground and on it; other arguments as for :func:`coview_kernels.align_planes`.
 
     Raises:
         ValueError: the initial guess or the prior is not finite.
@@ -97,12 +98,10 @@ def register_surfaces(
     """
     if not all(np.isfinite(a).all() for a in (T_map_source, pivot, *(prior or ()))):
         raise ValueError("T_map_source, its pivot or the prior is not finite")
-    if target.surfaces is None:
-        return None
     T, total, answer = np.array(T_map_source, dtype=np.float64), 0, None
     for scale in scales:
         for _ in range(iterations):
-            pairs = _pairs(source.surfaces, target, target.surfaces, T, pivot, scale.radius, keep)
+            pairs = _pairs(kinds, target, grid, normals, T, pivot, scale.radius, keep)
             if pairs is None:
                 return None
             H, b, count, rmse = pairs
@@ -120,7 +119,14 @@ def register_surfaces(
 
 
 def _pairs(
-    kinds: list[Surfaces], target: LocalMap, on_map: Surfaces, T: Pose, pivot: Floats, radius: float, keep: float
+    kinds: list[Surfaces],
+    target: Surfaces,
+    grid: kernels.PointGrid,
+    normals: Points,
+    T: Pose,
+    pivot: Floats,
+    radius: float,
+    keep: float,
 ) -> tuple[Floats, Floats, int, float] | None:
     """Return Hessian (6, 6), gradient (6,), number and rmse of the kept pairs at a pose; None where they are too few.
 
@@ -130,20 +136,20 @@ def _pairs(
     H, b, pairs, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     points = sum(len(kind.points) for kind in kinds)
     for kind in kinds:
-        distance, partner = kernels.nearest(target.grid, kind.points, radius, T)
+        distance, partner = kernels.nearest(grid, kind.points, radius, T)
         distances = distance[np.isfinite(distance)]
         if not len(distances):
             continue
         number = max(1, int(keep * len(distances)))
         farthest = min(radius, float(np.partition(distances, number - 1)[number - 1]) + _ROUNDING)
         answer = gicp.align(
-            on_map.cloud, kind.cloud, on_map.tree, T, registration_type="GICP",
+            target.cloud, kind.cloud, target.tree, T, registration_type="GICP",
             max_correspondence_distance=farthest, num_threads=1, max_iterations=1,
         )  # fmt: skip
         near = np.flatnonzero(distance <= farthest)
         moved = kind.points[near] @ T[:3, :3].T + T[:3, 3]
-        gap = moved - target.grid.points[partner[near]]
-        normal = target.normals[partner[near]]
+        gap = moved - grid.points[partner[near]]
+        normal = normals[partner[near]]
         residual = np.einsum("ij,ij->i", gap, normal) / np.maximum(norms(normal), np.float32(1e-6))
         weight = min(0.5 * points / len(near), _MAX_SHARE)
         H_kind, b_kind = about_pivot(answer.H, answer.b, T, pivot)

@@ -74,7 +74,12 @@ def register(
     if gicp:
         from coview_stream.localization.registration.gicp import register_surfaces
 
-        return register_surfaces(source, T_map_source, target, pivot, steps, config.keep, limit, prior)
+        if target.surfaces is None:
+            return None
+        return register_surfaces(
+            source.surfaces, T_map_source, target.surfaces, target.grid, target.normals, pivot, steps,
+            keep=config.keep, iterations=limit, prior=prior,
+        )  # fmt: skip
     return kernels.align_planes(
         target.grid, target.normals, source.points, source.above, T_map_source, pivot, steps,
         keep=config.keep, iterations=limit, min_pairs=MIN_PAIRS, prior=prior,

@@ -177,7 +177,7 @@ class RobotState:
 
 @dataclass(frozen=True)
 class OdomCorrection:
-    """Correction of odometry: the newest verified ``T_map_odom``, and the odometry's way up to its frame."""
+    """Correction of odometry by a fix: more than its pose, as odometry and its drift carry it on from here."""
 
     T_map_odom: Pose  # (4, 4) map <- odometry, source frame of the map
     T_map_body: Pose  # (4, 4) map <- body at the frame that it comes from
