@@ -129,17 +129,9 @@ def ambiguity(
     evidence, lead, error = values.T
     driven = ~np.isin(np.arange(len(station)), np.setdiff1d(waiting, driven_rows))
     return Ambiguity(
-        station,
-        position,
-        drive=drive,
-        driven=driven,
-        evidence=evidence,
-        lead=lead,
-        error=error,
-        wrong=wrong,
-        risk=rehearsal.config.acceptance.risk,
-        changed=changed,
-    )
+        station, position, drive=drive, driven=driven, evidence=evidence, lead=lead, error=error, wrong=wrong,
+        risk=rehearsal.config.acceptance.risk, changed=changed,
+    )  # fmt: skip
 
 
 def sample(base_map: BaseMap, count: int) -> Indices:

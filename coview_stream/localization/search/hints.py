@@ -1,6 +1,6 @@
-"""Hints and guesses of the robot's place from before the search: more hypotheses to try, none of them trusted.
+"""Hints and guesses of the robot's place: more hypotheses for the search, and none is trusted.
 
-Only the circle of a guess is: nothing outside of it is searched.
+Only the circle of a guess is trusted: nothing outside of it is searched.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) 
 
 
 def has_ground(guess: PlaceGuess, origin: Floats, grid: StationGrid) -> bool:
-    """Tell whether the map has ground anywhere near a guess, or within its circle if it has one."""
+    """Return whether the map has ground near a guess, or within its circle if it has one."""
     area = guess.area(origin)
     if area is not None:
         return bool(area.holds(grid.stations).any())
@@ -141,10 +141,9 @@ def has_ground(guess: PlaceGuess, origin: Floats, grid: StationGrid) -> bool:
 
 
 class PoseHints:
-    """Hints of a localizer to its search: ``T_map_odom`` in an odometry frame that keeps its origin.
+    """Hints of a localizer to its search: ``T_map_odom`` of the odometry frame as given.
 
-    The localizer moves the origin of its own odometry frame to an anchor, another one after each loss; here it is
-    undone. Map coordinates are the map's own.
+    The localizer moves that frame's origin to an anchor, another one after each loss; here the move is undone.
 
     Attributes:
         circle: of the map, metres from its zero, that the robot was said to be in; None for none.

@@ -218,7 +218,7 @@ class PlaceScorer:
         return [Hypothesis(pose) for pose in T]
 
     def _observe(self, scan: ObservedScan, followed: int, hypotheses: list[Hypothesis]) -> _Observed:
-        """Observe the map from hypotheses; the first ``known`` are followed and hardly drift."""
+        """Observe the map from hypotheses; the first ``followed`` are followed places and hardly drift."""
         if not hypotheses:
             nothing = np.empty((0, len(Share)), dtype=np.float32)
             return _Observed(np.empty((0, 4)), nothing, np.empty(0, dtype=np.float32), [])
