@@ -16,6 +16,8 @@ from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
 from coview_kernels.mapped import Windows
 from coview_kernels.reference.field import NO_GROUND, TILE, FieldLayers, Plan
 
+Scene = tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]
+
 
 def street(rng: np.random.Generator) -> tuple[FieldMap, np.ndarray]:
     """A flat street of 3 x 3 tiles (48 m) with walls; the map, and the walls' points."""
@@ -50,14 +52,14 @@ def scan_at(points: np.ndarray, pose: np.ndarray, rng: np.random.Generator) -> F
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]:
+def scene() -> Scene:
     rng = np.random.default_rng(11)
     field, points = street(rng)
     pose = np.array([24.0, 22.0, 1.5, 0.4])
     return field, scan_at(points, pose, rng), pose, rng.uniform([8, 8, 0.5, -3], [40, 40, 2.5, 3], (40, 4))
 
 
-def test_pose_is_found_from_three_metres_and_six_degrees_off(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_pose_is_found_from_three_metres_and_six_degrees_off(scene: Scene):
     field, scan, pose, _ = scene
     starts = pose + np.array([[0, 0, 0, 0], [2.6, -2.2, 0.8, 0.1], [-2.9, 2.4, -1.0, -0.1], [0.4, 0.3, 0.2, 0.03]])
     found = kernels.field_scores(field, scan, starts)
@@ -69,9 +71,7 @@ def test_pose_is_found_from_three_metres_and_six_degrees_off(scene: tuple[FieldM
     assert (found.grounded > 0.8 * found.low).all()
 
 
-def test_near_refinement_follows_drift_and_wanders_no_farther(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray],
-):
+def test_near_refinement_follows_drift_and_wanders_no_farther(scene: Scene):
     field, scan, pose, others = scene
     found = kernels.field_scores(field, scan, [pose + np.array([0.3, -0.25, 0.2, 0.01])], kernels.Move.NEAR)
     off = np.abs(found.pose[0] - pose)
@@ -83,7 +83,7 @@ def test_near_refinement_follows_drift_and_wanders_no_farther(
     assert moved[:, 3].max() <= np.radians(0.75) + 1e-4
 
 
-def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_kernel_agrees_with_its_numpy_twin(scene: Scene):
     field, scan, pose, others = scene
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
@@ -102,7 +102,7 @@ def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.
         assert np.abs(np.column_stack(found[1:])[same] - counts[same]).max() <= 6
 
 
-def test_unsurveyed_cells_are_left_out(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_unsurveyed_cells_are_left_out(scene: Scene):
     field, scan, pose, _ = scene
     half = kernels.field_scores(field, scan, [pose + np.array([24.0, 0, 0, 0])], kernels.Move.NONE)
     away = kernels.field_scores(field, scan, [pose + np.array([500.0, -300.0, 0, 0])])
@@ -121,7 +121,7 @@ def test_walls_below_a_roof_edge_are_covered():
     assert found.near[0] == 0
 
 
-def test_empty_scan_and_no_hypotheses_are_answered(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_empty_scan_and_no_hypotheses_are_answered(scene: Scene):
     field, scan, pose, _ = scene
     empty = np.zeros((0, 3), dtype=np.float32)
     found = kernels.field_scores(field, FieldScan(empty, empty, empty), [pose])
@@ -130,7 +130,7 @@ def test_empty_scan_and_no_hypotheses_are_answered(scene: tuple[FieldMap, FieldS
     assert len(kernels.field_scores(field, scan, np.empty((0, 4))).pose) == 0
 
 
-def test_wrong_shapes_and_poses_are_refused(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_wrong_shapes_and_poses_are_refused(scene: Scene):
     field, scan, pose, _ = scene
     with pytest.raises(ValueError, match="poses"):
         kernels.field_scores(field, scan, pose)
@@ -140,7 +140,7 @@ def test_wrong_shapes_and_poses_are_refused(scene: tuple[FieldMap, FieldScan, np
         kernels.field_scores(field, FieldScan(scan.structure[:, :2], scan.low, scan.free), [pose])
 
 
-def test_stored_layers_are_looked_up_instead(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+def test_stored_layers_are_looked_up_instead(scene: Scene):
     field, scan, _, others = scene
     stored = replace(field, stored=FieldLayers(*(np.array(each) for each in field.layers)))
     assert stored.layers is stored.stored
@@ -148,9 +148,7 @@ def test_stored_layers_are_looked_up_instead(scene: tuple[FieldMap, FieldScan, n
         np.testing.assert_array_equal(one, other)
 
 
-def test_layers_made_in_small_batches_are_the_same(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
-):
+def test_layers_made_in_small_batches_are_the_same(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     field, whole = scene[0], scene[0].layers
     monkeypatch.setattr("coview_kernels.field._BATCH", 3)
     monkeypatch.setattr("coview_kernels.field._BAND", 2)
@@ -163,24 +161,18 @@ def test_layers_made_in_small_batches_are_the_same(
 
 
 @pytest.mark.parametrize("name", FieldLayers._fields)
-def test_layers_that_are_not_those_of_the_tiles_are_refused(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], name: str
-):
+def test_layers_that_are_not_those_of_the_tiles_are_refused(scene: Scene, name: str):
     field = scene[0]
+    with pytest.raises(ValueError, match="not those of the tiles"):
+        replace(field, stored=field.layers._replace(table=field.layers.table + 1))
     with pytest.raises(ValueError, match=name):
         replace(field, stored=field.layers._replace(**{name: getattr(field.layers, name)[:-1]}))
     with pytest.raises(ValueError, match=name):
         replace(field, stored=field.layers._replace(**{name: getattr(field.layers, name).astype(np.uint32)}))
 
 
-def test_table_that_points_elsewhere_is_refused(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
-    field = scene[0]
-    with pytest.raises(ValueError, match="not those of the tiles"):
-        replace(field, stored=field.layers._replace(table=field.layers.table + 1))
-
-
 def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path, windows: Callable[[int, int], None]
+    scene: Scene, tmp_path: Path, windows: Callable[[int, int], None]
 ):
     field, scan, pose, others = scene
     np.save(tmp_path / "bits.npy", field.layers.bits)
@@ -194,9 +186,7 @@ def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
             np.testing.assert_array_equal(one, other)
 
 
-def test_tiles_beyond_what_32_bits_count_are_looked_up(
-    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray], tmp_path: Path
-):
+def test_tiles_beyond_what_32_bits_count_are_looked_up(scene: Scene, tmp_path: Path):
     """More than 268 km2: the same tiles under the highest numbers, in files that are holes but for these."""
     field, scan, pose, others = scene
     layers, last = field.layers, (1 << 20) + 50

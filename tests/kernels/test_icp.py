@@ -200,17 +200,12 @@ def test_errors_name_the_argument():
             align_planes(PointGrid(cloud), **(good | {name: value}))
 
 
-def test_min_pairs_below_one_raises():
+def test_min_pairs_and_shares_of_scales_are_checked():
     cloud = np.random.default_rng(2).uniform(-5, 5, (300, 3)).astype(np.float32)
-    up = np.tile(np.float32([0, 0, 1]), (300, 1))
-    arguments = PointGrid(cloud), up, cloud, np.zeros(300, bool), np.eye(4), np.zeros(3), SCALES
-    assert align_planes(*arguments, **FIXED, min_pairs=1) is not None
+    arguments = PointGrid(cloud), np.tile(np.float32([0, 0, 1]), (300, 1)), cloud, np.zeros(300, bool)
+    assert align_planes(*arguments, np.eye(4), np.zeros(3), SCALES, **FIXED, min_pairs=1) is not None
     with pytest.raises(ValueError, match="min_pairs must be at least 1"):
-        align_planes(*arguments, **FIXED, min_pairs=0)
-
-
-def test_points_of_a_scale_must_be_among_those_of_the_next():
-    cloud = np.random.default_rng(2).uniform(-5, 5, (300, 3)).astype(np.float32)
-    arguments = PointGrid(cloud), cloud, cloud, np.zeros(300, bool), np.eye(4), np.zeros(3)
+        align_planes(*arguments, np.eye(4), np.zeros(3), SCALES, **FIXED, min_pairs=0)
+    scales = [Scale(1.0, 1.0, every=3), Scale(0.5, 1.0, every=2)]
     with pytest.raises(ValueError, match="multiple of the next"):
-        align_planes(*arguments, [Scale(1.0, 1.0, every=3), Scale(0.5, 1.0, every=2)], **FIXED)
+        align_planes(*arguments, np.eye(4), np.zeros(3), scales, **FIXED)
