@@ -193,12 +193,8 @@ def record_live(
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Serve a map, replay a run to it at its own pace; return the poses and the statuses published, JSON, in order.
 
-    Args:
-        map_path: a ``.coview`` file.
-        run_path: a run directory.
-        logs: directory for the stderr of the three processes.
-        on_record: called with every pose and status, as they come.
-        web: ``HOST:PORT`` of a web page of the drive; None for none.
+    ``logs`` is the directory for the stderr of the three processes, ``on_record`` is called with every pose and status
+    as they come, ``web`` is the ``HOST:PORT`` of a web page of the drive.
 
     Raises:
         TransportError: a process failed; the message ends with the last line of its log.

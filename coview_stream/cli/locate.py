@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.progress import progress_bar
     from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, locate, summary, write
@@ -64,13 +65,8 @@ def run(args: argparse.Namespace) -> int:
     missing = base_map.require_features(args.reloc)
     if missing is not None:
         print(f"{args.map}: {missing}", file=sys.stderr)
-    quiet = not (args.progress or sys.stderr.isatty())
-    with tqdm(desc="odometry", unit="frame", disable=quiet or lidar is None, leave=False) as bar:
-
-        def follow(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    shown = args.progress or sys.stderr.isatty()
+    with progress_bar("odometry", shown and lidar is not None, "frame") as follow:
         recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow, mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
@@ -80,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         reloc=args.reloc if missing is None else "coview",
         sensor_leans=lidar is None,
     )
-    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
+    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown) as bar:
 
         def step(done: int, total: int, fix: Fix | None) -> None:
             bar.update(done - bar.n)

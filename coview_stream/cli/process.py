@@ -72,10 +72,8 @@ class Stop:
 def stop_on_signals(on_hangup: Callable[[], None] | None = None) -> Iterator[Stop]:
     """Give a :class:`Stop` that SIGINT and SIGTERM request; a second SIGINT interrupts for good.
 
-    Outside the main thread, where Python delivers no signals, it is an ordinary one.
-
-    Args:
-        on_hangup: called at SIGHUP, on the main thread; None leaves that signal as it is.
+    Outside the main thread, where Python delivers no signals, it is an ordinary one. ``on_hangup`` is called at SIGHUP,
+    on the main thread; None leaves that signal as it is.
     """
     stop = Stop()
     interrupted = False

@@ -108,9 +108,9 @@ def capture_robots(
     for capture in captures:
         k = capture.keys
         capture.began = clock()
-        odometry = keep(capture.odometry, partial(capture_odometry, option=codecs[1], hint=k.odometry_hint))
+        odometry = keep(capture.odometry, partial(capture_odometry, option=codecs[1], hint=k.hint))
         transport.subscribe(k.odometry, odometry, "all")
-        clouds = keep(capture.clouds, partial(capture_cloud, option=codecs[0], hint=k.cloud_hint))
+        clouds = keep(capture.clouds, partial(capture_cloud, option=codecs[0], hint=k.hint))
         transport.subscribe(k.cloud, clouds, "all")
         transport.subscribe(k.status, keep_status(capture), "all")
     wait(seconds)

@@ -74,7 +74,7 @@ def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
     """Return the topics of named robots, of any preset."""
     topics = []
     for k in keys:
-        topics += [Topic(k.pose, "pose", k.robot, k.pose_hint), Topic(k.cloud, "cloud", k.robot, k.cloud_hint)]
+        topics += [Topic(k.pose, "pose", k.robot, k.hint), Topic(k.cloud, "cloud", k.robot, k.hint)]
         topics += [Topic(k.status, "status", k.robot), Topic(k.hypotheses, "hypotheses", k.robot)]
     return topics
 

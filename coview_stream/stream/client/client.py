@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
 from typing import Any
 
 import numpy.typing as npt
@@ -237,9 +236,7 @@ class RobotClient:
     async def __aenter__(self) -> RobotClient:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         import asyncio
 
         await asyncio.to_thread(self.close)
@@ -250,9 +247,7 @@ class RobotClient:
         state = "no status yet" if status is None else f"state {str(status.get('state'))[:20]}"
         return f"RobotClient({self.robot!r}, sends on {self._sender.cloud_key}, {'closed' if self._closed else state})"
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _check_open(self) -> None:
@@ -261,7 +256,7 @@ class RobotClient:
 
     def _on_pose(self, sample: Sample) -> None:
         try:
-            pose = decode_pose(sample, hint=self.keys.pose_hint)
+            pose = decode_pose(sample, hint=self.keys.hint)
         except MessageError as error:
             self._reject(sample, error)
             return

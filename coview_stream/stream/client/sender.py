@@ -41,8 +41,8 @@ class Sender:
         odometry_encoding: str | None = None,
     ) -> None:
         self._chosen = cloud_encoding is not None
-        self.cloud_encoding = cloud_encoding or keys.cloud_hint or "xyz"
-        self.odometry_encoding = odometry_encoding or keys.odometry_hint or "json"
+        self.cloud_encoding = cloud_encoding or keys.hint or "xyz"
+        self.odometry_encoding = odometry_encoding or keys.hint or "json"
         for name, known, option in (
             (self.cloud_encoding, tuple(CLOUD_CODECS), "cloud encoding"),
             (self.odometry_encoding, tuple(ODOMETRY_CODECS), "odometry encoding"),
@@ -51,7 +51,7 @@ class Sender:
                 raise ConfigError(f"{option} {name!r} is unknown: choose one of {', '.join(known)}")
         self.cloud_key = _publishing_key(keys.cloud, keys.rmw, "sensor_msgs/msg/PointCloud2", "--cloud-key")
         self.odometry_key = _publishing_key(keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key")
-        self._bare = keys.bare
+        self._bare = keys.hint is not None
         self._last_cloud = -math.inf
         self._cloud = _publisher(transport, self.cloud_key, "bulk", keys.rmw)
         self._odometry = _publisher(transport, self.odometry_key, "data", keys.rmw)

@@ -184,13 +184,13 @@ class Inputs:
 
     def decode_cloud(self, sample: Sample) -> CloudMessage:
         """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
-        message = decode_cloud(sample, self.codecs[0], self.keys.cloud_hint, self.config.max_payload)
+        message = decode_cloud(sample, self.codecs[0], self.keys.hint, self.config.max_payload)
         message = message.limited(self.config.max_points)
         return replace(message, points=self.config.mount.to_body(message.points))
 
     def decode_odometry(self, sample: Sample) -> OdometryMessage:
         """Return an odometry sample; MessageError: it cannot be read."""
-        return decode_odometry(sample, self.codecs[1], self.keys.odometry_hint, self.config.max_payload)
+        return decode_odometry(sample, self.codecs[1], self.keys.hint, self.config.max_payload)
 
     def count_undecodable(self, error: MessageError, key: str, prefix: str = "") -> None:
         """Count a message that could not be decoded; log only the first one of a kind whose reasons all differ."""

@@ -52,7 +52,7 @@ class RobotEndpoints:
         self._reporter = reporter
         self._wake_engines = wake_engines
         self._pose_format = pose_format or session.keys.pose_format
-        self._bare = session.keys.bare and pose_format is None
+        self._bare = session.keys.hint is not None and pose_format is None
         self._geo = geo
         self._publisher: Publisher | None = None
         self._locations: Publisher | None = None

@@ -98,44 +98,33 @@ _INPUT_OPTIONS = ("--cloud-key", "--odometry-key")
 class Preset:
     """Templates of keys, in which ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}`` are filled in, and formats.
 
-    A hint is the codec to try where Encoding and key do not say; None leaves it to the payload.
+    ``hint`` is the codec of a convention whose messages come and go without Encoding; None where Encoding, key or
+    payload say it.
     """
 
     cloud: str  # key expression of lidar frames
     odometry: str  # likewise
     pose: str  # key of our poses
-    cloud_hint: str | None = None
-    odometry_hint: str | None = None
-    pose_hint: str | None = None  # for a reader of our poses
-    pose_format: str = "json"  # codec that poses are written with, unless the user asks for another
-    bare: bool = False  # poses go out without Encoding, as the convention has it
+    hint: str | None = None
     rmw: bool = False  # poses need rmw_zenoh's attachment and liveliness tokens
+
+    @property
+    def pose_format(self) -> str:
+        """Codec that poses are written with, unless the user asks for another."""
+        return self.hint or "json"
 
 
 PRESETS: dict[str, Preset] = {
     "native": Preset(
         cloud="{base}/{robot}/in/cloud", odometry="{base}/{robot}/in/odom", pose="{base}/{robot}/out/pose"
     ),
-    "ros2dds": Preset(
-        cloud="{robot}/points",
-        odometry="{robot}/odom",
-        pose="{robot}/coview/pose",
-        cloud_hint="cdr",
-        odometry_hint="cdr",
-        pose_hint="cdr",
-        pose_format="cdr",
-        bare=True,
-    ),
+    "ros2dds": Preset(cloud="{robot}/points", odometry="{robot}/odom", pose="{robot}/coview/pose", hint="cdr"),
     # the last part of an input is the type's hash: '*' takes every ROS 2 release's, Humble's too
     "rmw_zenoh": Preset(
         cloud=f"{{domain}}/{{robot}}/points/{_CLOUD_DDS}/*",
         odometry=f"{{domain}}/{{robot}}/odom/{_ODOMETRY_DDS}/*",
         pose=f"{{domain}}/{{robot}}/coview/pose/{_POSE_DDS}/{{pose_hash}}",
-        cloud_hint="cdr",
-        odometry_hint="cdr",
-        pose_hint="cdr",
-        pose_format="cdr",
-        bare=True,
+        hint="cdr",
         rmw=True,
     ),
     # keelson has no subject for a pose in a map frame, only foxglove.FrameTransform: ours is map -> body, from the
@@ -144,11 +133,7 @@ PRESETS: dict[str, Preset] = {
         cloud="{base}/@v0/{robot}/pubsub/point_cloud/**",
         odometry="{base}/@v0/{robot}/pubsub/frame_transform/odometry/**",
         pose="{base}/@v0/{robot}/pubsub/frame_transform/coview",
-        cloud_hint="keelson",
-        odometry_hint="keelson",
-        pose_hint="keelson",
-        pose_format="keelson",
-        bare=True,
+        hint="keelson",
     ),
 }
 

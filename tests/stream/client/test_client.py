@@ -130,8 +130,8 @@ def test_invalid_clouds_and_odometry_are_refused(client, net, call, text):
 def test_every_preset_reaches_a_node_of_that_preset(net, preset, cloud_key, has_encoding):
     keys = robot_keys(preset, "coview", "r1")
     clouds, odometry = [], []
-    net.subscribe(keys.cloud, lambda s: clouds.append(decode_cloud(s, hint=keys.cloud_hint)), "newest")
-    net.subscribe(keys.odometry, lambda s: odometry.append(decode_odometry(s, hint=keys.odometry_hint)), "all")
+    net.subscribe(keys.cloud, lambda s: clouds.append(decode_cloud(s, hint=keys.hint)), "newest")
+    net.subscribe(keys.odometry, lambda s: odometry.append(decode_odometry(s, hint=keys.hint)), "all")
     with RobotClient("r1", transport=net, preset=preset) as robot:
         robot.send_odometry(T, 12.5)
         robot.send_cloud(CLOUD, 12.5)

@@ -27,15 +27,14 @@ def test_native_keys_are_as_documented() -> None:
     assert keys.status == "coview/rover1/out/status"
     assert keys.alive == "coview/rover1/alive"
     assert (keys.relocalize, keys.reset) == ("coview/rover1/rpc/relocalize", "coview/rover1/rpc/reset")
-    assert (keys.cloud_hint, keys.pose_format, keys.rmw, keys.bare) == (None, "json", False, False)
+    assert (keys.hint, keys.pose_format, keys.rmw) == (None, "json", False)
 
 
 def test_ros2dds_uses_topic_names_and_native_service_keys() -> None:
     keys = robot_keys("ros2dds", "site/hall3", "bot1")
     assert (keys.cloud, keys.odometry, keys.pose) == ("bot1/points", "bot1/odom", "bot1/coview/pose")
     assert keys.status == "site/hall3/bot1/out/status"
-    assert (keys.cloud_hint, keys.odometry_hint, keys.pose_format) == ("cdr", "cdr", "cdr")
-    assert keys.bare
+    assert (keys.hint, keys.pose_format) == ("cdr", "cdr")
     assert not keys.rmw
 
 
