@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bench.harness.rows import Row, informs, listed
-from coview_stream.basemap.ground import GroundConfig, ground_mask
+from coview_stream.basemap.ground import ground_mask
 from coview_stream.clouds import read_cloud
 from coview_stream.errors import InputError
 
@@ -32,7 +32,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             raise InputError(f"{file}: no point is labelled as ground (class 2)")
         label = cloud.classification == _GROUND_CLASS
         for method in METHODS:
-            mask = ground_mask(cloud.points, GroundConfig(method=method))
+            mask = ground_mask(cloud.points, method)
             errors = [100 * each.mean() for each in (~mask[label], mask[~label], label != mask)]
             about = {"file": file.name, "method": method, "I": errors[0], "II": errors[1], "total": errors[2]}
             yield informs(f"ground/{file.name}, {method}: total error", errors[2], "%", about)

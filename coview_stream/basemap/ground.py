@@ -16,20 +16,29 @@ from typing import Literal
 import numpy as np
 
 from coview_stream.errors import ConfigError, DependencyError
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
+from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
 from coview_stream.geometry.rasters import cells, filled, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
-_TILE = 256.0
-_MARGIN = 24.0
-"""Metres. A cloth per tile rests after fewer steps and fits the processor's cache: 1.5 km2 as one took 75 s."""
+Method = Literal["auto", "cloth", "morphological"]
+"""``auto`` takes the cloth where its wheel is installed and the points are wide enough for a cloth to hang."""
 
-_MIN_POINTS = 10  # for a cloth to rest on
-
-_MIN_CELLS = 50
-"""Occupied cells below which all lowest points count as ground: too few for a cloth to rest on."""
+# ``python -m bench ground`` scores all these on labelled scans
+_CELL = 0.5  # metres: a filter gets the lowest point of each cell
+_MAX_CELLS = 20_000_000  # above, cells grow: bounds time and memory
+_CLASS_THRESHOLD = 0.3  # metres above or below the ground's raster that are ground
+_SLOPE_ALLOWANCE = 0.3  # metres more for each unit of local slope
+_REFINEMENTS = 4  # rounds in which lowest points near the raster join the ground that made it
 _PORTION = 1_000_000  # points classified at a time
-# of the morphological filter; scored by ``python -m bench ground``
+_MIN_CELLS = 50  # with fewer occupied cells all lowest points are ground: a cloth cannot rest on them
+# of the cloth
+_NODES = 1.0  # metres between its nodes
+_RIGIDNESS = 2  # 1 for mountains, 2 for relief, 3 for plains
+_ITERATIONS = 100  # at most, until it rests: in steep forest 50 are too few, 200 no better
+_CLOTH_THRESHOLD = 0.5  # metres from the cloth to a lowest point that is ground
+_TILE, _MARGIN = 256.0, 24.0  # metres: smaller cloths rest sooner and fit the cache; 1.5 km2 as one took 75 s
+_MIN_POINTS = 10  # for a cloth to rest on
+# of the morphological filter
 _MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
 _MAX_SLOPE = 0.3  # of terrain between two windows
 _FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
@@ -40,22 +49,8 @@ def cloth_available() -> bool:
     return importlib.util.find_spec("CSF") is not None
 
 
-def require_cloth() -> None:
-    """Raise DependencyError where the wheel is not installed."""
-    if not cloth_available():
-        raise DependencyError(
-            "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "
-            "to 3.12: pip install cloth-simulation-filter there, or use method='morphological'"
-        )
-
-
-def cloth_ground(points: Points, config: GroundConfig) -> Bools:
-    """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud.
-
-    Raises:
-        DependencyError: the wheel is not installed.
-    """
-    require_cloth()
+def _cloth_ground(points: Points) -> Bools:
+    """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud."""
     ground = np.zeros(len(points), dtype=bool)
     low = points[:, :2].min(axis=0).astype(np.float64)
     counts = np.maximum(1, np.ceil(np.ptp(points[:, :2], axis=0) / _TILE)).astype(int)
@@ -65,13 +60,10 @@ def cloth_ground(points: Points, config: GroundConfig) -> Bools:
         strip = np.flatnonzero(_between(points[:, 0], low[0] + size[0] * i, size[0]))
         for j in range(counts[1]):
             index = strip[_between(points[strip, 1], low[1] + size[1] * j, size[1])]
-            own = (tile[index] == (i, j)).all(axis=1)
-            if not own.any():
-                continue
-            inside = own
-            if len(index) >= _MIN_POINTS:
-                inside = _one_cloth(points[index], config)
-            ground[index[inside & own]] = True
+            inside = (tile[index] == (i, j)).all(axis=1)
+            if inside.any() and len(index) >= _MIN_POINTS:
+                inside &= _one_cloth(points[index])
+            ground[index[inside]] = True
     return ground
 
 
@@ -79,15 +71,15 @@ def _between(values: Floats32, start: float, length: float) -> Bools:
     return np.asarray((values > start - _MARGIN) & (values < start + length + _MARGIN))
 
 
-def _one_cloth(points: Points, config: GroundConfig) -> Bools:
+def _one_cloth(points: Points) -> Bools:
     csf = importlib.import_module("CSF")
     _one_thread()
     cloth = csf.CSF()
-    cloth.params.bSloopSmooth = config.slope_smooth
-    cloth.params.cloth_resolution = config.cloth_resolution
-    cloth.params.rigidness = config.rigidness
-    cloth.params.interations = config.iterations  # the wheel's spelling
-    cloth.params.class_threshold = config.cloth_threshold
+    cloth.params.bSloopSmooth = True  # the cloth follows steep steps: banks, terraces
+    cloth.params.cloth_resolution = _NODES
+    cloth.params.rigidness = _RIGIDNESS
+    cloth.params.interations = _ITERATIONS  # the wheel's spelling
+    cloth.params.class_threshold = _CLOTH_THRESHOLD
     ground, rest = csf.VecInt(), csf.VecInt()
     with _silence():
         cloth.setPointCloud(points.astype(np.float64))
@@ -131,57 +123,6 @@ def _silence() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class GroundConfig:
-    """Separation of the ground from the rest; ``python -m bench ground`` scores the defaults on labelled scans.
-
-    Attributes:
-        method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter
-            (see :func:`ground_filter`).
-        cell: the filter sees the lowest point of each cell of this size, metres.
-        cloth_resolution: distance of cloth nodes, metres.
-        rigidness: 1 for mountains, 2 for relief, 3 for plains.
-        slope_smooth: let the cloth follow steep steps (banks, terraces).
-        iterations: maximum of simulation steps; it stops when the cloth rests (in steep forest 50 are too few, 200 no
-            better).
-        cloth_threshold: a lowest point within this distance of the cloth is ground, metres.
-        class_threshold: a point within this height of the ground raster is ground, metres.
-        slope_allowance: added to ``class_threshold`` for each unit of local slope, metres.
-        refinements: rounds in which lowest points near the raster join the ground that made it.
-        max_cells: above this many occupied cells ``cell`` grows; bounds time and memory.
-    """
-
-    method: str = "auto"
-    cell: float = 0.5
-    cloth_resolution: float = 1.0
-    rigidness: int = 2
-    slope_smooth: bool = True
-    iterations: int = 100
-    cloth_threshold: float = 0.5
-    class_threshold: float = 0.3
-    slope_allowance: float = 0.3
-    refinements: int = 4
-    max_cells: int = 20_000_000
-
-    def __post_init__(self) -> None:
-        if self.method not in ("auto", "cloth", "morphological"):
-            raise ConfigError(f"method={self.method!r}: must be auto, cloth or morphological")
-        ranges = {
-            "cell": (0.05, 10.0),
-            "cloth_resolution": (0.1, 20.0),
-            "rigidness": (1, 3),
-            "iterations": (1, 10_000),
-            "cloth_threshold": (0.01, 5.0),
-            "class_threshold": (0.01, 5.0),
-            "slope_allowance": (0.0, 5.0),
-            "refinements": (0, 20),
-            "max_cells": (10_000, 1_000_000_000),
-        }
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ConfigError(f"{name}={getattr(self, name)}: must lie in {low} to {high}")
-
-
-@dataclass(frozen=True)
 class GroundRaster:
     """Ground heights of square cells in the frame of the points, metres.
 
@@ -222,84 +163,79 @@ class GroundRaster:
         return out
 
 
-def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal["cloth", "morphological"]:
+def ground_filter(points: Points, method: Method = "auto") -> Literal["cloth", "morphological"]:
     """Choose the filter for these (N, 3) points, metres.
 
-    With ``auto`` it is the cloth, but the morphological filter where the cloth's wheel is not installed (there is none
-    for Python 3.13 and for ARM) and where the points are too narrow for the cloth to hang.
-
     Raises:
-        DependencyError: ``method`` is ``cloth`` and its wheel is not installed.
+        ConfigError: ``method`` is unknown. DependencyError: it is ``cloth``, and its wheel is not installed.
     """
-    config = config or GroundConfig()
-    if config.method == "morphological":
-        return "morphological"
-    if config.method == "cloth":
-        require_cloth()
-        return "cloth"
-    extent = float(min(np.ptp(points[:, :2], axis=0)))
-    hangs = extent > 5 * config.cloth_resolution
+    if method not in ("auto", "cloth", "morphological"):
+        raise ConfigError(f"method={method!r}: must be auto, cloth or morphological")
+    if method == "cloth" and not cloth_available():
+        raise DependencyError(
+            "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "
+            "to 3.12: pip install cloth-simulation-filter there, or use method='morphological'"
+        )
+    if method != "auto":
+        return method
+    hangs = float(min(np.ptp(points[:, :2], axis=0))) > 5 * _NODES
     return "cloth" if hangs and cloth_available() else "morphological"
 
 
-def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
-    """Mask the points that lie on the ground.
+def ground_mask(points: Points, method: Method = "auto") -> Bools:
+    """Mask (N,) the points that lie on the ground.
 
-    The lowest point of each cell goes through the filter; then all points are classified by their height
-    above the raster of the lowest points that were ground.
+    The lowest point of each cell goes through the filter; then all points are classified by their height above the
+    raster of the lowest points that were ground.
 
     Args:
         points: (N, 3) float32 metres, finite, z up.
-        config: defaults suit airborne and mobile scans.
-
-    Returns:
-        (N,) booleans.
+        method: the filter.
 
     Raises:
-        ConfigError: the extent is absurd for a map.
-        DependencyError: ``method`` is ``cloth`` and the cloth-simulation-filter wheel is not installed.
+        ConfigError: the extent is absurd for a map. DependencyError: as of :func:`ground_filter`.
     """
-    config = config or GroundConfig()
     if not len(points):
         return np.zeros(0, dtype=bool)
-    surface = ground_surface(points, config)
+    from scipy import ndimage  # not part of the robot's side
+
+    surface = _ground_surface(points, method)
+    slope = _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
     mask = np.zeros(len(points), dtype=bool)
-    slope = _slope(surface)
     for start in range(0, len(points), _PORTION):
         part = points[start : start + _PORTION]
         # float32 may round the outermost point up to the next cell
         column = np.minimum(((part[:, 0] - surface.x0) / surface.cell).astype(np.intp), slope.shape[1] - 1)
         row = np.minimum(((part[:, 1] - surface.y0) / surface.cell).astype(np.intp), slope.shape[0] - 1)
-        allowed = config.class_threshold + config.slope_allowance * slope[row, column]
+        allowed = _CLASS_THRESHOLD + _SLOPE_ALLOWANCE * slope[row, column]
         mask[start : start + len(part)] = np.abs(part[:, 2] - surface.height_at(part[:, :2])) <= allowed
     return mask
 
 
-def ground_surface(points: Points, config: GroundConfig | None = None) -> GroundRaster:
-    """Raster the lowest ground of the cloud's extent, interpolated under buildings and trees, without NaN.
-
-    Arguments and errors as ``ground_mask``; ``points`` must not be empty.
-    """
-    config = config or GroundConfig()
-    method = ground_filter(points, config)
-    corner, shape, flat, cell = _cells_within(points, config)
+def _ground_surface(points: Points, method: Method) -> GroundRaster:
+    """Raster the lowest ground of the cloud's extent, interpolated under buildings and trees, without NaN."""
+    chosen, cell = ground_filter(points, method), _CELL
+    corner, shape, flat = cells(points, cell)
+    while shape[0] * shape[1] > _MAX_CELLS:
+        cell *= 2
+        corner, shape, flat = cells(points, cell)
     index = lowest_per_cell(points, flat)
     lowest, occupied = points[index], flat[index]
     z = np.full(shape, np.nan, dtype=np.float32)
     z.flat[occupied] = lowest[:, 2]
     usable = ~_stray_low(z).flat[occupied]
     lowest, occupied = lowest[usable], occupied[usable]
-    ground = _filtered(lowest, z, occupied, cell, config, method)
-    return GroundRaster(_refined(z, occupied, ground, config, cell), float(corner[0]), float(corner[1]), cell)
-
-
-def _cells_within(points: Points, config: GroundConfig) -> tuple[Floats, tuple[int, int], Ints, float]:
-    cell = config.cell
-    while True:
-        corner, shape, flat = cells(points, cell)
-        if shape[0] * shape[1] <= config.max_cells:
-            return corner, shape, flat, cell
-        cell *= 2
+    ground = np.ones(len(lowest), dtype=bool)
+    if len(lowest) >= _MIN_CELLS:
+        if chosen == "cloth":
+            ground = _cloth_ground(lowest)
+        else:
+            raster = np.full(shape, np.nan, dtype=np.float32)
+            raster.flat[occupied] = lowest[:, 2]
+            ground = _morphological_ground(raster, cell).flat[occupied]
+        if not ground.any():
+            ground[:] = True
+    return GroundRaster(_refined(shape, lowest[:, 2], occupied, ground, cell), float(corner[0]), float(corner[1]), cell)
 
 
 def _stray_low(z: Floats32) -> Bools:
@@ -311,40 +247,19 @@ def _stray_low(z: Floats32) -> Bools:
     return np.asarray(np.isfinite(fourth) & (high < fourth - 1.0))
 
 
-def _filtered(
-    lowest: Points,
-    z: Floats32,
-    occupied: Ints,
-    cell: float,
-    config: GroundConfig,
-    method: Literal["cloth", "morphological"],
-) -> Bools:
-    """Mask the lowest points that are ground; all of them if they are too few for a filter."""
-    if len(lowest) < _MIN_CELLS:
-        return np.ones(len(lowest), dtype=bool)
-    if method == "cloth":
-        ground = cloth_ground(lowest, config)
-    else:
-        raster = np.full(z.shape, np.nan, dtype=np.float32)
-        raster.flat[occupied] = lowest[:, 2]
-        ground = morphological_ground(raster, cell).flat[occupied]
-    return ground if bool(ground.any()) else np.ones(len(lowest), dtype=bool)
-
-
-def _refined(z: Floats32, occupied: Ints, ground: Bools, config: GroundConfig, cell: float) -> Floats32:
+def _refined(shape: tuple[int, int], heights: Floats32, occupied: Ints, ground: Bools, cell: float) -> Floats32:
     """Raster the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
     from scipy import ndimage  # not part of the robot's side
 
-    heights = z.flat[occupied]
-    for _ in range(config.refinements + 1):
-        raster = np.full(z.shape, np.nan, dtype=np.float32)
+    for _ in range(_REFINEMENTS + 1):
+        raster = np.full(shape, np.nan, dtype=np.float32)
         raster.flat[occupied[ground]] = heights[ground]
         surface = filled(raster)
         # a little smoothing: single low returns must not pull the surface down, and slopes need a scale
         smooth = ndimage.gaussian_filter(surface, 1.0 / cell, mode="nearest")
         away = np.abs(heights - smooth.flat[occupied])
         slope = _gradient(smooth, cell).flat[occupied]
-        near = away <= config.class_threshold + config.slope_allowance * slope
+        near = away <= _CLASS_THRESHOLD + _SLOPE_ALLOWANCE * slope
         ground = near | (ground & (away <= 2.0 + slope))
         if not ground.any():
             break
@@ -359,13 +274,7 @@ def _gradient(z: Floats32, cell: float) -> Floats32:
     return slope
 
 
-def _slope(surface: GroundRaster) -> Floats32:
-    from scipy import ndimage  # not part of the robot's side
-
-    return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
-
-
-def morphological_ground(z: Floats32, cell: float) -> Bools:
+def _morphological_ground(z: Floats32, cell: float) -> Bools:
     """Mask the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
 
     Openings with growing windows remove objects that are narrower than the window and stand out of the opened surface

@@ -12,15 +12,18 @@ from coview_stream.basemap.ground import ground_mask
 from coview_stream.basemap.progress import Progress
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
-from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Ints, Reals
 from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
-# floors
+# floors of buildings
 _SUBCELL = 0.5  # metres: airborne scans of 8 points/m2 still fill two
 _STEP = 0.1  # metres: height resolution of the columns
 _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
+_HEADROOM = 1.8  # metres of free height above a floor
+_COVER = 6.0  # metres within which a flat surface lies above a floor: a roof in the open has none
+_MIN_AREA = 25.0  # square metres, connected: most smaller floors are overhangs
+_FLATNESS = 2  # steps of height between neighbouring half-metre cells
 
 Described = dict[Channel, npt.NDArray[np.float16]]
 """(M, R, S) of each channel."""
@@ -28,48 +31,8 @@ RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its
 _PORTION = 512  # stations at a time: 7 MB of bins
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
-_CEILING = 6.0  # metres: as LevelConfig.cover
 LEVEL_GAP = 2.5
 """Metres: stations farther apart in height are on different storeys."""
-
-
-@dataclass(frozen=True)
-class LevelConfig:
-    """Criteria of an upper floor; set by hand.
-
-    Attributes:
-        headroom: free height above it, metres.
-        cover: a flat surface must lie above within this height, metres: a roof in the open has none.
-        area: minimal connected area, square metres.
-        flatness: neighbouring half-metre cells differ by less than this, metres.
-    """
-
-    headroom: float = 1.8
-    cover: float = 6.0
-    area: float = 4.0
-    flatness: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not 0.3 <= self.headroom < self.cover <= 50.0:
-            raise ConfigError(f"headroom={self.headroom}, cover={self.cover}: need 0.3 <= headroom < cover <= 50")
-        if not (0.25 <= self.area <= 10_000 and 0.01 <= self.flatness <= 1.0):
-            raise ConfigError(f"area={self.area}, flatness={self.flatness}: need 0.25-10000 m2 and 0.01-1 m")
-
-
-def ground_levels(ground: Points, floors: Points, cell: float) -> Points:
-    """Find the centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
-
-    The lowest level is the ground. A higher one counts only if it is a floor *indoors*: flat, wide, with headroom and
-    a flat cover. So an upper storey counts; a roof or a bridge deck (no cover) and a canopy (not flat) do not, nor does
-    an open parking deck or roof terrace. Heights of upper levels are good to 0.1 m.
-
-    Args:
-        ground: (N, 3) float32 points on the ground, metres.
-        floors: (F, 3) of :func:`indoor_floors`; empty for the ground alone.
-        cell: edge of the squares, whose centres are (k + 1/2) * cell, metres.
-    """
-    base = _squares(ground, cell)
-    return np.concatenate([base, _upper_squares(floors, base, cell)])
 
 
 def below_another(stations: Points, cell: float) -> Bools:
@@ -83,7 +46,7 @@ def below_another(stations: Points, cell: float) -> Bools:
     return below
 
 
-def indoor_floors(points: Points, config: LevelConfig) -> Points:
+def indoor_floors(points: Points) -> Points:
     """Return the half-metre cells (K, 3) of all covered floors, also of the lowest storey, metres."""
     corner, shape, flat = cells(points, _SUBCELL)
     level = np.floor(points[:, 2] / np.float32(_STEP)).astype(np.int64)
@@ -93,34 +56,31 @@ def indoor_floors(points: Points, config: LevelConfig) -> Points:
     column, z = np.divmod(voxels, span)
     # the next occupied voxel of the same column, if there is one
     gap = np.where(column[1:] == column[:-1], (z[1:] - z[:-1]) * _STEP, np.inf)
-    covered = (gap >= config.headroom) & (gap <= config.cover)
+    covered = (gap >= _HEADROOM) & (gap <= _COVER)
     column, floor = column[:-1][covered], z[:-1][covered]
     ceiling = floor + np.round(gap[covered] / _STEP).astype(np.int64)
-    wide = _flat_and_wide(column, floor, ceiling, shape, config)
+    wide = _flat_and_wide(column, floor, ceiling, shape)
     row, col = np.divmod(column[wide], shape[1])
     x, y = corner[0] + (col + 0.5) * _SUBCELL, corner[1] + (row + 0.5) * _SUBCELL
     return np.column_stack([x, y, (floor[wide] + base + 0.5) * _STEP]).astype(np.float32)
 
 
-def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], config: LevelConfig) -> Bools:
+def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) -> Bools:
     """Mask the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
     wide = np.zeros(len(column), dtype=bool)
-    steps = max(1, round(config.flatness / _STEP))
     # candidates of one column differ by the headroom at least, so each slab holds one of a column
-    slab_height = max(steps + 1, int(config.headroom / _STEP))
+    slab_height = int(_HEADROOM / _STEP)
     # slabs overlap by half, or a floor that lies across a border would be cut
     for shift in (0, slab_height // 2):
         slab = (floor + shift) // slab_height
         for number in np.unique(slab):
             index = np.flatnonzero(slab == number)
-            if len(index) * _SUBCELL**2 < config.area:
-                continue
-            inside = _one_slab(column[index], floor[index], ceiling[index], shape, steps, config.area)
-            wide[index[inside]] = True
+            if len(index) * _SUBCELL**2 >= _MIN_AREA:
+                wide[index[_one_slab(column[index], floor[index], ceiling[index], shape)]] = True
     return wide
 
 
-def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], steps: int, area: float) -> Bools:
+def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) -> Bools:
     from scipy import ndimage  # not part of the robot's side
 
     row, col = np.divmod(column, shape[1])
@@ -132,7 +92,7 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], 
     agreeing = np.zeros(len(row), dtype=np.int64)
     for dr in (-1, 0, 1):
         for dc in (-1, 0, 1):
-            near = np.abs(low[row + dr, col + dc] - floor) <= steps
+            near = np.abs(low[row + dr, col + dc] - floor) <= _FLATNESS
             # a ceiling may slope by 45 degrees
             near &= np.abs(high[row + dr, col + dc] - ceiling) <= _SUBCELL / _STEP
             agreeing += near
@@ -141,7 +101,7 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], 
     labels, _ = ndimage.label(solid, structure=np.ones((3, 3)))
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[labels[row, col]] * _SUBCELL**2 >= area)
+    return np.asarray(sizes[labels[row, col]] * _SUBCELL**2 >= _MIN_AREA)
 
 
 def _squares(ground: Points, cell: float) -> Points:
@@ -186,21 +146,19 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     return np.concatenate(levels)
 
 
-_FLOORS = LevelConfig(area=25.0)  # square metres: most smaller floors are overhangs
-
-
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
     """Put stations (M, 3), one per ``block``-sized cell that has ground, at its centre and median ground height.
 
-    With ``levels`` there is one more for every floor of a building above it. (The paper's centroids of 3-D voxels put
-    two stations into some cells.)
+    With ``levels`` there is one more for every floor *indoors* above it: flat, wide, with headroom and a flat cover. An
+    upper storey counts; a roof, a bridge deck or an open parking deck (no cover) and a canopy (not flat) do not.
+    Heights of upper levels are good to 0.1 m. (The paper's centroids of 3-D voxels put two stations into some cells.)
     """
     nothing = np.zeros((0, 3), dtype=np.float32)
     mask = ground_mask(points)
     if not mask.any():
         return nothing
-    floors = indoor_floors(points, _FLOORS) if levels else nothing
-    return ground_levels(points[mask], floors, block)
+    base = _squares(points[mask], block)
+    return np.concatenate([base, _upper_squares(indoor_floors(points), base, block)]) if levels else base
 
 
 def describe_storeys(
@@ -239,7 +197,7 @@ def describe_storeys(
         part = points
         if np.isfinite(floor):
             above = points[:, 2] - floor * _STOREY
-            part = points[(above > -_BELOW_FLOOR) & (above < _CEILING)]
+            part = points[(above > -_BELOW_FLOOR) & (above < _COVER)]
         raster = rasterise(part, corner, RASTER_CELL, config.voxel, margin, points)
         before = done
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from coview_stream.basemap.ground import GroundConfig, GroundRaster, cloth_available, ground_filter, ground_mask
-from coview_stream.basemap.stations import LevelConfig, ground_levels, indoor_floors
+from coview_stream.basemap.ground import GroundRaster, cloth_available, ground_filter, ground_mask
+from coview_stream.basemap.stations import find_stations
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rasters import filled
 
@@ -56,7 +56,7 @@ def test_ground_mask_of_hills_houses_and_trees(
     scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], method: str
 ) -> None:
     points, truth = scene
-    mask = ground_mask(points, GroundConfig(method=method))
+    mask = ground_mask(points, method)
     assert mask.shape == (len(points),)
     assert (truth & ~mask).sum() / truth.sum() < 0.02
     assert (~truth & mask).sum() / (~truth).sum() < 0.005
@@ -72,7 +72,7 @@ def test_ground_filter_prints_nothing_and_leaves_no_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     sys.stdout.write("before\n")
-    ground_mask(scene[0], GroundConfig(method=method))
+    ground_mask(scene[0], method)
     sys.stdout.write("after\n")
     assert capfd.readouterr().out == "before\nafter\n"
     assert not list(tmp_path.iterdir())
@@ -82,12 +82,12 @@ def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
     scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = scene[0]
-    expected = ground_mask(points, GroundConfig(method="morphological"))
+    expected = ground_mask(points, "morphological")
     monkeypatch.setitem(sys.modules, "CSF", None)
     assert ground_filter(points) == "morphological"
     np.testing.assert_array_equal(ground_mask(points), expected)
     with pytest.raises(DependencyError, match="method='morphological'"):
-        ground_mask(points, GroundConfig(method="cloth"))
+        ground_mask(points, "cloth")
 
 
 @pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")
@@ -97,7 +97,7 @@ def test_cloth_filter_is_the_default_where_available(
     points = scene[0]
     assert ground_filter(points) == "cloth"
     assert ground_filter(points[points[:, 0] ** 2 < 4.0]) == "morphological"
-    np.testing.assert_array_equal(ground_mask(points), ground_mask(points, GroundConfig(method="cloth")))
+    np.testing.assert_array_equal(ground_mask(points), ground_mask(points, "cloth"))
 
 
 @pytest.mark.slow
@@ -118,14 +118,6 @@ def test_too_large_extent_is_refused() -> None:
     points = np.array([[0, 0, 0], [9e7, 9e7, 0]], np.float32)
     with pytest.raises(ConfigError, match="stray points"):
         ground_mask(points)
-
-
-@pytest.mark.parametrize(
-    "field", [{"cell": 0.0}, {"rigidness": 4}, {"method": "magic"}, {"class_threshold": float("nan")}]
-)
-def test_ground_config_out_of_range_is_refused(field: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(field))):
-        GroundConfig(**field)  # type: ignore[arg-type]  # fields by name
 
 
 def test_ground_height_is_bilinear_and_ignores_unknown_neighbours() -> None:
@@ -160,12 +152,8 @@ def storeys() -> npt.NDArray[np.float32]:
     return np.concatenate(parts).astype(np.float32)
 
 
-def levels_of(points: npt.NDArray[np.float32], config: LevelConfig) -> npt.NDArray[np.float32]:
-    return ground_levels(points[ground_mask(points)], indoor_floors(points, config), 2.0)
-
-
 def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
-    levels = levels_of(storeys, LevelConfig())
+    levels = find_stations(storeys, 2.0)
     ground, upper = levels[levels[:, 2] < 1], levels[levels[:, 2] >= 1]
     # the whole field, below the house, the bridge and the canopy too, once per square
     assert len(ground) == len(np.unique(ground[:, :2], axis=0)) == 30 * 30
@@ -177,13 +165,12 @@ def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
     np.testing.assert_array_equal(np.mod(levels[:, :2], 2.0), 1.0)
 
 
-def test_floors_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> None:
-    wide = LevelConfig(area=400.0)
-    assert (levels_of(storeys, wide)[:, 2] < 1).all()
-    high = LevelConfig(headroom=3.5)
-    assert (levels_of(storeys, high)[:, 2] < 1).all()
-    with pytest.raises(ConfigError, match="headroom"):
-        LevelConfig(headroom=7.0)
+@pytest.mark.parametrize(("half", "ceiling", "count"), [(10.0, 2.5, 100), (2.0, 2.5, 0), (10.0, 1.5, 0)])
+def test_floors_need_extent_and_headroom(half: float, ceiling: float, count: int) -> None:
+    side = (-half, half)
+    slabs = [_slab((-30, 30), (-30, 30), 0.0, 1), _slab(side, side, 3.0, 2), _slab(side, side, 3.0 + ceiling, 3)]
+    stations = find_stations(np.concatenate(slabs).astype(np.float32), 2.0)
+    assert (stations[:, 2] > 1.0).sum() == count
 
 
 @pytest.mark.slow
@@ -198,7 +185,7 @@ def test_ground_error_on_delft_data(method: str) -> None:
     cloud = read_cloud(path)
     assert cloud.classification is not None
     label = cloud.classification == 2
-    mask = ground_mask(cloud.points, GroundConfig(method=method))
+    mask = ground_mask(cloud.points, method)
     assert (label & ~mask).sum() / label.sum() < 0.01
     assert (label != mask).mean() < 0.035
 
