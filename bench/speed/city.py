@@ -143,7 +143,7 @@ def _built(worlds: list[Path], site: Path) -> dict[str, float]:
 
 
 def _first_opened(site: Path) -> dict[str, float]:
-    working_path(site).unlink(missing_ok=True)
+    working_path(Manifest.load(site)).unlink(missing_ok=True)
     begin = time.monotonic()
     working_file(site)
     return {"seconds": time.monotonic() - begin, "peak": peak_megabytes()}

@@ -131,14 +131,12 @@ class BaseMap:
         """Memory-map a ``.coview`` file, or a site's.
 
         Args:
-            path: the file; or the directory of a site, or a part of one, whose working file is written first if it
-                does not exist.
+            path: the file; or the directory of a site, or a part of one, whose working file is written first if it does
+                not exist.
             check: compare the content with its checksum, for which the whole file is read (a site's working file only
-                the first time). Without, :attr:`sha256` is taken from the file: for one that another process has just
-                checked.
+                the first time). Without, :attr:`sha256` is taken from the file, for one that was just checked.
             verify_key: public key, or its PEM file, that must have signed the map; the content is compared with the
-                signed hashes then, whatever ``check`` says. A :class:`~coview_stream.basemap.signature.Trust` names a
-                file that has been compared already, and is not read again.
+                signed hashes then, unless :class:`~coview_stream.basemap.signature.Trust` says that it has been.
 
         Raises:
             MapError: it is missing, damaged or of another version, an array has another type or shape, or it is not
@@ -154,17 +152,16 @@ class BaseMap:
             place, file = open_site(place, check, None if trust is None else trust.key)
         else:
             file = open_file(place, check, trust)
-        loaded = cls(file.arrays, file.parameters, file.sha256)
+        try:
+            loaded = cls(file.arrays, file.parameters, file.sha256)
+            check_arrays(loaded.arrays, loaded.config)
+        except MapError as error:
+            raise MapError(f"{place}: {error}") from error
         loaded.path, loaded.identity = place.absolute(), file.identity
-        check_arrays(loaded.arrays, loaded.config)
         return loaded
 
     def save(self, path: str | os.PathLike[str], sign_key: SigningKey | None = None) -> str:
-        """Write the map atomically, signed if there is a key, and return its sha256.
-
-        Raises:
-            MapError: that fails.
-        """
+        """Write the map atomically, signed if there is a key, and return its sha256; MapError if that fails."""
         self.sha256 = save(Path(path), without_layers(self.arrays), self.parameters, sign_key)
         return self.sha256
 
@@ -201,16 +198,10 @@ class BaseMap:
         return np.asarray(self.points, dtype=np.float64) + self.origin
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the map from above with matplotlib, in the frame of the sources, metres: poses can be drawn over it.
+        """Draw the map from above, in the frame of the sources, metres, so that poses can be drawn over it.
 
-        Args:
-            axes: to draw into; None makes a new figure (``matplotlib.pyplot.show()`` shows it).
-
-        Returns:
-            The axes.
-
-        Raises:
-            DependencyError: matplotlib is missing.
+        ``axes`` of matplotlib are drawn into; None makes a figure (``matplotlib.pyplot.show()`` shows it). Returns the
+        axes; DependencyError if matplotlib is missing.
         """
         from coview_stream.basemap.summary import draw_plan
 
@@ -223,9 +214,9 @@ class BaseMap:
 
     @cached_property
     def station_index(self) -> StationIndex:
-        """Index of the descriptors, from the file; a file without it takes a second for 10,000 stations here.
+        """Index of the descriptors, from the file; making one takes a second for 10,000 stations.
 
-        Raises :class:`MapError` if the file's index has another number of stations.
+        MapError if the file's index has another number of stations.
         """
         channels = self.config.descriptor.channels
         index = StationIndex.from_arrays(self.arrays, channels)
@@ -238,10 +229,9 @@ class BaseMap:
         return np.array(self.points[:: max(1, -(-len(self.points) // count))])
 
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
-        """Return the descriptors (M, R, S) of one channel.
+        """Return the descriptors (M, R, S) of one channel, which the search does not need.
 
-        The search does not need them. Maps without them make them from the cloud, once: 2 s for 10,000 stations on two
-        cores, 2.4 kB of memory for each.
+        Maps without them make them from the cloud, once: 2 s and 24 MB for 10,000 stations on two cores.
         """
         stored = self.arrays.get(f"descriptor.{name}")
         if stored is not None:
@@ -255,7 +245,7 @@ class BaseMap:
 
     @cached_property
     def learned(self) -> FeatureMap | None:
-        """Learned features, None if the map has none; raises :class:`MapError` if they cannot be read."""
+        """Learned features, None if the map has none; MapError if they cannot be read."""
         parameters = self.parameters.get("learned")
         if parameters is None:
             return None
@@ -270,10 +260,7 @@ class BaseMap:
 
     @cached_property
     def field(self) -> kernels.FieldMap:
-        """Likelihood field, relative to :attr:`origin`; made now for files of earlier versions, which have none.
-
-        Raises :class:`MapError` if the file's field cannot be used.
-        """
+        """Likelihood field, relative to :attr:`origin`; made here if the file has none. MapError if it is invalid."""
         arrays = self.arrays
         if "field.tiles" not in arrays:
             normals = tiles.unit_normals(arrays["normals"])
@@ -289,7 +276,7 @@ class BaseMap:
             raise MapError(f"the map's likelihood field cannot be used ({error}); build it again") from error
 
     def surveyed(self, xy: Reals) -> Bools:
-        """Return for positions (K, 2), relative to :attr:`origin`, whether the map has points around them."""
+        """Return (K,) whether the map has points around positions (K, 2), relative to :attr:`origin`."""
         grid = self.arrays["surveyed"]
         index = np.floor((xy - self.survey.corner) / self.config.block).astype(np.int64)
         inside = ((index >= 0) & (index < np.array(grid.shape)[::-1])).all(axis=1)
@@ -297,19 +284,18 @@ class BaseMap:
         return np.asarray(inside & (grid[index[:, 1], index[:, 0]] > 0))
 
     def require_features(self, reloc: Reloc, load: bool = True) -> str | None:
-        """Check what the first learned query needs: the map's features, the weights and onnxruntime.
+        """Check that learned queries can be answered: the map's features, the weights and onnxruntime.
 
         Args:
-            reloc: how the map is to be searched.
+            reloc: mode of the search.
             load: also load the network, which takes 0.3 s and 60 MB; only searching needs it.
 
         Returns:
             The reason, with the remedy, why ``auto`` does not use the map's features; else None.
 
         Raises:
-            MapError: ``learned`` is asked for, and the map has no features, damaged ones, or some of other weights.
-            InputError: likewise, and there are no weights, or some that cannot be loaded.
-            DependencyError: likewise, and there is no onnxruntime, or one that cannot be loaded.
+            MapError, InputError, DependencyError: with ``learned``, if features, weights or onnxruntime are missing,
+                do not fit together or cannot be loaded.
         """
         if reloc == "coview":
             return None
@@ -358,11 +344,7 @@ def _load_again(kind: type[BaseMap], path: str, sha256: str, identity: FileIdent
 
 
 def load_served(files: Mapping[str, Path], sha256: str) -> BaseMap:
-    """Return the map of a hash from its file, which the node has compared with its hash when it opened the map.
-
-    Raises:
-        MapError: the file cannot be read, or is of another map than the one that is served.
-    """
+    """Return the map of a hash from its file, which the node has checked; MapError if the file is another one now."""
     base_map = BaseMap.load(files[sha256], check=False)
     if base_map.sha256 != sha256:
         raise MapError(f"{files[sha256]}: the file is of another map than the one that is served")

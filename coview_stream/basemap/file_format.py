@@ -108,19 +108,32 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
         key: signs the file; None leaves it unsigned.
 
     Raises:
-        MapError: the directory does not exist or cannot be written, or the path is another kind of file.
+        MapError: as of :func:`check_target`, or the directory cannot be written.
     """
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = _digest(text, contiguous, lambda name: _chunks(contiguous[name]))
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
-    names, header = _layout(contiguous, metadata)
+    header: dict[str, Any] = {"__metadata__": metadata}
+    # arrays that fill cache lines come first, and begin with one; then by item size: each begins at a multiple of it
+    names = sorted(
+        contiguous, key=lambda name: (contiguous[name].nbytes % _CACHE_LINE > 0, -contiguous[name].dtype.itemsize, name)
+    )
+    end = 0
+    for name in names:
+        array = contiguous[name]
+        begin, end = end, end + array.nbytes
+        header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
     if key is not None:
         sign_header(header, {name: sha256_of(_chunks(contiguous[name])) for name in sorted(names)}, key)
     try:
+        # array by array: the safetensors library's own writer holds a second copy of everything
         with atomic_file(path, sync=True) as file:
-            _write(file, contiguous, names, header)
+            file.write(_header_bytes(header))
+            for name in names:
+                for chunk in _chunks(contiguous[name]):
+                    file.write(chunk)
     except OSError as error:
         raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place with room") from error
     return digest
@@ -148,19 +161,6 @@ def check_target(path: Path) -> None:
             raise MapError(f"{path}: exists and is no coview map; delete it or give another name")
 
 
-def _layout(arrays: Arrays, metadata: dict[str, str]) -> tuple[list[str], dict[str, Any]]:
-    """Return the order of the arrays, and the header."""
-    header: dict[str, Any] = {"__metadata__": metadata}
-    # arrays that fill cache lines come first, and begin with one; then by item size: each begins at a multiple of it
-    names = sorted(arrays, key=lambda name: (arrays[name].nbytes % _CACHE_LINE > 0, -arrays[name].dtype.itemsize, name))
-    end = 0
-    for name in names:
-        array = arrays[name]
-        begin, end = end, end + array.nbytes
-        header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
-    return names, header
-
-
 def _header_bytes(header: dict[str, Any]) -> bytes:
     """Return a header with its length, padded to whole cache lines."""
     text = serialized(header)
@@ -175,14 +175,6 @@ def _is_exact(file: BinaryIO, header: dict[str, Any], start: int) -> bool:
         return file.read(start) == _header_bytes(header)
     except (RecursionError, OSError):
         return False
-
-
-def _write(file: BinaryIO, arrays: Arrays, names: list[str], header: dict[str, Any]) -> None:
-    """Write the safetensors layout array by array: the library's own writer holds a second copy of everything."""
-    file.write(_header_bytes(header))
-    for name in names:
-        for chunk in _chunks(arrays[name]):
-            file.write(chunk)
 
 
 def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
@@ -260,11 +252,7 @@ def open_file(
 
 
 def signer(path: Path) -> str | None:
-    """Return the unverified fingerprint of the key that signed a map; None if it is not signed.
-
-    Raises:
-        MapError: it is not a map.
-    """
+    """Return the unverified fingerprint of the key that signed a map, None if none did; MapError if it is no map."""
     try:
         with path.open("rb") as file:
             metadata = _header(path, file)[0].get("__metadata__", {})
@@ -327,7 +315,7 @@ def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
 
 
 def release_arrays(arrays: Arrays) -> None:
-    """Release the memory of arrays that are mapped from a file; pages that are used again are read again."""
+    """Release the memory of arrays that are mapped from a file."""
     for array in arrays.values():
         release(array)
 
@@ -343,11 +331,7 @@ def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[b
 
 
 def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> None:
-    """Check types and shapes of a map's arrays, and values that are used as indices.
-
-    Raises:
-        MapError: an array does not fit a map of this configuration; the message names it.
-    """
+    """Check types and shapes of a map's arrays, and values that are used as indices; MapError names a wrong one."""
     descriptor = ("<f2", ("stations", config.descriptor.rings, config.descriptor.sectors))
     expected = _EXPECTED | {f"descriptor.{name}": descriptor for name in config.descriptor.channels}
     known: dict[str, int] = {}
@@ -363,10 +347,6 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> N
             length = dimension if isinstance(dimension, int) else known.setdefault(dimension, actual)
             if actual != length:
                 raise _refused(name, f"has the shape {array.shape}, with {actual} where {length} were expected")
-    _check_values(arrays)
-
-
-def _check_values(arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     if not np.isfinite(arrays["origin"]).all():
         raise _refused("origin", "is not finite")
     for name in ("surveyed_corner", "stations"):

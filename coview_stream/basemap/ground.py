@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.errors import DependencyError
 from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
 from coview_stream.geometry.rasters import cells, filled, lowest_per_cell
 from coview_stream.geometry.transforms import Points
@@ -167,10 +167,8 @@ def ground_filter(points: Points, method: Method = "auto") -> Literal["cloth", "
     """Choose the filter for these (N, 3) points, metres.
 
     Raises:
-        ConfigError: ``method`` is unknown. DependencyError: it is ``cloth``, and its wheel is not installed.
+        DependencyError: ``method`` is ``cloth``, and its wheel is not installed.
     """
-    if method not in ("auto", "cloth", "morphological"):
-        raise ConfigError(f"method={method!r}: must be auto, cloth or morphological")
     if method == "cloth" and not cloth_available():
         raise DependencyError(
             "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "

@@ -72,11 +72,7 @@ def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
 
 
 def read_names(file: Path) -> list[tuple[str, Path]]:
-    """Return the names and paths in a file of :func:`write_names`.
-
-    Raises:
-        MapError: it is another file.
-    """
+    """Return the names and paths in a file of :func:`write_names`; MapError if it is another file."""
     try:
         data = read_record(file)
         if data["format"] != _NAMES_FORMAT:

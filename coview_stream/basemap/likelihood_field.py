@@ -28,7 +28,6 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 
-# the heights below are set by hand
 _BASE = 8  # metres: a tile's heights count from a multiple of it
 _GROUND_BAND = 0.4  # metres above the lowest point nearby: still the ground
 _STEEPEST = 0.7  # of a normal's vertical part: steeper surfaces are no ground
@@ -69,8 +68,12 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
     voxels = np.unique(flat * 64 + level)
     np.bitwise_or.at(occupied, voxels >> 6, np.uint64(1) << (voxels & 63).astype(np.uint64))
     ground = _ground_heights(points, normals, flat, (int(shape[0]), int(shape[1])))
-    edge = _edges(points, flat, (int(shape[0]), int(shape[1])))
-    tiles, used = _tiles(known)
+    top_height = np.full(shape[0] * shape[1], _NOTHING, dtype=np.float32)
+    np.maximum.at(top_height, flat, np.ascontiguousarray(points[:, 2]))
+    edge = roof_edges(top_height.reshape(shape))
+    down, across = (shape // TILE).tolist()
+    used = np.flatnonzero(known.reshape(down, TILE, across, TILE).any(axis=(1, 3)).ravel())
+    tiles = np.column_stack(np.divmod(used, across))
     heights = _tiles_of(ground, used)
     base = np.floor(np.nanmin(heights.reshape(len(heights), -1), axis=1, initial=np.inf) / _BASE)
     base = np.where(np.isfinite(base), base, 0.0).astype(np.int32) * _BASE
@@ -117,13 +120,6 @@ def without_layers(arrays: Arrays) -> Arrays:
     return {name: values for name, values in arrays.items() if not name.startswith(LAYERS)}
 
 
-def _tiles(known: Bools) -> tuple[Ints, Ints]:
-    """Return row and column (T, 2) of the tiles with any surveyed cell, and their number among all tiles (T,)."""
-    down, across = known.shape[0] // TILE, known.shape[1] // TILE
-    used = np.flatnonzero(known.reshape(down, TILE, across, TILE).any(axis=(1, 3)).ravel())
-    return np.column_stack(np.divmod(used, across)), used
-
-
 def _tiles_of(raster: npt.NDArray[_Number], used: Ints) -> npt.NDArray[_Number]:
     """Cut a raster into the tiles (T, TILE, TILE) that are used."""
     down, across = raster.shape[0] // TILE, raster.shape[1] // TILE
@@ -164,12 +160,6 @@ def _grown(ground: Floats) -> Floats:
                 count += there[window]
         ground = np.where(has | (count == 0), ground, total / np.maximum(count, 1.0))
     return ground
-
-
-def _edges(points: Points, flat: Ints, shape: tuple[int, int]) -> Floats32:
-    top = np.full(shape[0] * shape[1], _NOTHING, dtype=np.float32)
-    np.maximum.at(top, flat, np.ascontiguousarray(points[:, 2]))
-    return roof_edges(top.reshape(shape))
 
 
 def roof_edges(top: Floats32) -> Floats32:

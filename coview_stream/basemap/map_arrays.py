@@ -51,49 +51,8 @@ class Tiles(Protocol):
         """Return the likelihood field of a tile; no arrays where nothing is surveyed."""
 
 
-class Store(Protocol):
-    """Place for arrays that grow tile by tile, in memory or in files."""
-
-    def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return a new array of zeros to write to."""
-
-    def append(self, name: str, rows: npt.NDArray[Any]) -> int:
-        """Append rows (N, ...) to an array, and return how many it had."""
-
-    def arrays(self) -> Arrays:
-        """Return all arrays by name."""
-
-    def release(self) -> None:
-        """Release the memory of arrays that are in files."""
-
-
-class MemoryTile:
-    """The single tile of a map that is built in memory."""
-
-    def __init__(
-        self, config: MapConfig, points: Points, normals: Int8s, stations: Floats32, descriptors: Described
-    ) -> None:
-        """Take points (N, 3) and int8 normals (N, 3) in the order of the file, stations (M, 3) and descriptors."""
-        self.config, self.stations = config, {(0, 0): stations}
-        self._points, self._normals, self._descriptors = points, normals, descriptors
-        self._cells = cells_of(points, config.block)
-
-    def cells(self, beside: bool) -> Ints:
-        """Return column and row (K, 2) of the blocks that hold points."""
-        return self._cells
-
-    def described(self, wanted: Ints, keys: Collection[Key] | None = None) -> Iterator[tuple[Described, Ints]]:
-        """Yield the descriptors of stations (K,), and their numbers."""
-        whole = len(wanted) == len(self.stations[0, 0])
-        yield self._descriptors if whole else {name: v[wanted] for name, v in self._descriptors.items()}, wanted
-
-    def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
-        """Return the likelihood field."""
-        return field_arrays(self._points, unit_normals(self._normals), surveyed, corner, self.config.block)
-
-
 class MemoryArrays:
-    """Arrays in memory."""
+    """Arrays by name that grow tile by tile, here in memory (files: :class:`~.site.array_files.ArrayFiles`)."""
 
     def __init__(self) -> None:
         self._parts: dict[str, list[npt.NDArray[Any]]] = {}
@@ -114,7 +73,32 @@ class MemoryArrays:
         return {name: parts[0] if len(parts) == 1 else np.concatenate(parts) for name, parts in self._parts.items()}
 
     def release(self) -> None:
-        """Do nothing."""
+        """Release the memory of arrays that are in files."""
+
+
+class MemoryTile:
+    """The single tile of a map that is built in memory."""
+
+    def __init__(
+        self, config: MapConfig, points: Points, normals: Int8s, stations: Floats32, descriptors: Described
+    ) -> None:
+        # points (N, 3) and int8 normals (N, 3) in the order of the file, stations (M, 3)
+        self.config, self.stations = config, {(0, 0): stations}
+        self._points, self._normals, self._descriptors = points, normals, descriptors
+        self._cells = cells_of(points, config.block)
+
+    def cells(self, beside: bool) -> Ints:
+        """Return column and row (K, 2) of the blocks that hold points."""
+        return self._cells
+
+    def described(self, wanted: Ints, keys: Collection[Key] | None = None) -> Iterator[tuple[Described, Ints]]:
+        """Yield the descriptors of stations (K,), and their numbers."""
+        whole = len(wanted) == len(self.stations[0, 0])
+        yield self._descriptors if whole else {name: v[wanted] for name, v in self._descriptors.items()}, wanted
+
+    def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
+        """Return the likelihood field."""
+        return field_arrays(self._points, unit_normals(self._normals), surveyed, corner, self.config.block)
 
 
 class EarlierMap:
@@ -127,21 +111,11 @@ class EarlierMap:
     def __init__(
         self, arrays: Arrays | None = None, spans: Mapping[Key, tuple[slice, slice]] | None = None, channels: Any = ()
     ) -> None:
-        """Take an earlier map.
-
-        Args:
-            arrays: its arrays.
-            spans: stations and rows of the field of each tile that is unchanged.
-            channels: of the descriptors.
-        """
+        """Take arrays, spans (stations, rows of the field) of the unchanged tiles, and the descriptors' channels."""
         self._arrays = arrays or {}
         self._index = StationIndex.from_arrays(self._arrays, channels)
         usable = self._index is not None and all(name in self._arrays for name in FIELD_ARRAYS)
         self._spans = dict(spans or {}) if usable else {}
-
-    def __len__(self) -> int:
-        """Return the number of tiles that can be copied."""
-        return len(self._spans)
 
     def stations(self, key: Key) -> slice | None:
         """Return the numbers of a tile's stations in the earlier map; None for a tile that has changed."""
@@ -177,7 +151,7 @@ class EarlierMap:
 
 
 def map_arrays(
-    tiles: Tiles, into: Store, earlier: EarlierMap | None = None, step: Callable[[], None] = lambda: None
+    tiles: Tiles, into: MemoryArrays, earlier: EarlierMap | None = None, step: Callable[[], None] = lambda: None
 ) -> tuple[Arrays, dict[Key, int]]:
     """Make stations, surveyed cells, likelihood field and station codes of a map.
 
@@ -213,7 +187,9 @@ def map_arrays(
     return {"stations": whole, "surveyed": surveyed, "surveyed_corner": corner, **into.arrays(), **index}, rows
 
 
-def _station_codes(tiles: Tiles, stations: int, into: Store, earlier: EarlierMap, step: Callable[[], None]) -> Arrays:
+def _station_codes(
+    tiles: Tiles, stations: int, into: MemoryArrays, earlier: EarlierMap, step: Callable[[], None]
+) -> Arrays:
     """Make the station codes in ``into``, and return the other arrays of the station index.
 
     Descriptors of all stations are never in memory at once, unless the tiles hold them.
@@ -231,8 +207,8 @@ def _station_codes(tiles: Tiles, stations: int, into: Store, earlier: EarlierMap
     else:
         sample = _together(tiles, sampled)[1]
     begin = 0
-    for key, count in ((key, len(positions)) for key, positions in tiles.stations.items()):
-        before = earlier.stations(key) if copies else None
+    for key, positions in tiles.stations.items():
+        count, before = len(positions), earlier.stations(key) if copies else None
         if before is None:
             for part, numbers in tiles.described(np.arange(begin, begin + count), [key]):
                 StationCodes.encode_tiers(tiers, slice(int(numbers[0]), int(numbers[-1]) + 1), list(part.values()))

@@ -38,11 +38,15 @@ class MapPart:
 
     def own(self, T: Pose) -> Pose:
         """Transform a pose (4, 4) from the joined frame to this map's own."""
-        return _shifted(T, -np.array(self.shift))
+        out = np.array(T, dtype=np.float64)
+        out[:3, 3] -= self.shift
+        return out
 
     def joined(self, T: Pose) -> Pose:
         """Transform a pose (4, 4) from this map's own frame to the joined frame."""
-        return _shifted(T, np.array(self.shift))
+        out = np.array(T, dtype=np.float64)
+        out[:3, 3] += self.shift
+        return out
 
 
 class MapParts(Sequence[MapPart]):
@@ -84,11 +88,7 @@ class MapParts(Sequence[MapPart]):
         return self._parts[max(number, 0)]
 
     def named(self, name: str | None) -> MapPart:
-        """Return a part by its name.
-
-        Raises:
-            InputError: there is none; the message names the parts.
-        """
+        """Return a part by its name; InputError if there is none; the message names the parts."""
         for part in self._parts:
             if part.name == name:
                 return part
@@ -114,9 +114,3 @@ def _part(row: Mapping[str, Any]) -> MapPart:
     if not isinstance(sha256, str) or not isinstance(crs, str | None):
         raise ValueError("sha256 or crs is no text")
     return MapPart(name, sha256, crs, (numbers[0], numbers[1], numbers[2]), numbers[3], numbers[4])
-
-
-def _shifted(T: Pose, shift: Floats) -> Pose:
-    out = np.array(T, dtype=np.float64)
-    out[:3, 3] += shift
-    return out

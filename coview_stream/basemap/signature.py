@@ -37,7 +37,7 @@ class VerifyKey:
     @property
     def fingerprint(self) -> str:
         """First half of the sha256 of the key's bytes, in hexadecimal digits."""
-        return _fingerprint(self.raw)
+        return sha256_of([self.raw])[:32]
 
     def verifies(self, message: bytes, signature: bytes) -> bool:
         """Tell whether the key's owner has signed the message."""
@@ -51,10 +51,10 @@ class VerifyKey:
 
 
 class SigningKey:
-    """Private key that maps are signed with.
+    """Private key that maps are signed with, from a PEM file that is not encrypted.
 
-    Args:
-        path: a PEM file, not encrypted.
+    Attributes:
+        fingerprint: of its public key.
 
     Raises:
         InputError: it cannot be read, or holds no private ed25519 key. DependencyError: no ``cryptography``.
@@ -74,12 +74,7 @@ class SigningKey:
         if not isinstance(key, kind):
             raise InputError(f"{path}: the key is not ed25519; make one with 'coview-stream keygen'")
         self._key: Any = key
-        self._raw: bytes = key.public_key().public_bytes_raw()
-
-    @property
-    def fingerprint(self) -> str:
-        """That of its public key."""
-        return _fingerprint(self._raw)
+        self.fingerprint = VerifyKey(key.public_key().public_bytes_raw(), "").fingerprint
 
     def sign(self, message: bytes) -> bytes:
         """Return the 64 bytes that only the owner of this key can make of the message."""
@@ -139,11 +134,7 @@ def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
             raise InputError(
                 f"{path}: cannot be written ({error.strerror}); give a name in a writable place"
             ) from error
-    return private, public, _fingerprint(key.public_key().public_bytes_raw())
-
-
-def _fingerprint(raw: bytes) -> str:
-    return hashlib.sha256(raw).hexdigest()[:32]
+    return private, public, VerifyKey(key.public_key().public_bytes_raw(), "").fingerprint
 
 
 def _library(module: str) -> Any:
@@ -185,7 +176,7 @@ class Trust(NamedTuple):
 
 
 def file_identity(file: BinaryIO) -> FileIdentity:
-    """Return that of an open file."""
+    """Return the state of an open file."""
     now = os.fstat(file.fileno())
     return FileIdentity(now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns)
 
@@ -203,13 +194,7 @@ def sign_header(header: dict[str, Any], sections: dict[str, str], key: SigningKe
 
 
 def check_signature(path: Path, header: dict[str, Any], exact: bool, key: VerifyKey) -> None:
-    """Verify a header.
-
-    Args:
-        path: the file, for messages.
-        header: as it was read.
-        exact: whether the file holds it byte for byte as we write it.
-        key: has to have signed it.
+    """Verify a header as it was read; ``exact``: the file holds it byte for byte as we write it.
 
     Raises:
         MapError: it is not signed, not by this key, or has been changed since.
@@ -238,11 +223,7 @@ def check_signature(path: Path, header: dict[str, Any], exact: bool, key: Verify
 
 
 def check_sections(header: dict[str, Any], content: Callable[[str], Iterable[bytes]]) -> None:
-    """Compare the content of each array with its signed hash.
-
-    Raises:
-        ValueError: one differs, or not all have one.
-    """
+    """Compare the content of each array with its signed hash; ValueError if one differs, or not all have one."""
     sections = json.loads(header["__metadata__"]["sections"])
     names = header.keys() - {"__metadata__"}
     if sections.keys() != names:

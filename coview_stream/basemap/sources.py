@@ -62,14 +62,10 @@ class Source:
 
     def sha256(self) -> str:
         """Return the hash of the file, or of the array's numbers, row by row."""
-        digest = hashlib.sha256()
         if self.rows is not None:
-            digest.update(np.ascontiguousarray(self.rows).data)
-            return digest.hexdigest()
+            return hashlib.sha256(np.ascontiguousarray(self.rows).data).hexdigest()
         with self.path.open("rb") as file:
-            while chunk := file.read(1 << 22):
-                digest.update(chunk)
-        return digest.hexdigest()
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[Source]:
@@ -99,7 +95,12 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
             sources += [Source(path, None, crs) for path in expand_cloud_paths([item])]
         else:
             name = "array" if arrays == 1 else f"array {number}"
-            sources.append(Source(Path(name), _rows(item, name), crs))
+            array = np.asarray(item) if hasattr(item, "__array__") else None  # pandas and tensors have it, too
+            if array is None or array.ndim != 2 or array.shape[1] < 3:
+                flaw = f"is a {type(item).__name__}" if array is None else f"has shape {array.shape}"
+                raise CloudError(f"{name} {flaw}; give a cloud file, or an array (N, 3) of metres")
+            kind: Any = np.float32 if array.dtype == np.float32 else np.float64
+            sources.append(Source(Path(name), to_array(array[:, :3], kind, name), crs))
     places = [source.path.resolve() for source in sources if source.rows is None]
     for place in places:
         if places.count(place) > 1:
@@ -112,13 +113,3 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     """Return the file names of paths; of files with the same name the whole paths."""
     names = [path.name for path in paths]
     return [path.name if names.count(path.name) == 1 else str(path) for path in paths]
-
-
-def _rows(values: Any, name: str) -> Reals:
-    array = np.asarray(values) if hasattr(values, "__array__") else None  # tables of pandas and tensors have it, too
-    if array is None or array.ndim != 2 or array.shape[1] < 3:
-        flaw = f"is a {type(values).__name__}" if array is None else f"has shape {array.shape}"
-        raise CloudError(f"{name} {flaw}; give a cloud file, or an array (N, 3) of metres")
-    if array.dtype == np.float32:
-        return to_array(array[:, :3], np.float32, name)
-    return to_array(array[:, :3], np.float64, name)

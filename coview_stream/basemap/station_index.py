@@ -34,8 +34,7 @@ class ScoredQuery:
     """A query of :class:`StationIndex`.
 
     Attributes:
-        coded: the query, its channels weighted by the inverse of their spread.
-        rest: the same, for the second tier; None without one.
+        coded, rest: by tier, its channels weighted by the inverse of their spread; no ``rest`` without a second tier.
         screen_zero: z-score of zero correlation by the first tier alone.
         zero: the same by both tiers.
     """
@@ -46,20 +45,6 @@ class ScoredQuery:
     zero: float
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """Sample of stations by which queries are standardised.
-
-    Attributes:
-        codes, rest: codes by tier.
-        spectra: spectra of the descriptors by channel.
-    """
-
-    codes: StationCodes
-    rest: StationCodes
-    spectra: dict[Channel, Complexes]
-
-
 class StationIndex:
     """Codes of the stations' descriptors (:class:`coview_kernels.StationCodes`), and a sample of the descriptors.
 
@@ -68,18 +53,14 @@ class StationIndex:
     """
 
     def __init__(self, codes: StationCodes, rest: StationCodes | None, sample: Descriptors) -> None:
-        """Take the tiers of codes, the second of which is optional, and the descriptors of a sample."""
+        # the second tier is optional; ``sample``: the descriptors of the stations of sampled_stations()
         self.codes = codes
         self.rest = rest
         self._descriptors = sample
 
     @classmethod
     def of(cls, descriptors: Descriptors) -> StationIndex:
-        """Make the index of stations from their descriptors.
-
-        Raises:
-            MapError: too many stations.
-        """
+        """Make the index of stations from their descriptors; MapError if too many stations."""
         stations = len(next(iter(descriptors.values())))
         if stations > StationCodes.MAX_STATIONS:
             limit = StationCodes.MAX_STATIONS
@@ -144,11 +125,11 @@ class StationIndex:
         return self.codes.sectors
 
     @cached_property
-    def _sample(self) -> _Sample:
-        """Evenly spaced stations."""
+    def _sample(self) -> tuple[StationCodes, StationCodes, dict[Channel, Complexes]]:
+        """Sample by which queries are standardised: codes by tier, and spectra of the descriptors by channel."""
         codes, rest = (tier.subset(sampled_stations(len(self))) for tier in self.tiers)
-        known = self._descriptors.items()
-        return _Sample(codes, rest, {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known})
+        spectra = {name: kernels.column_spectra(d.astype(np.float32)) for name, d in self._descriptors.items()}
+        return codes, rest, spectra
 
     def prepare(self) -> None:
         """Do the one-time work of the first query, and compile its kernels."""
@@ -158,25 +139,25 @@ class StationIndex:
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
-        sample = self._sample
-        stations = np.arange(len(sample.codes))
+        sample, sample_rest, all_spectra = self._sample
+        stations = np.arange(len(sample))
         mean = np.zeros((len(stations), self.sectors), dtype=np.float32)
         columns = []
-        for name, spectra in sample.spectra.items():
+        for name, spectra in all_spectra.items():
             distance = kernels.all_shift_distance(descriptors[name], spectra, self.sectors)
             median = np.median(distance)
-            weight = np.float32(1.0 / (len(sample.spectra) * (1.4826 * np.median(np.abs(distance - median)) + 1e-6)))
+            weight = np.float32(1.0 / (len(all_spectra) * (1.4826 * np.median(np.abs(distance - median)) + 1e-6)))
             mean += (distance - median) * weight
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
         coded = self.codes.query(stacked)
         # codes leave out components of every query; correct the mean
-        mean += sample.codes.all_shifts(coded, stations)
+        mean += sample.all_shifts(coded, stations)
         screen_zero = float(np.median(mean))
         if self.rest is None:
             return ScoredQuery(coded, None, screen_zero, screen_zero)
         rest = self.rest.query(stacked)
-        mean += sample.rest.all_shifts(rest, stations)
+        mean += sample_rest.all_shifts(rest, stations)
         return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
@@ -210,5 +191,4 @@ def sampled_stations(stations: int) -> Ints:
 
 
 def _names(tier: str) -> tuple[str, str, str, str]:
-    """Return the names of a tier's arrays in a file."""
     return tier, f"{tier}.basis", f"{tier}.step", f"{tier}.norm"

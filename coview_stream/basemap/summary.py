@@ -80,15 +80,16 @@ class MapSummary:
     def __str__(self) -> str:
         """Return one line."""
         density = "" if self.density is None else f", {self.density:.3g} points/m2"
+        area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
         return (
-            f"{self.width:.0f} x {self.depth:.0f} m with points on {_area(self.area)}{density}, "
+            f"{self.width:.0f} x {self.depth:.0f} m with points on {area}{density}, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "
             f"{self.bytes / 1e6:.0f} MB as one file ({self.bytes / self.area / 1e3:.2g} GB per km2)"
         )
 
 
 class SummarizedMap(Protocol):
-    """What a summary needs of a :class:`~coview_stream.basemap.basemap.BaseMap`."""
+    """Attributes of a :class:`~coview_stream.basemap.basemap.BaseMap` that a summary reads."""
 
     config: MapConfig
     crs: str | None
@@ -116,6 +117,13 @@ def summary(base_map: SummarizedMap) -> MapSummary:
     area = float(covered.sum()) * _CELL**2
     read = base_map.parameters.get("source_points")
     density = read / area if isinstance(read, int) and read > 0 else None
+    thin = None
+    if density is not None and density < _THIN:
+        thin = (
+            f"{density:.2g} points/m2 are few: on {_THIN:.0f} and less the first pose may come after 100 m of driving, "
+            "or not at all; use a denser survey if there is one"
+        )
+    warnings = _upright(base_map), thin, _structured(points, index, covered), _covered(base_map)
     return MapSummary(
         float(high[0] - low[0]),
         float(high[1] - low[1]),
@@ -125,17 +133,8 @@ def summary(base_map: SummarizedMap) -> MapSummary:
         density=density,
         crs=short_name(base_map.crs),
         bytes=base_map.nbytes,
-        warnings=tuple(filter(None, (
-            _upright(base_map),
-            _dense(density),
-            _structured(points, index, covered),
-            _covered(base_map),
-        ))),
-    )  # fmt: skip
-
-
-def _area(metres: float) -> str:
-    return f"{metres / 1e6:.2f} km2" if metres >= 1e5 else f"{metres:.0f} m2"
+        warnings=tuple(filter(None, warnings)),
+    )
 
 
 def _dense(density: float | None) -> str | None:
@@ -199,19 +198,13 @@ def _covered(base_map: SummarizedMap) -> str | None:
 
 
 def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, axes: Any = None) -> Any:
-    """Draw a map from above in the frame of its sources, metres, darker where it is higher.
+    """Draw a map from above in the frame of its sources, metres, darker where it is higher; return the axes.
 
     Args:
         sampled: returns at most so many of the map's points (N, 3).
         origin: (3,) of these points, in the frame of the sources.
         voxel: metres between points.
-        axes: of matplotlib, to draw into; None makes a figure of its own.
-
-    Returns:
-        The axes.
-
-    Raises:
-        DependencyError: matplotlib is missing.
+        axes: of matplotlib, to draw into; None makes a figure. DependencyError if matplotlib is missing.
     """
     if axes is None:
         axes = require_library("matplotlib.pyplot", "matplotlib>=3.8", "pictures of maps").figure().add_subplot()
@@ -306,11 +299,7 @@ class MapView:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> MapView:
-        """Read untrusted data of :meth:`to_json`.
-
-        Raises:
-            MessageError: a field is missing or invalid; the message names it.
-        """
+        """Read untrusted data of :meth:`to_json`; MessageError names a field that is missing or invalid."""
         count, ground = (_whole(data, name) for name in ("count", "ground"))
         step: Any = data.get("step_m")
         crs, sha256 = data.get("crs"), data.get("map_sha256")

@@ -59,11 +59,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
 
 
 def read_times(path: str | os.PathLike[str]) -> Floats:
-    """Read stamps (N,) in seconds, one a line, increasing.
-
-    Raises:
-        RunError: as ``read_tum``.
-    """
+    """Read stamps (N,) in seconds, one a line, increasing; RunError as ``read_tum``."""
     path = Path(path)
     rows, lines = _read_rows(path, 1, "one stamp in seconds")
     check_stamps(rows[:, 0], lines, path)

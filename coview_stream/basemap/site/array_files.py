@@ -13,44 +13,36 @@ import mmap
 import os
 import tempfile
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.file_format import Arrays
+from coview_stream.basemap.map_arrays import MemoryArrays
 from coview_stream.errors import MapError
 
 Array = npt.NDArray[Any]
 
 
-class ArrayFiles:
+class ArrayFiles(MemoryArrays):
     """Arrays by name, each in a file: made whole by :meth:`zeros`, or row by row by :meth:`append`."""
 
     def __init__(self, folder: Path) -> None:
-        """Use this folder."""
+        super().__init__()
         self._folder = folder
         self._files: dict[str, io.FileIO] = {}
         self._shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         self._mapped: list[Array] = []
 
     def __enter__(self) -> ArrayFiles:
-        """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Delete the files."""
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Array:
-        """Return a new array of zeros to write to.
-
-        Raises:
-            MapError: there is no space.
-        """
+        """Return a new array of zeros to write to; MapError if there is no space."""
         kind = np.dtype(dtype)
         size = kind.itemsize * math.prod(shape)
         file = self._new(name, kind, tuple(shape))
@@ -66,11 +58,7 @@ class ArrayFiles:
         return made
 
     def append(self, name: str, rows: Array) -> int:
-        """Append rows (N, ...) to an array, and return how many it had.
-
-        Raises:
-            MapError: there is no space.
-        """
+        """Append rows (N, ...) to an array, and return how many it had; MapError if there is no space."""
         file = self._files.get(name) or self._new(name, rows.dtype, (0, *rows.shape[1:]))
         kind, (before, *rest) = self._shapes[name]
         if kind != rows.dtype or tuple(rest) != rows.shape[1:]:

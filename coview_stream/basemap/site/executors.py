@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from coview_stream.errors import ConfigError, MapError, require_library
 
@@ -22,25 +22,13 @@ MAX_WORKERS = 256
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Executor(Protocol):
-    """Runner of one function for many items."""
+class Executor:
+    """Runner of one function for many items, here in this process."""
 
     def run(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Exception]]:
         """Yield the number of each item with its result or its exception, in any order."""
-
-    def close(self) -> None:
-        """End the workers."""
-
-
-class SerialExecutor:
-    """Executor in this process."""
-
-    def run(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | Exception]]:
-        """Yield the results in the order of the items."""
         for number, item in enumerate(items):
             try:
                 yield number, function(item)
@@ -48,10 +36,10 @@ class SerialExecutor:
                 yield number, error
 
     def close(self) -> None:
-        """Do nothing."""
+        """End the workers."""
 
 
-class ProcessExecutor:
+class ProcessExecutor(Executor):
     """Executor in processes of this machine, each with one thread for its libraries.
 
     After a process has died, its items run again one at a time; the item that kills its process gets an error.
@@ -109,7 +97,7 @@ class ProcessExecutor:
         return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """Executor on a Dask scheduler, whose workers have the same files under the same names.
 
     Args:

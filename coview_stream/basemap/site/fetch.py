@@ -51,30 +51,10 @@ class SiteSource(Protocol):
         """Return a layer's bytes, ``size`` + 1 at most. TransportError: they cannot be fetched now."""
 
     def close(self) -> None:
-        """Close connections."""
+        """Close connections, if any are open."""
 
 
-class DirectorySource:
-    """A site's directory on a local disk or a network file system."""
-
-    def __init__(self, directory: Path) -> None:
-        """Read from a directory."""
-        self.name = str(directory)
-        self._directory, self._store = directory, TileStore(directory)
-
-    def manifest(self) -> bytes:
-        """Return the manifest's bytes."""
-        return _read(self._directory / FILE, MAX_MANIFEST)
-
-    def layer(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes."""
-        return _read(self._store.path(sha256), size)
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-class WebSource:
+class WebSource(SiteSource):
     """A site's directory on any web server: plain files below an address."""
 
     def __init__(self, address: str) -> None:
@@ -106,11 +86,8 @@ class WebSource:
         except CloudError as error:
             raise TransportError(str(error)) from error
 
-    def close(self) -> None:
-        """Nothing is open."""
 
-
-class ObjectStoreSource:
+class ObjectStoreSource(SiteSource):
     """A site below a prefix of an object store: ``s3://bucket/prefix``, also ``gs://`` and ``az://``.
 
     Keys and regions come from the environment, as obstore reads it (``AWS_ACCESS_KEY_ID`` ...).
@@ -133,9 +110,6 @@ class ObjectStoreSource:
         """Return a layer's bytes."""
         return self._get(layer_path(sha256), size)
 
-    def close(self) -> None:
-        """Nothing is open."""
-
     def _get(self, path: str, limit: int) -> bytes:
         try:
             raw = bytearray()
@@ -151,14 +125,6 @@ class ObjectStoreSource:
 def is_site_address(name: object) -> bool:
     """Return whether a name is the address of a site, not the path of a map."""
     return urlsplit(str(name)).scheme in ("zenoh", "http", "https", "s3", "gs", "az") and "://" in str(name)
-
-
-def _read(path: Path, limit: int) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(limit + 1)
-    except (OSError, MapError) as error:
-        raise TransportError(f"{path}: cannot be read ({error})") from error
 
 
 def _body(answer: Any, limit: int, address: str) -> bytes:

@@ -202,11 +202,7 @@ def square_metres(points: Points) -> int:
 
 
 def columns_of(tile: float, voxel: float) -> int:
-    """Return the number of voxels along a tile's edge.
-
-    Raises:
-        MapError: too many, or none.
-    """
+    """Return the number of voxels along a tile's edge; MapError if too many, or none."""
     across = int(np.ceil(tile / voxel - 1e-6)) if voxel > 0 else 0
     if not 0 < across * across <= _MAX_COLUMNS:
         raise MapError(f"tiles of {tile:g} m in voxels of {voxel:g} m: choose smaller tiles or larger voxels")

@@ -139,11 +139,7 @@ class Manifest:
         return replace(self, signer=key.fingerprint, signature=key.sign(_PURPOSE + self._content()).hex())
 
     def check_signature(self, key: VerifyKey, name: str) -> None:
-        """Verify the signature.
-
-        Raises:
-            MapError: it is not signed, or not by this key.
-        """
+        """Verify the signature; MapError if it is not signed, or not by this key."""
         if not self.signature:
             raise MapError(
                 f"{name}: the site is not signed, and a signature by {key.name} is asked for; build it with --sign and "
@@ -168,11 +164,7 @@ class Manifest:
 
     @classmethod
     def from_bytes(cls, raw: bytes, name: str) -> Manifest:
-        """Read untrusted bytes of :meth:`to_bytes`.
-
-        Raises:
-            MapError: they are no manifest, or of an unknown version.
-        """
+        """Read untrusted bytes of :meth:`to_bytes`; MapError if they are no manifest, or of an unknown version."""
         try:
             data = json.loads(raw)
             if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -187,11 +179,7 @@ class Manifest:
             raise MapError(f"{name}: cannot be read as a manifest ({reason}); fetch or build the site again") from error
 
     def save(self, directory: Path) -> None:
-        """Write it into a site's directory, complete or not at all.
-
-        Raises:
-            MapError: it cannot be written.
-        """
+        """Write it into a site's directory, complete or not at all; MapError if it cannot be written."""
         try:
             with atomic_file(directory / FILE, sync=True) as file:
                 file.write(self.to_bytes())
@@ -200,11 +188,7 @@ class Manifest:
 
     @classmethod
     def load(cls, directory: Path) -> Manifest:
-        """Read the manifest of a site's directory.
-
-        Raises:
-            MapError: it is missing, or cannot be read.
-        """
+        """Read the manifest of a site's directory; MapError if it is missing, or cannot be read."""
         path = directory / FILE
         try:
             with path.open("rb") as file:
@@ -376,11 +360,7 @@ def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
 
 
 def read_part(path: Path) -> tuple[Path, set[Key]]:
-    """Return the site's directory and the tiles in a file of :func:`part_file`.
-
-    Raises:
-        MapError: it is another file.
-    """
+    """Return the site's directory and the tiles in a file of :func:`part_file`; MapError if it is another file."""
     try:
         data = read_record(path)
         if data["format"] != _FORMAT:

@@ -16,7 +16,7 @@ import numpy as np
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import SigningKey
-from coview_stream.basemap.site.executors import Executor, SerialExecutor
+from coview_stream.basemap.site.executors import Executor
 from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
@@ -87,7 +87,7 @@ def build_site(
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise MapError(f"{directory}: cannot be written ({error.strerror}); choose a writable place") from error
-    run = _Run(executor or SerialExecutor(), keep_going, progress)
+    run = _Run(executor or Executor(), keep_going, progress)
     sources, low, high = _extent(sources, run)
     before = Manifest.load(directory) if is_site(directory) else None
     origin = before.origin if before is not None and before.tile == TILE else origin_of(low, high)

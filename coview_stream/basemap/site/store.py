@@ -24,8 +24,6 @@ from coview_stream.errors import ConfigError, MapError
 SHA256 = re.compile(r"[0-9a-f]{64}")
 _FOLDER = "layers"
 
-_GB = 1e9
-_MAX_GB = 20.0
 _MAX_RECORD = 1 << 24  # bytes
 _MARK = ".checked"  # suffix of the record of a file that has been compared with its checksum
 
@@ -48,19 +46,11 @@ class TileStore:
         self.folder = directory / _FOLDER
 
     def path(self, sha256: str) -> Path:
-        """Return the file of a layer, which need not exist.
-
-        Raises:
-            MapError: it is no hash.
-        """
+        """Return the file of a layer, which need not exist; MapError if it is no hash."""
         return self.folder.parent / layer_path(sha256)
 
     def put(self, content: bytes) -> str:
-        """Write a layer, unless it exists, and return its hash.
-
-        Raises:
-            MapError: it cannot be written.
-        """
+        """Write a layer, unless it exists, and return its hash; MapError if it cannot be written."""
         sha256 = hashlib.sha256(content).hexdigest()
         path = self.path(sha256)
         if self.holds(sha256, len(content)):
@@ -76,11 +66,7 @@ class TileStore:
         return sha256
 
     def get(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes.
-
-        Raises:
-            MapError: the file is missing, cut off or changed.
-        """
+        """Return a layer's bytes; MapError if the file is missing, cut off or changed."""
         path = self.path(sha256)
         try:
             with path.open("rb") as file:
@@ -150,30 +136,34 @@ def evict(folder: Path, *keep: Path) -> None:
 
     Files that a process holds (:func:`hold`), and ``keep``, stay.
     """
+    text = os.environ.get("COVIEW_CACHE_GB", "20")
+    try:
+        bound = float(text)
+    except ValueError:
+        bound = -1.0
+    if not bound > 0:
+        raise ConfigError(f"COVIEW_CACHE_GB={text}: is no size in GB")
     files = []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
+        parts = [path, *path.rglob("*")]  # of a mirror its files
         with contextlib.suppress(OSError):
-            files.append((_last_used(path), _size(path), path))
-    total, bound = sum(size for _, size, _ in files), _bound()
+            used = [at.stat().st_mtime for at in (path, path.with_suffix(_MARK)) if at.exists()]
+            files.append((max(used, default=0.0), sum(part.stat().st_size for part in parts if part.is_file()), path))
+    total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files):
-        if total <= bound:
+        if total <= bound * 1e9:
             break
-        if path not in keep and not _is_held(path):
-            _remove(path)
-            total -= size
-
-
-def hold(file: BinaryIO) -> None:
-    """Lock an open file against :func:`evict` as long as it, or a mapping of it, is open in any process."""
-    with contextlib.suppress(ImportError, OSError):
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        if path in keep or (path.is_file() and _is_held(path)):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+            path.with_suffix(_MARK).unlink(missing_ok=True)
+        total -= size
 
 
 def _is_held(path: Path) -> bool:
-    if path.is_dir():
-        return False
     try:
         import fcntl
 
@@ -182,8 +172,16 @@ def _is_held(path: Path) -> bool:
     except BlockingIOError:
         return True
     except (ImportError, OSError):
-        return False
+        pass
     return False
+
+
+def hold(file: BinaryIO) -> None:
+    """Lock an open file against :func:`evict` as long as it, or a mapping of it, is open in any process."""
+    with contextlib.suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def checked(path: Path) -> FileIdentity | None:
@@ -209,38 +207,6 @@ def remember_written(path: Path) -> None:
     """Record that a cached file has just been written, with the checksum of its content."""
     with path.open("rb") as file:
         remember_checked(path, file_identity(file))
-
-
-def _last_used(path: Path) -> float:
-    times = [path.stat().st_mtime]
-    with contextlib.suppress(OSError):
-        times.append(path.with_suffix(_MARK).stat().st_mtime)
-    return max(times)
-
-
-def _size(path: Path) -> int:
-    if path.is_dir():
-        return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    return path.stat().st_size
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
-        path.with_suffix(_MARK).unlink(missing_ok=True)
-
-
-def _bound() -> float:
-    text = os.environ.get("COVIEW_CACHE_GB", str(_MAX_GB))
-    try:
-        bound = float(text)
-    except ValueError:
-        bound = -1.0
-    if not bound > 0:
-        raise ConfigError(f"COVIEW_CACHE_GB={text}: is no size in GB")
-    return bound * _GB
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from coview_stream.basemap.file_format import Loaded, open_file, save
@@ -34,7 +35,7 @@ log = logging.getLogger("coview_stream.maps")
 
 
 def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, Loaded]:
-    """Return the working file of a site and its content; a damaged one is written again.
+    """Return the working file of a site, or of the part of one in a file, and its content; a damaged one is made again.
 
     Args:
         place: directory of the site, or the file of a part of it.
@@ -49,15 +50,7 @@ def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = No
 
 
 def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, Loaded]:
-    """Return a file of the cache and its content; a damaged one is written again.
-
-    Args:
-        make: returns the file, and writes it if it does not exist.
-        check: compare the content with its checksum, unless that has been done since it was written.
-
-    Raises:
-        MapError: raised by ``make``.
-    """
+    """Return the cached file that ``make`` returns or writes, and its content; a damaged one is made again."""
     path = make()
     before = checked(path)
     try:
@@ -95,16 +88,14 @@ def working_file(
     manifest = Manifest.load(directory)
     if verify_key is not None:
         manifest.check_signature(verify_key, str(directory))
-    folder, path = cache_folder(), _path(manifest, keys)
+    folder, path = cache_folder(), working_path(manifest, keys)
     with lock(path):
         if path.is_file():
             write_record(_record_name(directory), path.name)
             return path
 
-        def earlier(states: Mapping[Key, str]) -> EarlierMap:
-            channels = config_of_map(manifest.parameters["config"]).descriptor.channels
-            return _open_earlier(earlier_file(directory), states, channels)
-
+        channels = config_of_map(manifest.parameters["config"]).descriptor.channels
+        earlier = partial(_open_earlier, earlier_file(directory), channels)
         with (
             progress_bar(f"{directory}: made ready for this machine", progress, "step") as step,
             ArrayFiles(folder) as into,
@@ -117,11 +108,6 @@ def working_file(
     return path
 
 
-def working_path(directory: Path, keys: Collection[Key] | None = None) -> Path:
-    """Return the path of a site's working file, which need not exist; MapError if the directory is no site."""
-    return _path(Manifest.load(directory), keys)
-
-
 def earlier_file(directory: Path) -> Path | None:
     """Return the working file of a site that was used last, if it still exists."""
     try:
@@ -131,7 +117,7 @@ def earlier_file(directory: Path) -> Path | None:
     return path if path.parent == cache_folder() and path.is_file() else None
 
 
-def _open_earlier(path: Path | None, states: Mapping[Key, str], channels: Sequence[Channel]) -> EarlierMap:
+def _open_earlier(path: Path | None, channels: Sequence[Channel], states: Mapping[Key, str]) -> EarlierMap:
     """Open an earlier working file; one that cannot be read, or has another form, is as good as none."""
     if path is None:
         return EarlierMap()
@@ -145,6 +131,7 @@ def _open_earlier(path: Path | None, states: Mapping[Key, str], channels: Sequen
         log.info("%s: nothing is taken from it (%s)", path, error)
         return EarlierMap()
     spans = {key: table[state] for key, state in states.items() if state in table}
+    log.info("%s: %d of %d tiles are copied from it", path, len(spans), len(states))
     return EarlierMap(loaded.arrays, spans, channels)
 
 
@@ -152,6 +139,7 @@ def _record_name(directory: Path) -> str:
     return hashlib.sha256(str(directory.resolve()).encode()).hexdigest()[:16] + ".last"
 
 
-def _path(manifest: Manifest, keys: Collection[Key] | None) -> Path:
+def working_path(manifest: Manifest, keys: Collection[Key] | None = None) -> Path:
+    """Return the path of a site's working file, which need not exist."""
     part = "" if keys is None else hashlib.sha256(repr(sorted(keys)).encode()).hexdigest()[:8]
     return cache_folder() / f"{manifest.sha256[:40]}{part}.{VERSION}.coview"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.basemap.site.executors import DaskExecutor, ProcessExecutor, SerialExecutor
+from coview_stream.basemap.site.executors import DaskExecutor, Executor, ProcessExecutor
 from coview_stream.errors import ConfigError, MapError
 
 
@@ -31,7 +31,7 @@ EXPECTED = {0: 1, 1: 4, 2: "three is damaged", 3: 16}
 
 
 def test_steps_in_this_process():
-    assert told(SerialExecutor().run(step, [1, 2, 3, 4])) == EXPECTED
+    assert told(Executor().run(step, [1, 2, 3, 4])) == EXPECTED
 
 
 @pytest.mark.slow

@@ -14,20 +14,20 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, read_verify_key
-from coview_stream.basemap.site.fetch import DirectorySource, Mirror, ObjectStoreSource, WebSource, is_site_address
+from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, SiteSource, WebSource, is_site_address
 from coview_stream.basemap.site.manifest import FILE, Around, Manifest, part_file, read_part, tiles_around
-from coview_stream.basemap.site.store import TileStore
+from coview_stream.basemap.site.store import TileStore, layer_path
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache", "no_pauses")]
 
 
-class Faulty(DirectorySource):
-    """A directory that answers wrongly, or not at all."""
+class Directory(SiteSource):
+    """A site's directory as a source, which may answer wrongly, or not at all."""
 
     def __init__(self, directory, change=lambda sha256, raw: raw):
-        super().__init__(directory)
+        self.name, self.directory = str(directory), directory
         self.change = change
         self.gone = False
         self.asked = []
@@ -35,17 +35,17 @@ class Faulty(DirectorySource):
     def manifest(self):
         if self.gone:
             raise TransportError("yard: nobody answers")
-        return super().manifest()
+        return (self.directory / FILE).read_bytes()
 
     def layer(self, sha256, size):
         self.asked.append(sha256)
         if self.gone:
             raise TransportError("yard: nobody answers")
-        return self.change(sha256, super().layer(sha256, size))
+        return self.change(sha256, (self.directory / layer_path(sha256)).read_bytes())
 
 
 def test_mirror_is_the_site_and_is_opened_without_the_source(site):
-    source = Faulty(site)
+    source = Directory(site)
     mirror = Mirror(source)
     path = mirror.open()
     assert Manifest.load(path) == Manifest.load(site)
@@ -62,7 +62,7 @@ def test_mirror_is_the_site_and_is_opened_without_the_source(site):
 
 
 def test_site_that_was_never_fetched_needs_its_source(site):
-    source = Faulty(site)
+    source = Directory(site)
     source.gone = True
     with pytest.raises(TransportError, match="nobody answers"):
         Mirror(source).open()
@@ -72,14 +72,14 @@ def test_site_that_was_never_fetched_needs_its_source(site):
     "change", [lambda sha256, raw: raw[:-1] + b"x", lambda sha256, raw: raw[:9], lambda sha256, raw: raw * 2]
 )
 def test_damaged_layers_are_refused_and_named(site, change):
-    mirror = Mirror(Faulty(site, change))
+    mirror = Mirror(Directory(site, change))
     with pytest.raises(MapError, match=r"yard: a layer of tile -?\d+, -?\d+ \([0-9a-f]{12}\) is not what the manifest"):
         mirror.open()
     assert not (mirror.directory / FILE).exists()
 
 
 def test_swapped_layers_are_refused_and_the_map_before_is_kept(site):
-    mirror = Mirror(Faulty(site))
+    mirror = Mirror(Directory(site))
     path = mirror.open()
     before = Manifest.load(path)
     store = TileStore(path)
@@ -96,7 +96,7 @@ def test_swapped_layers_are_refused_and_the_map_before_is_kept(site):
 
 
 def test_what_was_fetched_before_a_source_broke_off_is_not_fetched_again(site):
-    source = Faulty(site)
+    source = Directory(site)
     count = len(Manifest.load(site).hashes())
 
     def break_off(sha256, raw):
@@ -119,15 +119,15 @@ def test_manifest_has_to_be_signed_where_a_key_is_asked_for(site, tmp_path):
     site = shutil.copytree(site, tmp_path / "signed")
     Manifest.load(site).signed(SigningKey(tmp_path / "owner.key")).save(site)
     owner, other = (read_verify_key(tmp_path / f"{name}.pub") for name in ("owner", "other"))
-    path = Mirror(DirectorySource(site), owner).open()
+    path = Mirror(Directory(site), owner).open()
     assert len(BaseMap.load(path, verify_key=owner)) > 0
     with pytest.raises(MapError, match="is not signed with"):
-        Mirror(DirectorySource(site), other).open()
+        Mirror(Directory(site), other).open()
     manifest = Manifest.load(site)
     replace(manifest, tiles=manifest.tiles[1:]).save(site)
     with pytest.raises(MapError, match="is not signed with"):
-        Mirror(DirectorySource(site), owner).open()
-    source = Faulty(site)
+        Mirror(Directory(site), owner).open()
+    source = Directory(site)
     source.gone = True
     with pytest.raises(MapError, match="is not signed with"):
         Mirror(source, other).open()
@@ -135,7 +135,7 @@ def test_manifest_has_to_be_signed_where_a_key_is_asked_for(site, tmp_path):
 
 def test_changed_site_is_fetched_and_what_is_no_longer_named_goes_with_the_next_change(site, tmp_path):
     place = shutil.copytree(site, tmp_path / "changing")
-    source = Faulty(place)
+    source = Directory(place)
     mirror = Mirror(source)
     path = mirror.open()
     whole = Manifest.load(place)
@@ -155,7 +155,7 @@ def test_only_tiles_around_a_place_are_fetched(site):
     tile = manifest.tiles[0]
     centre = [manifest.origin[k] + (index + 0.5) * manifest.tile for k, index in enumerate((tile.column, tile.row))]
     around = Around(*centre, 1.0)
-    source = Faulty(site)
+    source = Directory(site)
     mirror = Mirror(source, around=around)
     path = mirror.open()
     assert len(source.asked) == len(tile.layers)

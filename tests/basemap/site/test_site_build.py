@@ -12,7 +12,7 @@ from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site import tile_build
 from coview_stream.basemap.site.convert import join, split
-from coview_stream.basemap.site.executors import ProcessExecutor, SerialExecutor
+from coview_stream.basemap.site.executors import Executor, ProcessExecutor
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.site_build import WORK, build_site
 from coview_stream.basemap.site.store import TileStore
@@ -43,7 +43,7 @@ def site(halves, tmp_path_factory):
     return directory
 
 
-class Interrupted(SerialExecutor):
+class Interrupted(Executor):
     """Breaks off after some tiles."""
 
     def __init__(self, after):

@@ -15,7 +15,7 @@ import zenoh
 from sockets import free_endpoint, until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.site.fetch import DirectorySource, Mirror
+from coview_stream.basemap.site.fetch import Mirror
 from coview_stream.basemap.site.manifest import Around, Manifest, part_file, read_part
 from coview_stream.basemap.site.site_build import build_site
 from coview_stream.basemap.site.store import TileStore
@@ -28,6 +28,7 @@ from coview_stream.stream.maps.map_follower import MapFollower
 from coview_stream.stream.maps.map_server import MapServer
 from coview_stream.stream.maps.zenoh_source import MapKeys, ZenohSource
 from coview_stream.stream.transport.zenoh_config import compose
+from tests.basemap.site.test_fetch import Directory
 
 pytestmark = pytest.mark.slow
 
@@ -132,19 +133,8 @@ def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, si
         thread.join()
 
 
-class Gone(DirectorySource):
-    """A site whose source answers only sometimes."""
-
-    gone = False
-
-    def manifest(self):
-        if self.gone:
-            raise TransportError("yard: nobody answers")
-        return super().manifest()
-
-
 def test_change_that_is_not_taken_over_is_asked_for_again(site):
-    mirror = Mirror(DirectorySource(site))
+    mirror = Mirror(Directory(site))
     mirror.open()
     outcomes, calls, stopping = ["loading"], [], threading.Event()
     follower = MapFollower([mirror], lambda: calls.append(1), lambda: outcomes[-1], period=0.05)
@@ -169,8 +159,8 @@ def test_change_that_is_not_taken_over_is_asked_for_again(site):
 
 def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
     other = shutil.copytree(site, tmp_path / "other")
-    gone = Gone(site)
-    mirrors = [Mirror(gone), Mirror(DirectorySource(other))]
+    gone = Directory(site)
+    mirrors = [Mirror(gone), Mirror(Directory(other))]
     for mirror in mirrors:
         mirror.open()
     calls, stopping = [], threading.Event()
@@ -190,7 +180,7 @@ def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
 
 
 def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):
-    mirror = Mirror(DirectorySource(site), None, Around(512_000.0, 5_120_000.0, 30.0))
+    mirror = Mirror(Directory(site), None, Around(512_000.0, 5_120_000.0, 30.0))
     mirror.open()
     calls, stopping = [], threading.Event()
     thread = threading.Thread(target=MapFollower([mirror], lambda: calls.append(1), period=0.05).run, args=(stopping,))
@@ -208,9 +198,9 @@ def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):
 def test_working_file_of_a_part_is_made_by_another_process(site):
     part = part_file(site, [(0, 0)], "test")
     prepare_map(part, lambda: False)
-    assert working_path(site, [(0, 0)]).is_file()
+    assert working_path(Manifest.load(site), [(0, 0)]).is_file()
     prepare_map(site, lambda: True)  # given up
-    assert not working_path(site).exists()
+    assert not working_path(Manifest.load(site)).exists()
     prepare_map(site / "manifest.json", lambda: False)  # one file: there is nothing to do
 
 
