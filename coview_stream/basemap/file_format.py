@@ -99,16 +99,9 @@ class Loaded(NamedTuple):
 
 
 def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey | None = None) -> str:
-    """Write a map and return its sha256; an existing file stays whole until the new one is complete.
+    """Write a map, signed if there is a key, and return its sha256; an earlier file stays until it is complete.
 
-    Args:
-        path: the file.
-        arrays: by name.
-        parameters: plain data.
-        key: signs the file; None leaves it unsigned.
-
-    Raises:
-        MapError: as of :func:`check_target`, or the directory cannot be written.
+    MapError as of :func:`check_target`, or if the directory cannot be written.
     """
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)

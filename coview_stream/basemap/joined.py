@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from coview_kernels.reference.field import CELL as FIELD_CELL
 from coview_kernels.reference.field import TILE as FIELD_TILE
@@ -33,21 +34,14 @@ JOINED_SUFFIX = ".joined"
 _NAMES_FORMAT = "coview-joined"
 _VERSION = 2  # of the arrays made of the same maps
 
-_MIN_GAP = 300.0
-"""Metres between two maps at least: a lidar's range, and a margin for a robot that drives off its map."""
-
+_MIN_GAP = 300.0  # metres between two maps at least: a lidar's range, and a margin beyond the map's edge
 _SHARED = ("block", "voxel", "tile", "descriptor")
 
 
 def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
-    """Load one map, or several as one.
+    """Load one map (:meth:`BaseMap.load`), or several as one, from a file of :func:`write_names`.
 
-    Args:
-        path: as for :meth:`BaseMap.load`; or a file of :func:`write_names`.
-        verify_key: must have signed the map, or each of several.
-
-    Raises:
-        As :meth:`BaseMap.load`; MapError: maps cannot be joined.
+    Each must be signed with the key, if there is one. MapError if they cannot be joined.
     """
     if path.suffix != JOINED_SUFFIX:
         return BaseMap.load(path, verify_key=verify_key)
@@ -59,8 +53,7 @@ def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
 def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
     """Write names and paths of maps into a small file that :func:`load_map` takes, and return its path.
 
-    Raises:
-        MapError: two have the same name, or the cache cannot be written.
+    MapError if two have the same name, or the cache cannot be written.
     """
     names = [name for name, _ in maps]
     for name, path in maps:
@@ -83,15 +76,7 @@ def read_names(file: Path) -> list[tuple[str, Path]]:
 
 
 def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None = None) -> Path:
-    """Return the cached file of several maps as one, and write it if it does not exist.
-
-    Args:
-        paths: names, and files, directories or parts of sites.
-        verify_key: must have signed each of them.
-
-    Raises:
-        MapError: a map cannot be loaded, or they cannot be joined.
-    """
+    """Return the cached file of several maps as one, and write it if it does not exist; MapError if that fails."""
     maps = {name: BaseMap.load(path, verify_key=verify_key) for name, path in paths}
     key = repr([(name, base_map.sha256) for name, base_map in maps.items()])
     path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_VERSION}.coview"
@@ -105,63 +90,77 @@ def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None 
 
 
 def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
-    """Join several maps.
-
-    Args:
-        maps: by name, from west to east in the joined frame.
-
-    Raises:
-        MapError: there are none, or two were built with different settings.
-    """
+    """Join several maps, placed from west to east; MapError if there are none, or settings differ."""
     if not maps:
         raise MapError("no maps to join: name two or more")
-    _check_alike(maps)
-    several = list(maps.values())
-    config = several[0].config
+    (first_name, first), *others = maps.items()
+    for name, other in others:
+        for setting in _SHARED:
+            mine, its = getattr(first.config, setting), getattr(other.config, setting)
+            if mine != its:
+                raise MapError(
+                    f"{first_name} and {name} differ in {setting} ({mine} and {its}): build them with the same"
+                )
+        if first.learned is not None and other.learned is not None and first.learned.weights != other.learned.weights:
+            raise MapError(f"{first_name} and {name} hold features of different networks: build one of them again")
+    several, config = list(maps.values()), first.config
     parts, moves = _placed(maps)
-    arrays: Arrays = {"origin": np.zeros(3), **_clouds(several, moves, config.tile)}
-    arrays["stations"] = np.concatenate([
-        (base_map.stations.astype(np.float64) + move).astype(np.float32)
-        for base_map, move in zip(several, moves, strict=True)
-    ])  # fmt: skip
-    arrays |= _surveyed(several, moves, config.block)
+    pairs = list(zip(several, moves, strict=True))
+
+    def united(name: str) -> npt.NDArray[Any]:
+        return np.concatenate([np.asarray(base_map.arrays[name]) for base_map in several])
+
+    def moved(name: str) -> npt.NDArray[Any]:
+        columns = several[0].arrays[name].shape[1]
+        return np.concatenate(
+            [(m.arrays[name].astype(np.float64) + move[:columns]).astype(np.float32) for m, move in pairs]
+        )
+
+    def moved_tiles(name: str, edge: float, order: slice = slice(None)) -> Ints:
+        """Move tiles, whose first two columns are counted east and north, or north and east."""
+        rows = [np.array(m.arrays[name]) for m in several]
+        for tiles, move in zip(rows, moves, strict=True):
+            tiles[:, :2] += np.rint(move[:2] / edge).astype(np.int32)[order]
+        return np.concatenate(rows)
+
+    arrays: Arrays = {"origin": np.zeros(3), "normals": united("normals")}
+    arrays |= {"points": moved("points"), "stations": moved("stations")}
+    arrays["tile_index"] = moved_tiles("tile_index", config.tile)
+    begins = np.cumsum([0, *(len(m.points) for m in several)])
+    arrays["tile_index"][:, 2:] += np.repeat(begins[:-1], [len(m.arrays["tile_index"]) for m in several])[:, None]
+    arrays |= _surveyed(pairs, config.block)
     if all(name in base_map.arrays for base_map in several for name in FIELD_ARRAYS):
-        arrays |= _united(several, FIELD_ARRAYS)
-        shifts = [_tiles(move, FIELD_CELL * FIELD_TILE)[::-1] for move in moves]
-        arrays["field.tiles"] = _shifted_tiles(several, "field.tiles", shifts)
+        arrays |= {name: united(name) for name in FIELD_ARRAYS}
+        arrays["field.tiles"] = moved_tiles("field.tiles", FIELD_CELL * FIELD_TILE, slice(None, None, -1))
     learned = all(base_map.learned is not None for base_map in several)
     if learned:
-        arrays |= _united(several, ("learned.local", "learned.sigma", "learned.place"))
-        arrays["learned.tiles"] = _shifted_tiles(
-            several, "learned.tiles", [_tiles(m, float(FEATURE_TILE)) for m in moves]
-        )
-        arrays["learned.place_at"] = np.concatenate([
-            (base_map.arrays["learned.place_at"] + move[:2]).astype(np.float32)
-            for base_map, move in zip(several, moves, strict=True)
-        ])  # fmt: skip
+        arrays |= {name: united(name) for name in ("learned.local", "learned.sigma", "learned.place")}
+        arrays["learned.tiles"] = moved_tiles("learned.tiles", float(FEATURE_TILE))
+        arrays["learned.place_at"] = moved("learned.place_at")
     channels = config.descriptor.channels
     described = {name: np.concatenate([base_map.descriptors(name) for base_map in several]) for name in channels}
     arrays |= StationIndex.of(described).arrays()
-    first = several[0].parameters
-    parameters: dict[str, Any] = dict(first) | {
+    parameters: dict[str, Any] = dict(first.parameters) | {
         "crs": None,
         "parts": MapParts(parts).to_json(),
         "sources": {f"{name}/{source}": sha for name, m in maps.items() for source, sha in m.sources.items()},
         "source_points": sum(int(base_map.parameters.get("source_points", 0)) for base_map in several),
-        "learned": first.get("learned") if learned else None,
+        "learned": first.parameters.get("learned") if learned else None,
     }
     return BaseMap(arrays, parameters)
 
 
-def _check_alike(maps: Mapping[str, BaseMap]) -> None:
-    (first, one), *others = maps.items()
-    for name, other in others:
-        for setting in _SHARED:
-            mine, its = getattr(one.config, setting), getattr(other.config, setting)
-            if mine != its:
-                raise MapError(f"{first} and {name} differ in {setting} ({mine} and {its}): build them with the same")
-        if one.learned is not None and other.learned is not None and one.learned.weights != other.learned.weights:
-            raise MapError(f"{first} and {name} hold features of different networks: build one of them again")
+def _surveyed(pairs: Sequence[tuple[BaseMap, Floats]], block: float) -> Arrays:
+    """Return one raster of surveyed cells; the gaps are not surveyed."""
+    corners = [base_map.arrays["surveyed_corner"] + move[:2] for base_map, move in pairs]
+    low = np.min(corners, axis=0)
+    starts = [np.rint((corner - low) / block).astype(np.int64)[::-1] for corner in corners]
+    rasters = [base_map.arrays["surveyed"] for base_map, _ in pairs]
+    ends = [start + raster.shape for start, raster in zip(starts, rasters, strict=True)]
+    whole = np.zeros(np.max(ends, axis=0), np.uint8)
+    for raster, (row, column), (end_row, end_column) in zip(rasters, starts, ends, strict=True):
+        whole[row:end_row, column:end_column] = raster
+    return {"surveyed": whole, "surveyed_corner": low}
 
 
 def _placed(maps: Mapping[str, BaseMap]) -> tuple[list[MapPart], list[Floats]]:
@@ -185,47 +184,3 @@ def _placed(maps: Mapping[str, BaseMap]) -> tuple[list[MapPart], list[Floats]]:
         moves.append(move)
         edge = end + gap
     return parts, moves
-
-
-def _clouds(maps: Sequence[BaseMap], moves: Sequence[Floats], tile: float) -> Arrays:
-    points, index, begin = [], [], 0
-    for base_map, move in zip(maps, moves, strict=True):
-        points.append((base_map.points.astype(np.float64) + move).astype(np.float32))
-        rows = np.array(base_map.arrays["tile_index"])
-        rows[:, :2] += _tiles(move, tile)
-        rows[:, 2:] += begin
-        index.append(rows)
-        begin += len(base_map.points)
-    return {"points": np.concatenate(points), "tile_index": np.concatenate(index), **_united(maps, ("normals",))}
-
-
-def _surveyed(maps: Sequence[BaseMap], moves: Sequence[Floats], block: float) -> Arrays:
-    """Return one raster of surveyed cells; the gaps are not surveyed."""
-    corners = [base_map.arrays["surveyed_corner"] + move[:2] for base_map, move in zip(maps, moves, strict=True)]
-    low = np.min(corners, axis=0)
-    starts = [np.rint((corner - low) / block).astype(np.int64)[::-1] for corner in corners]
-    rasters = [base_map.arrays["surveyed"] for base_map in maps]
-    ends = [start + raster.shape for start, raster in zip(starts, rasters, strict=True)]
-    whole = np.zeros(np.max(ends, axis=0), np.uint8)
-    for raster, (row, column), (end_row, end_column) in zip(rasters, starts, ends, strict=True):
-        whole[row:end_row, column:end_column] = raster
-    return {"surveyed": whole, "surveyed_corner": low}
-
-
-def _united(maps: Sequence[BaseMap], names: Sequence[str]) -> Arrays:
-    return {name: np.concatenate([np.asarray(base_map.arrays[name]) for base_map in maps]) for name in names}
-
-
-def _shifted_tiles(maps: Sequence[BaseMap], name: str, shifts: Sequence[Ints]) -> Ints:
-    """Return the tiles (T, 2 or 3) of all maps, moved by whole tiles (2,) in the order of the first two columns."""
-    moved = []
-    for base_map, shift in zip(maps, shifts, strict=True):
-        rows = np.array(base_map.arrays[name])
-        rows[:, :2] += shift.astype(np.int32)
-        moved.append(rows)
-    return np.concatenate(moved)
-
-
-def _tiles(move: Floats, edge: float) -> Ints:
-    """Return the number of tiles of a move, east and north."""
-    return np.rint(move[:2] / edge).astype(np.int64)

@@ -44,14 +44,10 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 
 def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Floats, block: float) -> Arrays:
-    """Make the field of a cloud (N, 3) with unit normals (N, 3); arrays for the map's file.
+    """Make the field of a cloud (N, 3), map frame, with unit normals (N, 3); arrays for the map's file.
 
-    Args:
-        points: map frame, metres.
-        normals: unit normals.
-        surveyed: (H, W) cells of ``block`` metres, row along y, that the map has been surveyed in.
-        corner: (2,) x and y of the lower corner of its first cell.
-        block: metres, a multiple of half a metre.
+    ``surveyed`` (H, W) are the cells of ``block`` metres, a multiple of half a metre, that the map has been surveyed
+    in, row along y; ``corner`` (2,) is the lower corner of the first.
     """
     ratio = round(block / CELL)
     low = np.rint(np.asarray(corner) / CELL).astype(np.int64)[::-1]  # row, column of the first cell
@@ -90,12 +86,9 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
 
 
 def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[], object] = lambda: None) -> Arrays:
-    """Return the rasters in which a field is looked up, for a working file.
+    """Return the rasters in which a map's field is looked up, for a working file.
 
-    Args:
-        arrays: of the map, with those of :func:`field_arrays`.
-        zeros: makes the arrays; None makes them in memory.
-        done: called after each batch.
+    ``zeros`` makes the arrays, None in memory; ``done`` is called after each batch.
     """
     field = field_of(arrays)
     layers = field.layers if zeros is None else field.made_layers(zeros, done)
@@ -103,11 +96,7 @@ def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[],
 
 
 def field_of(arrays: Arrays) -> FieldMap:
-    """Return the field in a map's arrays, with its layers if the arrays have them.
-
-    Raises:
-        KeyError: an array is missing. ValueError: one is invalid.
-    """
+    """Return the field in a map's arrays, with its layers if there are any; KeyError or ValueError if it is invalid."""
     stored = None
     if f"{LAYERS}table" in arrays:
         stored = FieldLayers(*(arrays[f"{LAYERS}{name}"] for name in FieldLayers._fields))

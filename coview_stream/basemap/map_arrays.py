@@ -105,7 +105,7 @@ class EarlierMap:
     """Arrays of an earlier state of a site, from which unchanged tiles are copied; by default empty.
 
     The field and the codes of a tile depend on its stations and on the clouds on it and around it. Codes of other tiles
-    are made with the basis of the earlier map; they find the same stations (tests/basemap/site/test_working_file.py).
+    are made with the earlier basis; they find the same stations (tests/basemap/site/test_working_file.py).
     """
 
     def __init__(
@@ -153,19 +153,10 @@ class EarlierMap:
 def map_arrays(
     tiles: Tiles, into: MemoryArrays, earlier: EarlierMap | None = None, step: Callable[[], None] = lambda: None
 ) -> tuple[Arrays, dict[Key, int]]:
-    """Make stations, surveyed cells, likelihood field and station codes of a map.
+    """Make stations, surveyed cells, likelihood field and station codes of a map, and the number of field rows by tile.
 
-    Args:
-        tiles: clouds and stations.
-        into: place of the large arrays; those that it has already are returned as well.
-        earlier: earlier state of the map, whose unchanged tiles are copied.
-        step: called twice for each tile.
-
-    Returns:
-        The arrays, and the rows of the field that belong to each tile.
-
-    Raises:
-        MapError: too many stations, or no room.
+    Large arrays are made in ``into``; those that it has already are returned as well. ``step`` is called twice for each
+    tile. MapError if there are too many stations, or no room.
     """
     earlier = EarlierMap() if earlier is None else earlier
     stations = sum(map(len, tiles.stations.values()))
@@ -194,18 +185,23 @@ def _station_codes(
 
     Descriptors of all stations are never in memory at once, unless the tiles hold them.
     """
+
+    def together(wanted: Ints) -> tuple[Ints, Described]:
+        parts, numbers = zip(*tiles.described(wanted), strict=True)
+        return np.concatenate(numbers), {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
     made = [into.zeros(name, StationCodes.shape_of(stations), np.int16) for name in CODES]
     sampled, tiers = sampled_stations(stations), earlier.tiers(made)
     copies = tiers is not None
     if tiers is None:
         learned = StationCodes.learned_from(stations)
-        numbers, values = _together(tiles, np.union1d(learned, sampled))
+        numbers, values = together(np.union1d(learned, sampled))
         tiers = StationCodes.empty_tiers(
             [v[np.searchsorted(numbers, learned)] for v in values.values()], 2, stations, made
         )
         sample = {name: v[np.searchsorted(numbers, sampled)] for name, v in values.items()}
     else:
-        sample = _together(tiles, sampled)[1]
+        sample = together(sampled)[1]
     begin = 0
     for key, positions in tiles.stations.items():
         count, before = len(positions), earlier.stations(key) if copies else None
@@ -224,12 +220,6 @@ def _station_codes(
         step()
     arrays = StationIndex(tiers[0], tiers[1], sample).arrays()
     return {name: values for name, values in arrays.items() if name not in CODES}
-
-
-def _together(tiles: Tiles, wanted: Ints) -> tuple[Ints, Described]:
-    """Return the numbers and the descriptors of stations on all tiles."""
-    parts, numbers = zip(*tiles.described(wanted), strict=True)
-    return np.concatenate(numbers), {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def cells_of(points: Points, block: float) -> Ints:

@@ -117,8 +117,6 @@ def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
     key = _library("asymmetric.ed25519").Ed25519PrivateKey.generate()
     secret = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption())
     known = key.public_key().public_bytes(form.Encoding.PEM, form.PublicFormat.SubjectPublicKeyInfo)
-    if public.exists():  # before the private one is there
-        raise InputError(f"{public}: exists; a key is never overwritten: give another name")
     made: list[Path] = []
     for path, content, mode in ((private, secret, 0o600), (public, known, 0o644)):
         try:
@@ -126,11 +124,11 @@ def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
             made.append(path)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
-        except FileExistsError as error:
-            raise InputError(f"{path}: exists; a key is never overwritten: give another name") from error
         except OSError as error:
             for half in made:  # both or none
                 half.unlink(missing_ok=True)
+            if isinstance(error, FileExistsError):
+                raise InputError(f"{path}: exists; a key is never overwritten: give another name") from error
             raise InputError(
                 f"{path}: cannot be written ({error.strerror}); give a name in a writable place"
             ) from error

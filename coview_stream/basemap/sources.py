@@ -69,11 +69,7 @@ class Source:
 
 
 def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[Source]:
-    """Return the sources of a caller's arguments.
-
-    Args:
-        given: a file, a folder or pattern of files, or an array (N, 3) whose further columns are ignored; or several.
-        crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT.
+    """Return the sources that files, folders, patterns and arrays (N, 3 or more) mean; ``crs`` of those without one.
 
     Raises:
         MapError: there is none, or a file is named twice. CloudError: an array is no cloud.

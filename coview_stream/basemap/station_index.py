@@ -24,8 +24,7 @@ Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
 _SAMPLE = 128  # stations whose scores at all shifts give the medians
-CODES = ("station_codes", "station_codes.rest")
-"""Names of the tiers' codes in a map's file."""
+CODES = ("station_codes", "station_codes.rest")  # names of the tiers' codes in a map's file
 _SAMPLED = "station_codes.sample"
 
 

@@ -104,18 +104,6 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) 
     return np.asarray(sizes[labels[row, col]] * _SUBCELL**2 >= _MIN_AREA)
 
 
-def _squares(ground: Points, cell: float) -> Points:
-    """Return the cell centre and median height of the ground in each cell, one height per cell."""
-    if not len(ground):
-        return ground.reshape(0, 3)
-    corner, shape, flat = cells(ground, cell)
-    order = np.lexsort((ground[:, 2], flat))
-    unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-    row, column = np.divmod(unique, shape[1])
-    z = ground[order[first + count // 2], 2]
-    return np.column_stack([corner[0] + (column + 0.5) * cell, corner[1] + (row + 0.5) * cell, z]).astype(np.float32)
-
-
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     """Find the squares of floors that lie above the base level of their cell and cover a quarter of it."""
     from scipy import ndimage  # not part of the robot's side
@@ -153,11 +141,17 @@ def find_stations(points: Points, block: float, levels: bool = True) -> Floats32
     upper storey counts; a roof, a bridge deck or an open parking deck (no cover) and a canopy (not flat) do not.
     Heights of upper levels are good to 0.1 m. (The paper's centroids of 3-D voxels put two stations into some cells.)
     """
-    nothing = np.zeros((0, 3), dtype=np.float32)
     mask = ground_mask(points)
     if not mask.any():
-        return nothing
-    base = _squares(points[mask], block)
+        return np.zeros((0, 3), dtype=np.float32)
+    ground = points[mask]
+    corner, shape, flat = cells(ground, block)
+    order = np.lexsort((ground[:, 2], flat))
+    unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
+    row, column = np.divmod(unique, shape[1])
+    z = ground[order[first + count // 2], 2]
+    xy = [corner[0] + (column + 0.5) * block, corner[1] + (row + 0.5) * block]
+    base = np.column_stack([*xy, z]).astype(np.float32)
     return np.concatenate([base, _upper_squares(indoor_floors(points), base, block)]) if levels else base
 
 
@@ -175,7 +169,7 @@ def describe_storeys(
     points from a metre below their floor up to the highest possible ceiling.
 
     Args:
-        points: (N, 3) of the map, or at least those within the radius and two blocks of the stations.
+        points: (N, 3), at least those within the radius and two blocks of the stations.
         stations: (M, 3), with all stations of their blocks.
         block: metres.
         config: of the descriptors.
@@ -269,8 +263,7 @@ class HeightRaster:
 def aligned_corner(points: Points, block: float, cell: float) -> Floats:
     """Return the lower left corner (2,) of a raster whose cells have the centres of ``block``-sized cells among theirs.
 
-    Stations stand at ``(k + 1/2) * block``; a half-cell shift lets one offset table serve them all. Needs
-    ``block`` to be a multiple of ``cell``.
+    Stations stand at ``(k + 1/2) * block``, a multiple of ``cell``; the shift lets one offset table serve them all.
     """
     lowest = np.floor(points[:, :2].min(axis=0).astype(np.float64) / block) * block
     return np.asarray(lowest + 0.5 * block - cell * (np.ceil(0.5 * block / cell) + 0.5))
@@ -279,10 +272,9 @@ def aligned_corner(points: Points, block: float, cell: float) -> Floats:
 def rasterise(
     points: Points, corner: Floats, cell: float, voxel: float, margin: int = 0, extent: Points | None = None
 ) -> HeightRaster:
-    """Raster (N, 3) map-frame points.
+    """Raster (N, 3) map-frame points, to the farthest of ``extent`` (default: the points) and ``margin`` cells beyond.
 
-    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of raw points depend on the scan
-    pattern. The raster reaches to the farthest of ``extent`` (by default the points) and ``margin`` empty cells beyond.
+    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of points depend on the scan pattern.
     """
     column, row = np.floor((points[:, :2] - corner) / cell).astype(np.int64).T
     level = np.floor(points[:, 2] / voxel).astype(np.int64)
@@ -329,10 +321,7 @@ class StationGrid:
         return len(self.stations)
 
     def at(self, positions: Reals) -> Indices:
-        """Return the station (N,) at each of (N, 3) positions, -1 for none.
-
-        On maps with several levels it is the nearest one, less than 2.5 m above or below.
-        """
+        """Return the station (N,) at each of (N, 3) positions, of several the nearest within 2.5 m; -1 for none."""
         cell = self.cell(positions)
         if len(self._levels) == 1:
             return np.asarray(self._levels[0].take(cell), dtype=np.intp)

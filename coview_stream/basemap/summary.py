@@ -37,12 +37,9 @@ _DRAWN_POINTS = 2_000_000
 _PIXELS = 800  # along the longer side
 _DARK, _LIGHT = 0.15, 0.9  # grey of the highest and of the lowest points
 _STRAY_HEIGHTS = 1.0  # per cent of the heights at either end that may be birds or pits
-POINTS_OF_FILE = 300_000
-"""Points of a view of a map on this machine."""
-POINTS_ON_WIRE = 100_000
-"""Points of a view from a node: 0.8 MB of JSON."""
-MAX_WIRE_BYTES = 4 * 1024 * 1024
-"""Largest JSON of a view, bytes."""
+POINTS_OF_FILE = 300_000  # of a view of a map on this machine
+POINTS_ON_WIRE = 100_000  # of a view from a node: 0.8 MB of JSON
+MAX_WIRE_BYTES = 4 * 1024 * 1024  # of the JSON of a view
 _MAX_POINTS = 500_000  # that are read
 _OVERSAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
 _GROWTH = 1.2  # of the cells, until few enough are left

@@ -24,17 +24,14 @@ def scaled_normals(normals: Points, planarity: Floats32) -> Points:
     return normals * np.maximum(planarity, np.float32(_SHORTEST))[:, None]
 
 
-def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, Int8s, Ints]:
+def sort_by_tile(points: Points, normals: Points | Int8s, tile: float) -> tuple[Points, Int8s, Ints]:
     """Return points (N, 3), normals (N, 3) of a length of at most one as int8, and the index (T, 4) of their tiles.
 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
-    A normal of length 1 in int8 is off by less than 0.5 degrees.
+    A normal of length 1 in int8 is off by less than 0.5 degrees; normals may be int8 already.
     """
-    return sort_by_tile_packed(points, np.rint(normals * _NORMAL_SCALE).astype(np.int8), tile)
-
-
-def sort_by_tile_packed(points: Points, packed: Int8s, tile: float) -> tuple[Points, Int8s, Ints]:
-    """Return the same for normals (N, 3) that are int8 already."""
+    scale = 1.0 if normals.dtype == np.int8 else _NORMAL_SCALE
+    packed: Int8s = np.rint(normals * np.float32(scale)).astype(np.int8)
     cells = np.floor(points[:, :2].astype(np.float64) / tile).astype(np.int64)
     order = np.lexsort((cells[:, 1], cells[:, 0]))
     cells = cells[order]

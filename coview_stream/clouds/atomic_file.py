@@ -24,12 +24,8 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     Partial files of the same name left by killed processes are deleted first: those of this host and process
     namespace at once, all others after a day, because their processes cannot be seen from here.
 
-    Args:
-        path: an existing file stays whole until the new one is complete.
-        temporary: name to write under, in the same directory; default: unique to this process.
-
-    Raises:
-        OSError: the file cannot be renamed.
+    An existing file stays whole until the new one is complete. ``temporary`` is the name to write under, in the same
+    directory; by default one that is unique to this process.
     """
     part = temporary or path.with_name(f".{path.name}.{_host()}.{os.getpid()}.part")
     if temporary is None:
@@ -49,7 +45,12 @@ def _remove_left(path: Path) -> None:
             match = form.fullmatch(entry.name)
             if match is None or not 0 < (process := int(match[2])) < 1 << 31:
                 continue
-            dead = match[1] == _host() and not _lives(process)
+            dead = False
+            if match[1] == _host():
+                try:
+                    os.kill(process, 0)
+                except OSError as error:  # another user's process lives
+                    dead = isinstance(error, ProcessLookupError)
             if dead or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
                 Path(entry.path).unlink(missing_ok=True)
 
@@ -66,27 +67,11 @@ def _host() -> str:
     return f"{zlib.crc32(f'{platform.node()} {namespace} {boot}'.encode()):08x}"
 
 
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # another user's process
-        return True
-    return True
-
-
 @contextmanager
 def atomic_file(path: Path, *, sync: bool = False, temporary: Path | None = None) -> Iterator[BinaryIO]:
-    """Open a binary stream that becomes ``path`` at the end of the block, or is deleted if the block raises.
+    """Open a binary stream that becomes ``path`` at the end of the block (:func:`atomic_path`); OSError if it cannot.
 
-    Args:
-        path: as for :func:`atomic_path`.
-        sync: flush to disk before renaming; otherwise a power cut may leave an empty file.
-        temporary: as for :func:`atomic_path`.
-
-    Raises:
-        OSError: the directory does not exist or cannot be written.
+    With ``sync`` it is flushed to disk before renaming; otherwise a power cut may leave an empty file.
     """
     with atomic_path(path, temporary) as part, part.open("wb") as stream:
         yield stream

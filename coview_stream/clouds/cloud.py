@@ -16,13 +16,10 @@ from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
 LOCAL_LIMIT = 10_000.0
-"""Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm."""
+"""Metres: smaller coordinates keep a zero origin, because float32 still resolves 1 mm."""
+_ORIGIN_STEP = 100.0  # metres: origins are multiples of it, so that offsets between tiles are exact
 
-ORIGIN_STEP = 100.0
-"""Origins are multiples of this (metres): readable, exact offsets between neighbouring tiles."""
-
-COARSE_FLOAT32 = 1e6
-"""Beyond this (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""
+_COARSE_FLOAT32 = 1e6  # metres: beyond, float32 is coarser than 6 cm
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +29,7 @@ class Cloud:
     Attributes:
         points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
         origin: (3,) float64 metres. Zeros if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero,
-            otherwise the rounded (``ORIGIN_STEP``) median of the points.
+            otherwise the median, rounded to 100 m, of the points.
         crs: coordinate reference system as stated in the file (WKT or ``EPSG:code``), else None.
         classification: (N,) uint8 LAS classes, if the format has them.
         dropped: rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.
@@ -58,13 +55,7 @@ class Cloud:
 
 @dataclass
 class CloudBuilder:
-    """Builder of a cloud from chunks of raw coordinates; the first usable chunk decides the origin.
-
-    Attributes:
-        crs: as of :class:`Cloud`.
-        origin: (3,) float64 metres; None until a usable chunk was added.
-        dropped: rows left out so far.
-    """
+    """Builder of a :class:`Cloud` from chunks of raw coordinates; the first usable chunk decides the origin."""
 
     crs: str | None = None
     origin: Floats | None = None
@@ -83,8 +74,12 @@ class CloudBuilder:
         if not len(raw):
             return
         if self.origin is None:
-            self.origin = choose_origin(raw)
-            if raw.dtype == np.float32 and np.abs(self.origin).max() > COARSE_FLOAT32:
+            self.origin = np.zeros(3)
+            if np.abs(raw).max() >= LOCAL_LIMIT:
+                # a sparse median, not the bounding box: one stray point must not move the origin
+                middle = np.median(raw[:: max(1, len(raw) // 10_000)].astype(np.float64), axis=0)
+                self.origin = np.round(middle / _ORIGIN_STEP) * _ORIGIN_STEP + 0.0  # + 0.0 turns -0.0 into 0.0
+            if raw.dtype == np.float32 and np.abs(self.origin).max() > _COARSE_FLOAT32:
                 warnings.warn(
                     f"float32 coordinates near {self.origin.tolist()} are rounded to 6 cm or worse in the "
                     "file itself; export them as float64 or LAS",
@@ -98,11 +93,7 @@ class CloudBuilder:
             self._classes.append(classification)
 
     def finish(self, name: str) -> Cloud:
-        """Return the cloud of all chunks; ``name`` is the file in the error message.
-
-        Raises:
-            CloudError: no usable point was added.
-        """
+        """Return the cloud of all chunks; CloudError, with the file's ``name``, if no usable point was added."""
         if self.origin is None:
             if self.dropped:
                 raise CloudError(
@@ -113,18 +104,6 @@ class CloudBuilder:
         points = self._points[0] if len(self._points) == 1 else np.concatenate(self._points)
         classes = np.concatenate(self._classes) if self._classes else None
         return Cloud(points, self.origin, self.crs, classes, self.dropped)
-
-
-def choose_origin(raw: Reals) -> Floats:
-    """Choose a float64 origin (3,) for (N, 3) coordinates in metres; zeros if all are local.
-
-    A sparse median, not the bounding box: one stray point must not move the origin.
-    """
-    if np.abs(raw).max() < LOCAL_LIMIT:
-        return np.zeros(3)
-    sample = raw[:: max(1, len(raw) // 10_000)].astype(np.float64)
-    # + 0.0 turns -0.0 into 0.0
-    return np.asarray(np.round(np.median(sample, axis=0) / ORIGIN_STEP) * ORIGIN_STEP + 0.0)
 
 
 def merge(clouds: Sequence[Cloud]) -> Cloud:

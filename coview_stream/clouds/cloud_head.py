@@ -16,15 +16,9 @@ from coview_stream.clouds.reference_system import same_system, short_name
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Bools, Floats
 
-MAX_GAP = 1000.0
-"""Metres between tiles of one site; a lake or a field may lie between them."""
-
-FAR_GAP = 10_000.0
-"""Metres between files that are never one site."""
-
-MAX_AREA = 50e6
-"""Square metres of the box around a site: the limit of a build's rasters, cells of 0.5 m."""
-
+_MAX_GAP = 1000.0  # metres between tiles of one site; a lake or a field may lie between them
+_FAR_GAP = 10_000.0  # metres between files that are never one site
+_MAX_AREA = 50e6  # square metres of the box around a site: the limit of a build's rasters, cells of 0.5 m
 _SAMPLED_POINTS = 100_000  # of a cloud, to measure its extent
 _STRAY = 0.5  # per cent of the points at either end that do not count for the extent
 
@@ -80,23 +74,19 @@ def head_of(path: Path, cloud: Cloud) -> CloudHead:
     """
     low, high = _extent(cloud)
     wide = high - low
-    if wide[0] * wide[1] > MAX_AREA:
+    if wide[0] * wide[1] > _MAX_AREA:
         raise CloudError(
             f"{path}: extends over {wide[0] / 1000:.0f} x {wide[1] / 1000:.0f} km, heights over {wide[2]:.0f} m; "
-            f"a map holds {MAX_AREA / 1e6:.0f} km2 at most: is it in millimetres or centimetres? Convert it to metres, "
-            "or cut it into sites"
+            f"a map holds {_MAX_AREA / 1e6:.0f} km2 at most: is it in millimetres or centimetres? Convert it to "
+            "metres, or cut it into sites"
         )
     return CloudHead(path, cloud.crs, low, high)
 
 
 def check_together(heads: Sequence[CloudHead]) -> str | None:
-    """Check by their heads that files can be one site.
+    """Check by their heads that files can be one site; return a sentence about an unusual gap, None if there is none.
 
-    Returns:
-        A sentence about an unusual gap between them; None if there is none.
-
-    Raises:
-        CloudError: two are in different reference systems, or too far apart for a map; it names both.
+    CloudError names two that are in different reference systems, or too far apart for a map.
     """
     stated = [head for head in heads if head.crs is not None]
     for head in stated[1:]:
@@ -105,20 +95,22 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
                 f"{stated[0].path} is in {short_name(stated[0].crs)}, {head.path} in {short_name(head.crs)}; "
                 "reproject one of them"
             )
-    boxes = [
-        (head.path, head.low[:2], head.high[:2]) for head in heads if head.low is not None and head.high is not None
-    ]
+    boxes = [(h.path, h.low[:2], h.high[:2]) for h in heads if h.low is not None and h.high is not None]
     if len(boxes) < 2:
         return None
-    low, high = np.array([box[1] for box in boxes]), np.array([box[2] for box in boxes])
+    paths, low, high = (np.array(column) for column in zip(*boxes, strict=True))
     near = _connected(low, high)
     if near.all():
         return None
     far = ~near if near.sum() >= (~near).sum() else near
-    one, other, gap = _nearest(low, high, far)
+    gap, one, other = np.inf, 0, 0  # the smallest gap between one of ``far`` and one of the others
+    for at in np.flatnonzero(far).tolist():
+        gaps = np.where(far, np.inf, _gaps(low, high, at))
+        if gaps.min() < gap:
+            gap, one, other = float(gaps.min()), at, int(gaps.argmin())
     wide = high.max(axis=0) - low.min(axis=0)
-    apart = f"{boxes[one][0]} lies {gap / 1000:.1f} km from {boxes[other][0]}, the nearest of the other files"
-    if gap > FAR_GAP or wide[0] * wide[1] > MAX_AREA:
+    apart = f"{paths[one]} lies {gap / 1000:.1f} km from {paths[other]}, the nearest of the other files"
+    if gap > _FAR_GAP or wide[0] * wide[1] > _MAX_AREA:
         raise CloudError(
             f"{apart}; they cannot be one map: leave out what does not belong, bring all into one reference system and "
             "unit, or build a map for each site"
@@ -127,27 +119,16 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
 
 
 def _connected(low: Floats, high: Floats) -> Bools:
-    """Find the boxes (N, 2) that are connected to the first by gaps below :data:`MAX_GAP`."""
+    """Find the boxes (N, 2) that are connected to the first by gaps below 1 km."""
     reached = np.zeros(len(low), dtype=bool)
     reached[0] = True
     fresh = [0]
     while fresh:
         at = fresh.pop()
-        neighbours = np.flatnonzero(~reached & (_gaps(low, high, at) < MAX_GAP))
+        neighbours = np.flatnonzero(~reached & (_gaps(low, high, at) < _MAX_GAP))
         reached[neighbours] = True
         fresh += neighbours.tolist()
     return reached
-
-
-def _nearest(low: Floats, high: Floats, far: Bools) -> tuple[int, int, float]:
-    """Find the two boxes, one of ``far`` and one of the others, with the smallest gap between them, metres."""
-    pairs = []
-    for at in np.flatnonzero(far):
-        gaps = np.where(far, np.inf, _gaps(low, high, int(at)))
-        nearest = int(np.argmin(gaps))
-        pairs.append((float(gaps[nearest]), int(at), nearest))
-    gap, one, other = min(pairs)
-    return one, other, gap
 
 
 def _gaps(low: Floats, high: Floats, at: int) -> Floats:

@@ -20,7 +20,6 @@ from coview_stream.clouds.cloud import CloudBuilder
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CloudError
 
-_IDLE_S = 10.0  # an idle child ends after that
 _MAX_END_S = 5.0  # for a child to end by itself
 _MAX_LINE = 1 << 20  # bytes of an answer's line; a reference system's text is the longest
 _LIMITS = {  # threads' stacks and heaps count against the child's memory limit
@@ -29,13 +28,12 @@ _LIMITS = {  # threads' stacks and heaps count against the child's memory limit
 
 
 class DecodingChild:
-    """A child that answers requests one at a time; started when needed, ended when idle or at exit."""
+    """A child that answers requests one at a time; started when needed, ended at exit."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._owner = 0
-        self._timer: threading.Timer | None = None
         atexit.register(self.close)
 
     def ask(self, request: dict[str, Any], builder: CloudBuilder | None = None) -> dict[str, Any]:
@@ -45,16 +43,11 @@ class DecodingChild:
             CloudError: the file is damaged, or asked for more memory than a file of its size can need.
         """
         with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
             try:
                 answer = self._exchange(request, builder)
             except BaseException:
                 self._end(kill=True)  # its next bytes would belong to this request
                 raise
-            self._timer = threading.Timer(_IDLE_S, self.close)
-            self._timer.daemon = True
-            self._timer.start()
         if "error" in answer:
             raise CloudError(answer["error"])
         return answer
@@ -104,8 +97,6 @@ class DecodingChild:
         return self._child
 
     def _end(self, kill: bool) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
         child, self._child = self._child, None
         if child is None or self._owner != os.getpid():
             return
@@ -132,22 +123,14 @@ _shared = DecodingChild()
 
 
 def decode_in_child(path: Path, builder: CloudBuilder) -> None:
-    """Decode a LAZ or E57 file in the shared child into a builder, with its reference system.
-
-    Raises:
-        CloudError: as of :meth:`DecodingChild.ask`.
-    """
+    """Decode a LAZ or E57 file in the shared child into a builder, with its system (:meth:`DecodingChild.ask`)."""
     builder.crs = _shared.ask({"path": str(path.resolve())}, builder).get("crs")
 
 
 def copy_window(source: str, low: tuple[float, float], high: tuple[float, float], target: Path) -> dict[str, int]:
-    """Write the points of a COPC file's window to the LAS file ``target``, in the shared child.
+    """Write the points of a COPC file's window to a LAS file, in the shared child; return the fields of ``Fetched``.
 
-    Returns:
-        ``points``, ``received`` and ``requests``: fields of :class:`~coview_stream.clouds.fetch.Fetched`.
-
-    Raises:
-        CloudError: the file cannot be read, is no COPC file, or no point is in the window.
+    CloudError if the file cannot be read, is no COPC file, or no point is in the window.
     """
     answer = _shared.ask({"path": source, "low": low, "high": high, "target": str(target)})
     return {name: answer[name] for name in ("points", "received", "requests")}

@@ -28,10 +28,7 @@ def require_pye57() -> Any:
 def decode(path: Path, builder: CloudBuilder) -> None:
     """Read a file chunk by chunk in this process into a builder, with its reference system.
 
-    Points that the scanner marks as invalid are dropped and counted.
-
-    Raises:
-        CloudError: the file is damaged, or not in metres. DependencyError: pye57 is missing.
+    Points that the scanner marks as invalid are dropped and counted. CloudError if it is damaged, or not in metres.
     """
     pye57 = require_pye57()
     low, high = np.full(3, np.inf), np.full(3, -np.inf)

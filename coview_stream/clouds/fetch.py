@@ -5,6 +5,7 @@ A window's points are written to a LAS file, to be read like any other.
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import math
 import os
@@ -13,6 +14,7 @@ import time
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -43,13 +45,6 @@ class Window:
     low: tuple[float, float]
     high: tuple[float, float]
 
-    def __post_init__(self) -> None:
-        """Check that it has an area (ConfigError)."""
-        if not all(map(math.isfinite, (*self.low, *self.high))) or not (
-            self.low[0] < self.high[0] and self.low[1] < self.high[1]
-        ):
-            raise ConfigError(f"window {self}: has no area; give X0,Y0,X1,Y1, the south-west corner first")
-
     @classmethod
     def parse(cls, text: str) -> Window:
         """Return the window that ``X0,Y0,X1,Y1`` means; ConfigError for any other text."""
@@ -57,6 +52,8 @@ class Window:
             x0, y0, x1, y1 = map(float, text.split(","))
         except ValueError:
             raise ConfigError(f"window {text!r}: give X0,Y0,X1,Y1 in the clouds' coordinates") from None
+        if not (-math.inf < x0 < x1 < math.inf and -math.inf < y0 < y1 < math.inf):
+            raise ConfigError(f"window {text}: has no area; give X0,Y0,X1,Y1, the south-west corner first")
         return cls((x0, y0), (x1, y1))
 
     def __str__(self) -> str:
@@ -87,24 +84,14 @@ def is_web_address(name: str | os.PathLike[str]) -> bool:
 def is_copc(path: Path) -> bool:
     """Return whether a local file is marked as COPC."""
     at, mark = _COPC_MARK
-    try:
-        with path.open("rb") as file:
-            head = file.read(at + len(mark))
-    except OSError:
-        return False
-    return head.startswith(b"LASF") and head[at:] == mark
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        head = file.read(at + len(mark))
+        return head.startswith(b"LASF") and head[at:] == mark
+    return False
 
 
 def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | None = None) -> tuple[Path, Fetched]:
-    """Write a cloud of a web server, or a window of a COPC file, into a folder.
-
-    Args:
-        source: address of a cloud file; with a window, address or name of a COPC file.
-        folder: exists; existing files in it are kept.
-        window: part to write; None: the whole file.
-
-    Returns:
-        The new file, and counts; without a window only of bytes and requests.
+    """Write a cloud of a web server, or a window of a COPC file, into a folder; return the new file, and counts.
 
     Raises:
         CloudError: it cannot be read, is no COPC file, or no point is in the window. OSError: it cannot be written.
@@ -127,19 +114,12 @@ def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | N
 
 
 def _free(path: Path) -> Path:
-    number, name = 1, path
-    while name.exists():
-        number += 1
-        name = path.with_name(f"{number}_{path.name}")
-    return name
+    names = (path.with_name(f"{number}_{path.name}") for number in count(2))
+    return next(name for name in chain([path], names) if not name.exists())
 
 
 def download(address: str, target: Path) -> int:
-    """Write a file of a web server to ``target``; return its size in bytes.
-
-    Raises:
-        CloudError: the server cannot be reached, lacks the file, or broke off. OSError: it cannot be written.
-    """
+    """Write a file of a web server to ``target``; return its size in bytes. CloudError if the server broke off."""
     with open_web_file(urllib.request.Request(address)) as answer, target.open("wb") as file:
         try:
             shutil.copyfileobj(answer, file, 1 << 20)
@@ -152,11 +132,7 @@ def download(address: str, target: Path) -> int:
 
 
 def open_web_file(request: urllib.request.Request) -> Any:
-    """Return the answer to a request; a busy server is tried again a few times.
-
-    Raises:
-        CloudError: not the address of a web server, or the server cannot be reached or lacks the file.
-    """
+    """Return the answer to a request, tried again while the server is busy; CloudError if it cannot be fetched."""
     address = request.full_url
     if not is_web_address(address):
         raise CloudError(f"{address}: not an http:// or https:// address")
@@ -185,7 +161,6 @@ class RangeFile:
     """
 
     def __init__(self, address: str) -> None:
-        """Take an address; no request is made yet."""
         self._address = address
         self._at = 0
         self._block, self._begin = b"", 0
@@ -204,11 +179,7 @@ class RangeFile:
         return self._at
 
     def read(self, size: int) -> bytes:
-        """Return ``size`` bytes, fewer at the end of the file.
-
-        Raises:
-            CloudError: the server cannot be reached, lacks the file, or serves no ranges.
-        """
+        """Return ``size`` bytes, fewer at the file's end; CloudError if the server lacks it or serves no ranges."""
         begin = self._at - self._begin
         if not (begin >= 0 and begin + size <= len(self._block)):
             self._block, self._begin, begin = self._request(max(size, _BLOCK)), self._at, 0

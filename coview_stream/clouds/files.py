@@ -64,11 +64,8 @@ def is_cloud_name(path: str | os.PathLike[str]) -> bool:
 def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Return the files that names, folders and patterns (``tiles/*.laz``) mean, in natural order within each.
 
-    A folder means the clouds directly in it, by their suffix, without hidden and unfinished (``.part``) files. A named
-    file is returned whatever its suffix, for its reader to judge.
-
-    Raises:
-        CloudError: a folder or a pattern holds no cloud.
+    A folder means the clouds directly in it, by their suffix. A named file is returned whatever its suffix, for its
+    reader to judge. CloudError if a folder or a pattern holds no cloud.
     """
     out: list[Path] = []
     for path in map(Path, given):
@@ -98,11 +95,7 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 
 def check_format(path: Path) -> str:
-    """Return the format that a file's suffix names.
-
-    Raises:
-        CloudError: the file is missing, empty or a directory, or its first bytes are of another format.
-    """
+    """Return the format that a file's suffix names; CloudError if the first bytes are of another one."""
     suffix = path.suffix.lower()
     head = _head(path)
     if suffix not in _FORMATS:
@@ -146,10 +139,8 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
 def stream_cloud(path: Path, builder: CloudBuilder) -> str | None:
     """Pass a file's points to a builder, raw, float64 metres; return its reference system, if stated.
 
-    LAS, LAZ and E57 come in chunks of a million points; other formats are read whole first.
-
-    Raises:
-        CloudError: as of :func:`read_cloud`, but not for a file without points.
+    LAS, LAZ and E57 come in chunks of a million points; other formats are read whole first. CloudError as of
+    :func:`read_cloud`, but not for a file without points.
     """
     kind = check_format(path)
     if kind in _WHOLE_READERS:

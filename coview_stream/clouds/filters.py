@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.errors import ConfigError, DependencyError
-from coview_stream.geometry.arrays import Bools, Floats32, Indices, Ints
+from coview_stream.geometry.arrays import Bools, Floats32, Ints
 from coview_stream.geometry.transforms import Points
 
 _MAX_CELLS = 2**62  # voxel keys must fit a signed 64-bit integer
@@ -33,14 +34,17 @@ def open3d() -> ModuleType:
         DependencyError: Open3D or a system library of it is missing; the message names library and remedy.
     """
     try:
-        module = _import_open3d()
-    except ImportError as error:
-        if not (sys.platform == "linux" and "libusb" in str(error) and _preload_libusb()):
-            raise DependencyError(_remedy(error)) from error
         try:
             module = _import_open3d()
-        except ImportError as second:
-            raise DependencyError(_remedy(second)) from second
+        except ImportError as error:
+            if sys.platform != "linux" or "libusb" not in str(error):
+                raise
+            with contextlib.suppress(ImportError, OSError):  # the wheel's libusb, for the linker to find
+                library = importlib.import_module("libusb_package").get_library_path()
+                ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+            module = _import_open3d()
+    except ImportError as error:
+        raise DependencyError(_remedy(error)) from error
     # Open3D prints warnings where this library raises errors
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
@@ -58,18 +62,6 @@ def _import_open3d() -> ModuleType:
         raise ImportError(str(error)) from error
 
 
-def _preload_libusb() -> bool:
-    """Load the libusb of the ``libusb-package`` wheel, for the linker to find."""
-    try:
-        path = importlib.import_module("libusb_package").get_library_path()
-        if path is None:
-            return False
-        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        return False
-    return True
-
-
 def _remedy(error: ImportError) -> str:
     reason = str(error)
     for library, package in _DEBIAN_PACKAGES.items():
@@ -85,20 +77,10 @@ def _remedy(error: ImportError) -> str:
 
 
 def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0) -> tuple[Points, Bools]:
-    """Drop points unusually far from their neighbours (Open3D's statistical filter).
+    """Drop points unusually far from their neighbours (Open3D's statistical filter); return the rest and its mask (N,).
 
-    It takes about 1.6 s per million points on two cores: run it after ``voxel_grid`` on large maps.
-
-    Args:
-        points: (N, 3) float32 metres, finite.
-        neighbours: number of nearest points for the mean distance.
-        std_ratio: mean distances above mean + ``std_ratio`` * standard deviation of the cloud are outliers.
-
-    Returns:
-        The remaining points (K, 3) and their mask (N,). Clouds of at most ``neighbours`` points stay whole.
-
-    Raises:
-        ConfigError: ``neighbours`` < 1 or ``std_ratio`` <= 0.
+    Outliers are points (float32, finite) whose mean distance to the nearest ``neighbours`` exceeds the cloud's mean by
+    ``std_ratio`` standard deviations. 1.6 s per million points on two cores: run it after ``voxel_grid`` on large maps.
     """
     if neighbours < 1 or not std_ratio > 0:
         raise ConfigError(f"neighbours={neighbours}, std_ratio={std_ratio}: both must be positive")
@@ -116,28 +98,13 @@ def voxel_grid(points: Points, voxel: float) -> Points:
 
     NumPy is several times faster here than Open3D's filter on 10 M points, and its order does not depend on threads.
 
-    Args:
-        points: (N, 3) float32 metres, finite.
-        voxel: edge length in metres; borders are multiples of it.
-
-    Raises:
-        ConfigError: ``voxel`` is not positive, or so small for this extent that keys would overflow.
+    Points (N, 3) are float32 metres, finite; borders of voxels are multiples of the edge ``voxel``, metres. ConfigError
+    if it is not positive, or so small for this extent that keys would overflow.
     """
     if not voxel > 0:
         raise ConfigError(f"voxel={voxel}: must be positive")
     if not len(points):
         return points.reshape(0, 3)
-    order, starts = _voxel_groups(points, voxel)
-    counts = np.diff(np.append(starts, len(points)))
-    centroids = np.empty((len(starts), 3), dtype=np.float32)
-    for axis in range(3):  # one axis at a time: smaller float64 copies
-        column = points[:, axis][order].astype(np.float64)
-        centroids[:, axis] = np.add.reduceat(column, starts) / counts
-    return centroids
-
-
-def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
-    """Return the points' order by voxel key, and the start of each voxel in that order."""
     low = np.floor(points.min(axis=0).astype(np.float64) / voxel)
     extent = np.floor(points.max(axis=0).astype(np.float64) / voxel) - low + 1
     if float(np.prod(extent)) > _MAX_CELLS:
@@ -150,7 +117,12 @@ def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
     order = np.argsort(keys)
     keys = keys[order]
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
-    return order, starts
+    counts = np.diff(np.append(starts, len(points)))
+    centroids = np.empty((len(starts), 3), dtype=np.float32)
+    for axis in range(3):  # one axis at a time: smaller float64 copies
+        column = points[:, axis][order].astype(np.float64)
+        centroids[:, axis] = np.add.reduceat(column, starts) / counts
+    return centroids
 
 
 def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> tuple[Points, Floats32]:
@@ -159,24 +131,15 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
     Planarity is 1 - 3 s, with s the share of the covariance's smallest eigenvalue ("surface variation", Pauly et al.,
     2002): 1 on a plane, 0 for isotropic scatter as in a crown. Fewer than three neighbours give (0, 0, 1) and 0.
 
-    Args:
-        points: (N, 3) float32 metres, finite.
-        k: maximum number of neighbours.
-        radius: maximum distance of neighbours, metres (hybrid search); None for the k nearest.
-
-    Raises:
-        ConfigError: ``k`` < 3 or ``radius`` <= 0.
+    Points (N, 3) are float32 metres, finite; neighbours are the ``k`` nearest, within ``radius`` metres if it is given.
     """
     if k < 3 or (radius is not None and not radius > 0):
         raise ConfigError(f"k={k}, radius={radius}: k must be at least 3 and the radius positive")
     if not len(points):
         return points.reshape(0, 3), np.empty(0, dtype=np.float32)
     geometry = open3d().geometry
-    search = (
-        geometry.KDTreeSearchParamKNN(k)
-        if radius is None
-        else geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=k)
-    )
+    hybrid, nearest = geometry.KDTreeSearchParamHybrid, geometry.KDTreeSearchParamKNN
+    search = nearest(k) if radius is None else hybrid(radius=radius, max_nn=k)
     cloud = _legacy(points)
     cloud.estimate_covariances(search)
     covariances = np.asarray(cloud.covariances)

@@ -24,10 +24,8 @@ from coview_stream.geometry.arrays import Floats
 
 CHUNK = 1_000_000
 """Points per chunk: about 100 MB of float64 and record buffers."""
-
 NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""
-
 _MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
 _WKT_RECORD = "LASF_Projection", 2112
 _POINTWISE = 1  # LASzip's number of the compressor without chunks
@@ -68,10 +66,7 @@ def read_header(path: Path) -> Any:
 def decode(path: Path, builder: CloudBuilder) -> None:
     """Read a file chunk by chunk in this process into a builder, with its reference system.
 
-    Withheld points and the noise classes 7 and 18 are dropped and counted.
-
-    Raises:
-        CloudError: the file is damaged, truncated or not in metres. DependencyError: laspy is missing.
+    Withheld points and the classes of noise are dropped and counted. CloudError if it is damaged or not in metres.
     """
     with _reader(path) as reader:
         builder.crs = system_of(path, reader.header)

@@ -25,11 +25,11 @@ _LZF_RATIO = 88  # LZF's maximum: a back reference of 3 bytes yields up to 264
 
 @dataclass(frozen=True)
 class _Header:
-    """Header of a PCD file."""
+    """Header of a PCD file: type, count and number of each field, and of each axis its field."""
 
-    fields: tuple[str, ...]
     types: tuple[np.dtype[np.generic], ...]
     counts: tuple[int, ...]
+    axes: tuple[int, int, int]
     points: int
     encoding: str
     data_start: int
@@ -99,7 +99,8 @@ def _header_from(entries: dict[str, list[str]], data_start: int) -> _Header:
     if points < 0:
         raise ValueError("POINTS is negative")
     types = tuple(np.dtype(f"<{_KINDS[kind]}{size}") for kind, size in zip(kinds, sizes, strict=True))
-    return _Header(fields, types, tuple(counts), points, encoding, data_start)
+    x, y, z = (fields.index(axis) for axis in _AXES)
+    return _Header(types, tuple(counts), (x, y, z), points, encoding, data_start)
 
 
 def _truncated(path: Path, header: _Header, stored: int) -> CloudError:
@@ -116,8 +117,7 @@ def _stack(columns: list[npt.NDArray[np.generic]]) -> Reals:
 
 
 def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
-    starts = np.concatenate([[0], np.cumsum(header.counts)])
-    columns = [int(starts[header.fields.index(axis)]) for axis in _AXES]
+    columns = [sum(header.counts[:field]) for field in header.axes]
     body = content[header.data_start :]
     if header.points == 0:
         return np.zeros((0, 3))
@@ -142,7 +142,7 @@ def _binary(content: bytes, header: _Header, path: Path) -> Reals:
     if stored < header.points:
         raise _truncated(path, header, stored)
     rows = np.frombuffer(content, row, header.points, header.data_start)
-    return _stack([rows[f"f{header.fields.index(axis)}"][:, 0] for axis in _AXES])
+    return _stack([rows[f"f{field}"][:, 0] for field in header.axes])
 
 
 def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
@@ -167,18 +167,14 @@ def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
         raise CloudError(f"{path}: damaged compressed PCD ({error}); copy or export it again") from error
     lengths = [t.itemsize * c * header.points for t, c in zip(header.types, header.counts, strict=True)]
     starts = np.concatenate([[0], np.cumsum(lengths)])
-    columns = [header.fields.index(axis) for axis in _AXES]
-    return _stack([np.frombuffer(body, header.types[i], header.points, int(starts[i])) for i in columns])
+    return _stack([np.frombuffer(body, header.types[i], header.points, int(starts[i])) for i in header.axes])
 
 
 def lzf_decompress(packed: bytes, size: int) -> bytearray:
-    """Decompress one LZF block of ``size`` bytes.
+    """Decompress one LZF block; ValueError if it does not decode to exactly ``size`` bytes.
 
     A control byte below 32 starts a literal run; others are back references with a 3-bit length (7: one more
     length byte follows) and a 13-bit distance.
-
-    Raises:
-        ValueError: the block does not decode to exactly ``size`` bytes.
     """
     out = bytearray()
     at, end = 0, len(packed)

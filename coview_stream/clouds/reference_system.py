@@ -24,8 +24,7 @@ _METRE = 9001
 _NORTH_STEP = 10.0  # metres along the map's north axis, to measure true north
 _UNITS = {9002: "feet", 9003: "US survey feet", 9005: "Clarke's feet", 9014: "fathoms", 9093: "miles"}
 
-MAX_SCALE_ERROR = 0.01
-"""Relative error of a projection's lengths: half a metre in 50 m."""
+_MAX_SCALE_ERROR = 0.01  # of a projection's lengths: half a metre in 50 m
 
 
 def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
@@ -143,22 +142,16 @@ def _flaw(system: Any, centre: Floats) -> str | None:
         if abs(axis.unit_conversion_factor - 1.0) > 1e-9:
             unit = {"foot": "feet", "US survey foot": "US survey feet"}.get(axis.unit_name, axis.unit_name)
             return f"{subject} are in {unit} ({system.name})"
-    scale = _scale(parts[0], centre)
-    if scale is not None and abs(scale - 1.0) > MAX_SCALE_ERROR:
-        return f"lengths are {scale:.2f} times those on the ground ({system.name} is a map of the world, not of a site)"
-    return None
-
-
-def _scale(projected: Any, centre: Floats) -> float | None:
-    """Return lengths on the map divided by lengths on the ground; None outside the system's area."""
-    place = _longitude_latitude(projected, centre)
-    if place is None:
+    place = _longitude_latitude(parts[0], centre)
+    if place is None:  # outside of the system's area
         return None
     import pyproj
 
-    factors = pyproj.Proj(projected).get_factors(*place)
+    factors = pyproj.Proj(parts[0]).get_factors(*place)
     scale = float(np.sqrt(abs(factors.meridional_scale * factors.parallel_scale)))
-    return scale if np.isfinite(scale) and scale > 0 else None
+    if np.isfinite(scale) and scale > 0 and abs(scale - 1.0) > _MAX_SCALE_ERROR:
+        return f"lengths are {scale:.2f} times those on the ground ({system.name} is a map of the world, not of a site)"
+    return None
 
 
 def _longitude_latitude(projected: Any, centre: Floats) -> tuple[float, float] | None:
@@ -210,10 +203,9 @@ class GeoReference:
         try:
             system = pyproj.CRS.from_user_input(crs)
             self.name = short_name(crs)
-            self._flat: Any = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
-            self._high: Any = None
-            if system.is_compound or len(system.axis_info) == 3:
-                self._high = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
+            self._has_heights = system.is_compound or len(system.axis_info) == 3
+            target = "EPSG:4979" if self._has_heights else "EPSG:4326"
+            self._to_degrees: Any = pyproj.Transformer.from_crs(system, target, always_xy=True)
         except pyproj.exceptions.ProjError as error:
             raise InputError(f"the map's reference system {short_name(crs)} has no place on Earth ({error})") from error
 
@@ -223,11 +215,10 @@ class GeoReference:
         NaN for a position without a place on Earth.
         """
         x, y, z = np.asarray(positions, dtype=np.float64).reshape(-1, 3).T
-        if self._high is None:
-            longitude, latitude = self._flat.transform(x, y)
-            height = z
+        if self._has_heights:
+            longitude, latitude, height = self._to_degrees.transform(x, y, z)
         else:
-            longitude, latitude, height = self._high.transform(x, y, z)
+            (longitude, latitude), height = self._to_degrees.transform(x, y), z
         out = np.stack([latitude, longitude, height], axis=1)
         out[~np.isfinite(out).all(axis=1)] = np.nan
         return out

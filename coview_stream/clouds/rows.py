@@ -43,10 +43,7 @@ def read_text(path: Path) -> Cloud:
     """Read x, y and z (metres) from text, in the first three columns or those that a line of titles names.
 
     Spaces, tabs, commas or semicolons separate the columns. Skipped are further columns, lines that begin with #, // or
-    ;, and the number of points at the start of a PTS file.
-
-    Raises:
-        CloudError: a line is no point (the message names it), there are decimal commas, or no points at all.
+    ;, and the number of points at the start of a PTS file. CloudError names a line that is no point.
     """
     builder = CloudBuilder()
     with path.open(encoding="utf-8-sig", errors="replace", newline=None) as stream:
@@ -71,7 +68,7 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
         if _DECIMAL_COMMAS.match(text):
             raise CloudError(f"{path}:{number}: {text[:60]!r} has decimal commas; write decimal points")
         separator = next((mark for mark in (";", ",", "\t") if mark in text), None)
-        cells = _cells(text, separator)
+        cells = [cell.strip().strip('"') for cell in text.split(separator)]
         if all(map(_is_number, cells)):
             if len(cells) >= 3:
                 return separator, columns, [line], number
@@ -88,7 +85,9 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
 def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[int, ...], number: int) -> Floats:
     """Return (N, 3) of lines, without blank lines, comments, and a PTS file's numbers of points."""
     counted = path.suffix.lower() == ".pts"
-    rows = [row if _is_point(row, counted) else "" for row in rows]
+    rows = [
+        "" if (text := row.strip()).startswith(_COMMENTS) or (counted and text.isdecimal()) else text for row in rows
+    ]
     points = [row for row in rows if row]
     try:
         if separator is None or not any("  " in row for row in points[:1]):
@@ -102,16 +101,11 @@ def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[
     for at, row in enumerate(rows):
         if not row:
             continue
-        words = _cells(row, separator)
+        words = [cell.strip().strip('"') for cell in row.split(separator)]
         if len(words) <= max(columns) or not all(_is_number(words[k]) for k in columns):
-            raise CloudError(f"{path}:{number + at}: {row.strip()[:60]!r} is no point; write x y z, in metres")
+            raise CloudError(f"{path}:{number + at}: {row[:60]!r} is no point; write x y z, in metres")
         cells.append([float(words[k]) for k in columns])
     return np.array(cells, dtype=np.float64).reshape(-1, 3)
-
-
-def _is_point(row: str, counted: bool) -> bool:
-    text = row.strip()
-    return bool(text) and not text.startswith(_COMMENTS) and not (counted and text.isdecimal())
 
 
 def _titled_columns(text: str) -> tuple[int, ...] | None:
@@ -124,10 +118,6 @@ def _titled_columns(text: str) -> tuple[int, ...] | None:
     return (columns[0], columns[1], columns[2]) if len(columns) == 3 else None
 
 
-def _cells(line: str, separator: str | None) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.strip().split(separator)]
-
-
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -137,11 +127,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_npy(path: Path) -> Cloud:
-    """Read an (N, 3 or more) array of numbers whose first three columns are x, y and z in metres.
-
-    Raises:
-        CloudError: the file is damaged, truncated, holds objects, or is of another shape or type.
-    """
+    """Read an (N, 3 or more) array of numbers whose first three columns are x, y and z in metres; CloudError if not."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except MemoryError:

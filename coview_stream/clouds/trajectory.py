@@ -20,14 +20,10 @@ _ROTATION_TOLERANCE = 1e-2
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
-    """Read stamps (N,) in seconds and poses (N, 4, 4) in metres from a TUM file.
+    """Read stamps (N,) in seconds and poses (N, 4, 4) in metres from a TUM file; N may be 0.
 
-    Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
-    without poses gives N = 0 (a run that was never localized).
-
-    Raises:
-        RunError: missing or unreadable file, text or a wrong number of columns, NaN, a zero quaternion, or
-            stamps that do not increase; the message names the line.
+    Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. RunError names a line
+    with text, a wrong number of columns, NaN, a zero quaternion or a stamp that does not increase.
     """
     path = Path(path)
     rows, lines = _read_rows(path, _TUM_COLUMNS, "t x y z qx qy qz qw")
@@ -36,26 +32,28 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
     short = np.linalg.norm(quaternions, axis=1) < _MIN_QUATERNION_NORM
     if short.any():
         raise RunError(f"{path}:{lines[int(np.argmax(short))]}: quaternion is zero; write qx qy qz qw")
-    return stamps, _poses(rows[:, 1:4], quat_to_matrix(quaternions) if len(rows) else None)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        poses[:, :3, :3] = quat_to_matrix(quaternions)
+    poses[:, :3, 3] = rows[:, 1:4]
+    return stamps, poses
 
 
 def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
-    """Read poses (N, 4, 4) from a KITTI file: 12 numbers a line, the first three rows of each matrix.
-
-    Raises:
-        RunError: as ``read_tum``; also if the 3x3 part is no rotation.
-    """
+    """Read poses (N, 4, 4) from a KITTI file, 12 numbers a line; RunError as ``read_tum``, also for no rotation."""
     path = Path(path)
     rows, lines = _read_rows(path, 12, "the 3x4 pose, row by row")
-    if not len(rows):
-        return np.zeros((0, 4, 4))
     parts = rows.reshape(-1, 3, 4)
     R = parts[:, :, :3]
     wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
     wrong |= np.linalg.det(R) <= 0
     if wrong.any():
         raise RunError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns")
-    return _poses(parts[:, :, 3], nearest_rotation(R))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        poses[:, :3, :3] = nearest_rotation(R)
+    poses[:, :3, 3] = parts[:, :, 3]
+    return poses
 
 
 def read_times(path: str | os.PathLike[str]) -> Floats:
@@ -69,10 +67,7 @@ def read_times(path: str | os.PathLike[str]) -> Floats:
 def write_tum(path: str | os.PathLike[str], stamps: Sequence[float] | Floats, poses: Sequence[Pose] | Poses) -> None:
     """Write stamps (N,) in seconds and poses (N, 4, 4) in metres; the file is complete or not there.
 
-    N = 0 writes an empty file.
-
-    Raises:
-        InputError: the lengths differ, or the file cannot be written.
+    InputError if the lengths differ, or the file cannot be written.
     """
     path = Path(path)
     if len(stamps) != len(poses):
@@ -139,11 +134,3 @@ def _read_rows(path: Path, columns: int, meaning: str) -> tuple[Floats, list[int
         number = lines[int(np.argmax(absurd))]
         raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
     return table, lines
-
-
-def _poses(translations: Floats, rotations: Floats | None) -> Poses:
-    poses = np.tile(np.eye(4), (len(translations), 1, 1))
-    if rotations is not None:
-        poses[:, :3, :3] = rotations
-        poses[:, :3, 3] = translations
-    return poses

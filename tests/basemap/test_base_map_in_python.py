@@ -47,6 +47,12 @@ def test_arrays_and_files_can_be_mixed(cut, from_array, tmp_path):
     names = [str(source.path) for source in sources_of([cut, cut])]
     assert names == ["array 1", "array 2"]
 
+    class Table:  # of pandas, or a tensor
+        def __array__(self, dtype=None, copy=None):
+            return cut[:9]
+
+    np.testing.assert_array_equal(sources_of(Table())[0].rows, cut[:9])
+
 
 @pytest.mark.parametrize(
     ("given", "says"),
@@ -77,14 +83,6 @@ def test_system_that_is_not_of_metres_is_refused(cut):
         BaseMap.build(cut, crs=32632)
     with pytest.raises(ConfigError, match="config is a dict; give a MapConfig"):
         BaseMap.build(cut, config={"voxel": 0.5})
-
-
-def test_what_can_be_made_an_array_is_one(cut):
-    class Table:
-        def __array__(self, dtype=None, copy=None):
-            return cut[:9]
-
-    np.testing.assert_array_equal(sources_of(Table())[0].rows, cut[:9])
 
 
 def test_coarse_float32_coordinates_are_told(cut):
@@ -147,6 +145,14 @@ def test_loaded_map_is_pickled_as_its_path(world_file, tmp_path):
     assert pickle.loads(data).sha256 == loaded.sha256
 
 
+def test_built_map_is_pickled_with_its_arrays(from_array):
+    _ = from_array.station_grid, from_array.summary  # are not pickled
+    again = pickle.loads(pickle.dumps(from_array))
+    np.testing.assert_array_equal(again.points, from_array.points)
+    assert again.config == from_array.config
+    assert "station_grid" not in vars(again)
+
+
 def test_pickled_map_whose_file_is_another_is_refused(world_file, from_array, tmp_path):
     path = tmp_path / "site.coview"
     shutil.copy(world_file, path)
@@ -157,11 +163,3 @@ def test_pickled_map_whose_file_is_another_is_refused(world_file, from_array, tm
     path.unlink()
     with pytest.raises(MapError, match=r"site\.coview"):
         pickle.loads(data)
-
-
-def test_built_map_is_pickled_with_its_arrays(from_array):
-    _ = from_array.station_grid, from_array.summary  # what is computed is not pickled
-    again = pickle.loads(pickle.dumps(from_array))
-    np.testing.assert_array_equal(again.points, from_array.points)
-    assert again.config == from_array.config
-    assert "station_grid" not in vars(again)

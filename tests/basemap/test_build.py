@@ -12,7 +12,7 @@ from coview_stream.basemap.ground import cloth_available
 from coview_stream.basemap.map_arrays import cells_of, surveyed_around
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
-from coview_stream.errors import CloudError, ConfigError, CoViewError, MapError
+from coview_stream.errors import CloudError, ConfigError, MapError
 
 SMALL = {"radius": 15.0, "rings": 6, "sectors": 12}
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -209,20 +209,3 @@ def test_map_of_earlier_version_with_removed_options_loads(whole):
 def test_map_made_with_removed_option_is_refused(whole, option):
     with pytest.raises(MapError, match=f"{next(iter(option))} is .*build it again"):
         BaseMap(whole.arrays, with_option(whole, **option))
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"config": {}},
-        {"config": None},
-        {"config": {"descriptor": {"channels": ["coview"], "radius": -1.0}}},
-        {"config": {"descriptor": {"channels": ["coview"], "colour": 1}}},
-        {"sources": None},
-    ],
-)
-def test_invalid_map_parameters_are_refused(whole, damage):
-    with pytest.raises(MapError, match="build it again"):
-        BaseMap(whole.arrays, whole.parameters | damage)
-    with pytest.raises(CoViewError):
-        BaseMap(whole.arrays, {})

@@ -71,13 +71,27 @@ def test_values_that_would_be_used_as_places_are_checked(small: Any, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "parameters", [None, [], "x", {"config": None}, {"config": []}, {"sources": [1, 2]}, {"sources": "ab"}, {"crs": 7}]
-)
+    "parameters",
+    [
+        None, [], "x", {}, {"config": None}, {"config": []}, {"config": {}}, {"sources": [1, 2]}, {"sources": "ab"},
+        {"sources": None}, {"crs": 7}, {"config": {"descriptor": {"channels": ["coview"], "radius": -1.0}}},
+        {"config": {"descriptor": {"channels": ["coview"], "colour": 1}}},
+    ],
+)  # fmt: skip
 def test_parameters_of_another_kind_are_refused(small: Any, tmp_path: Path, parameters: Any) -> None:
     whole = small[1] | parameters if isinstance(parameters, dict) and parameters else parameters
     file_format.save(tmp_path / "a.coview", small[0], whole)
-    with pytest.raises(MapError):
+    with pytest.raises(MapError, match=r"a\.coview: the map.* (build it|copy or build it) again"):
         BaseMap.load(tmp_path / "a.coview")
+
+
+def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, tmp_path: Path) -> None:
+    parameters = json.loads(json.dumps(small[1]))
+    parameters["config"]["descriptor"]["channels"].append("coview_strict")  # of maps from before November 2026
+    file_format.save(tmp_path / "a.coview", small[0], parameters)
+    with pytest.raises(MapError, match=r"a\.coview: the map's .*'coview_strict'.*; build it again") as error:
+        BaseMap.load(tmp_path / "a.coview")
+    assert "\n" not in str(error.value)
 
 
 def _with_header(path: Path, text: bytes, body: bytes = bytes(64)) -> Path:

@@ -88,21 +88,19 @@ def test_stations_do_not_depend_on_point_order():
     np.testing.assert_allclose(one[np.lexsort(one.T)], two[np.lexsort(two.T)], atol=1e-5)
 
 
-def test_describing_stations_in_chunks_gives_same_descriptors(monkeypatch):
+def test_describing_stations_in_portions_gives_same_descriptors():
     points = np.random.default_rng(5).uniform([-15, -15, 0], [15, 15, 6], (4000, 3)).astype(np.float32)
     stations = find_stations(sloping_ground(), 2.0)
     raster = rasterise(points, aligned_corner(points, 2.0, 0.5), 0.5, 0.5, margin=4)
     config = DescriptorConfig(radius=12.0, rings=6, sectors=12, channels=("scan_context", "coview"))
-    whole = describe_stations(raster, stations, config)
-    seen = []
-    monkeypatch.setattr("coview_stream.basemap.stations._PORTION", 7)
-    parts = describe_stations(raster, stations, config, lambda done, total: seen.append((done, total)))
-    assert seen[-1] == (len(stations), len(stations))
-    assert [done for done, _ in seen] == sorted({done for done, _ in seen})
+    one, seen = describe_stations(raster, stations, config), []
+    many = describe_stations(raster, np.tile(stations, (9, 1)), config, lambda *step: seen.append(step))
+    total = 9 * len(stations)
+    assert seen == [(512, total), (1024, total), (total, total)]
     for name in config.channels:
-        assert whole[name].shape == (len(stations), 6, 12)
-        assert whole[name].dtype == np.float16
-        np.testing.assert_array_equal(whole[name], parts[name])
+        assert one[name].shape == (len(stations), 6, 12)
+        assert one[name].dtype == np.float16
+        np.testing.assert_array_equal(many[name], np.tile(one[name], (9, 1, 1)))
 
 
 def test_tower_appears_in_its_ring_and_sector():

@@ -59,12 +59,6 @@ def test_axis_that_points_up_other_than_z_is_told(town, tmp_path, order, name, r
     assert any(f"{name} seems to point up" in warning and remedy in warning for warning in found.warnings), found
 
 
-def test_remedy_of_the_warning_is_the_right_one(town):
-    y_up, x_up = town[:, (0, 2, 1)] * (1, 1, -1), town[:, (2, 0, 1)]
-    np.testing.assert_allclose(np.stack([y_up[:, 0], -y_up[:, 2], y_up[:, 1]], axis=1), town)
-    np.testing.assert_allclose(np.stack([x_up[:, 1], x_up[:, 2], x_up[:, 0]], axis=1), town)
-
-
 def test_tiles_far_apart_are_told_when_a_map_is_built(town, tmp_path):
     np.save(tmp_path / "a.npy", town)
     np.save(tmp_path / "b.npy", np.add(town, (1500.0, 0.0, 0.0)))
@@ -86,9 +80,6 @@ def test_thinned_points_are_the_maps_and_on_the_ground_where_it_is_level(world_m
     assert z[~view.is_ground].max() > 2.0
     assert 0.2 < view.is_ground.mean() < 0.95
     assert view.sha256 == world_map.sha256
-
-
-def test_few_points_are_all_kept(world_map):
     assert len(MapView.of(world_map, 10**6).points) == len(world_map.points)
 
 

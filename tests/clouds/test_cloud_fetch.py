@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -67,15 +68,22 @@ def site(points: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def server(site: Path) -> Iterator[str]:
-    """Return the address of a server of its folder."""
+@contextlib.contextmanager
+def served_folder(folder: Path) -> Iterator[str]:
+    """Serve a folder, and yield its address."""
     Handler.ranges, Handler.sent, Handler.busy = True, [], 0
-    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(site.parent)))
+    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
     threading.Thread(target=served.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{served.server_address[1]}"
     served.shutdown()
     served.server_close()
+
+
+@pytest.fixture
+def server(site: Path) -> Iterator[str]:
+    """Return the address of a server of its folder."""
+    with served_folder(site.parent) as address:
+        yield address
 
 
 def inside(points: np.ndarray) -> np.ndarray:
@@ -110,15 +118,8 @@ def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
     """In a file this small most bytes come from rounding requests up to a block; the bound allows for them."""
     rng = np.random.default_rng(5)
     write_copc(tmp_path / "wide.copc.laz", rng.uniform([0.0, 0.0, 0.0], [900.0, 900.0, 40.0], (60_000, 3)), levels=5)
-    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(tmp_path)))
-    threading.Thread(target=served.serve_forever, daemon=True).start()
-    Handler.sent, Handler.ranges = [], True
-    try:
-        address = f"http://127.0.0.1:{served.server_address[1]}/wide.copc.laz"
-        fetch_cloud(address, tmp_path, Window((10.0, 10.0), (20.0, 20.0)))
-    finally:
-        served.shutdown()
-        served.server_close()
+    with served_folder(tmp_path) as address:
+        fetch_cloud(f"{address}/wide.copc.laz", tmp_path, Window((10.0, 10.0), (20.0, 20.0)))
     beside = 65_536 * len(Handler.sent)
     assert sum(Handler.sent) - beside < 0.3 * (tmp_path / "wide.copc.laz").stat().st_size
 

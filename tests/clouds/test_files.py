@@ -6,7 +6,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from coview_stream.clouds import merge, read_cloud, write_cloud
@@ -58,52 +57,26 @@ def test_non_finite_and_huge_rows_are_dropped_and_counted(tmp_path: Path, suffix
     np.testing.assert_array_equal(cloud.points, np.delete(POINTS, [3, 5, 7], axis=0))
 
 
-def _pcd(fields: str, size: str, kind: str, count: str, n: int, data: str) -> bytes:
-    return (
-        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\n"
-        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
-    ).encode()
-
-
-def _mixed_rows() -> npt.NDArray[np.void]:
-    row = np.dtype([("i", "u1"), ("z", "<f8"), ("n", "<f4", (3,)), ("x", "<f4"), ("y", "<i2")])
-    rows = np.zeros(50, row)
-    rows["x"], rows["y"], rows["z"] = POINTS[:50, 0], np.arange(50), POINTS[:50, 2]
-    rows["n"] = 7.0
-    return rows
-
-
-def _expected(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
-    return np.column_stack([rows["x"], rows["y"], rows["z"]])
-
-
-def test_pcd_binary_with_any_field_order_and_types(tmp_path: Path) -> None:
-    rows = _mixed_rows()
-    path = tmp_path / "a.pcd"
-    path.write_bytes(_pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "binary") + rows.tobytes())
-    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
-
-
-def test_pcd_ascii_with_any_field_order(tmp_path: Path) -> None:
-    rows = _mixed_rows()
-    body = "".join(f"{r['i']} {r['z']} 1 nan 3 {r['x']} {r['y']}\n" for r in rows)
-    path = tmp_path / "a.pcd"
-    path.write_bytes(_pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "ascii") + body.encode())
-    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-5)
-
-
-def _lzf_literals(data: bytes) -> bytes:
-    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
-
-
-def test_pcd_binary_compressed_stores_fields_one_after_another(tmp_path: Path) -> None:
-    rows = _mixed_rows()
-    data = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names or ())
-    packed = _lzf_literals(data)
-    path = tmp_path / "a.pcd"
-    header = _pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "binary_compressed")
-    path.write_bytes(header + struct.pack("<II", len(packed), len(data)) + packed)
-    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_pcd_with_fields_of_any_order_and_type(tmp_path: Path, encoding: str) -> None:
+    kind = np.dtype([("i", "u1"), ("z", "<f8"), ("n", "<f4", (3,)), ("x", "<f4"), ("y", "<i2")])
+    rows = np.zeros(50, kind)
+    rows["x"], rows["y"], rows["z"], rows["n"] = POINTS[:50, 0], np.arange(50), POINTS[:50, 2], 7.0
+    if encoding == "ascii":
+        body = "".join(f"{r['i']} {r['z']} 1 nan 3 {r['x']} {r['y']}\n" for r in rows).encode()
+    elif encoding == "binary":
+        body = rows.tobytes()
+    else:  # one field after another, in literal runs of LZF
+        data = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in kind.names)
+        packed = b"".join(bytes([len(run) - 1]) + run for run in (data[i : i + 32] for i in range(0, len(data), 32)))
+        body = struct.pack("<II", len(packed), len(data)) + packed
+    (tmp_path / "a.pcd").write_bytes(
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS i z n x y\nSIZE 1 8 4 4 2\nTYPE U F F F I\nCOUNT 1 1 3 1 1\n"
+        f"WIDTH 50\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 50\nDATA {encoding}\n".encode()
+        + body
+    )
+    expected = np.column_stack([rows["x"], rows["y"], rows["z"]])
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd").points, expected, atol=1e-5)
 
 
 def test_lzf_back_references_repeat_and_overlap() -> None:
@@ -128,7 +101,7 @@ def test_ply_vertices_after_another_element(tmp_path: Path, order: str) -> None:
     rows["x"], rows["y"], rows["z"] = POINTS[:40, 0], POINTS[:40, 1], np.arange(40)
     path = tmp_path / "a.ply"
     path.write_bytes(header.encode() + struct.pack(f"{sign}2d", 1, 2) + rows.tobytes())
-    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
+    np.testing.assert_allclose(read_cloud(path).points, np.column_stack([rows["x"], rows["y"], rows["z"]]), atol=1e-6)
 
 
 def test_ply_ascii_is_read(tmp_path: Path) -> None:

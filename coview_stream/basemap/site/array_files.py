@@ -12,6 +12,7 @@ import math
 import mmap
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ class ArrayFiles(MemoryArrays):
         return self._files[name]
 
     @contextlib.contextmanager
-    def _room(self) -> Any:
+    def _room(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:

@@ -22,7 +22,7 @@ from coview_stream.basemap.site.layers import decode, read_cloud_layer, read_sta
 from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEntry
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.stations import Described, describe_storeys
-from coview_stream.basemap.tiles import Key, sort_by_tile_packed, unit_normals
+from coview_stream.basemap.tiles import Key, sort_by_tile, unit_normals
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
@@ -30,9 +30,7 @@ from coview_stream.geometry.transforms import Points
 
 log = logging.getLogger("coview_stream.maps")
 
-VERSION = 3
-"""Version of the arrays that are made of the same layers."""
-
+VERSION = 3  # of the arrays that are made of the same layers
 PARAMETER = "made_tiles"
 """Parameter of a working file: for each tile its state, first station, stations, first row of the field, rows."""
 
@@ -49,18 +47,12 @@ def assemble(
     keys: Collection[Key] | None = None,
     earlier: Callable[[Mapping[Key, str]], EarlierMap] | None = None,
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Return the arrays of a map, and its parameters.
+    """Return the arrays of a map of some tiles of a site, or all, and its parameters; the arrays outlive ``into``.
 
-    Args:
-        manifest: of the site.
-        store: holds the layers.
-        into: holds the arrays; they stay usable after it is closed.
-        progress: called with steps done and all steps.
-        keys: tiles of the map; None takes all.
-        earlier: opens an earlier map, given the states of the tiles (:meth:`SiteTiles.states`).
+    ``earlier`` opens an earlier map, given the states of the tiles (:meth:`SiteTiles.states`).
 
     Raises:
-        MapError: a layer is missing or damaged, there are no stations on these tiles or too many, or there is no room.
+        MapError: a layer is missing or damaged, too few or too many stations, or no room.
     """
     entries = [tile for tile in manifest.tiles if keys is None or (tile.column, tile.row) in keys]
     steps, done = 3 * len(entries), 0
@@ -82,7 +74,12 @@ def assemble(
     if learned is None or not all("features" in entry.layers for entry in entries):
         learned = None
     else:
-        arrays |= _features(entries, store)
+        layers = [layer_of(entry, "features", store) for entry in entries]
+        try:
+            arrays |= {f"learned.{name}": np.concatenate([layer[name] for layer in layers]) for name in _LEARNED}
+        except (KeyError, ValueError) as error:
+            flaw = f"a tile's features are not what they should be ({error})"
+            raise MapError(f"{flaw}; fetch or build it again") from error
     parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256, "learned": learned}
     if keys is not None and isinstance(read := parameters.get("source_points"), int):
         # an estimate: the source points of single tiles are not known
@@ -96,11 +93,7 @@ def assemble(
 
 
 def field_layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
-    """Return the rasters in which the field of a map is looked up, made in files.
-
-    Raises:
-        MapError: the map is too large for them, or there is no room.
-    """
+    """Return the rasters in which a map's field is looked up, made in files; MapError if they are too large."""
     try:
         made = layers_arrays(arrays, into.zeros, into.release)
     except ValueError as error:
@@ -125,11 +118,7 @@ class SiteTiles:
         into: ArrayFiles,
         step: Callable[[], None],
     ) -> None:
-        """Decode the tiles, and the clouds of neighbours that are in the store.
-
-        Raises:
-            MapError: a layer is missing or damaged, or does not match the manifest.
-        """
+        # MapError where a layer is missing or damaged, or does not match the manifest
         self.config = config_of_map(manifest.parameters["config"])
         self.stations: dict[Key, Floats32] = {}
         self._grid = SiteGrid(manifest.origin, manifest.tile, self.config)
@@ -139,7 +128,7 @@ class SiteTiles:
         self._cells: dict[Key, Ints] = {}
         self._index: list[Ints] = []
         for entry in entries:
-            self._add(entry, *self._read(entry, store))
+            self._add(entry, store)
             stations = read_stations_layer(layer_of(entry, "stations", store), self.config.block)
             if len(stations) != entry.stations:
                 raise MapError(f"tile {entry.column}, {entry.row}: its stations are not those that the manifest counts")
@@ -150,7 +139,7 @@ class SiteTiles:
             cloud = entry.layers["cloud"]
             if (entry.column, entry.row) in neighbours and store.holds(cloud.sha256, cloud.bytes):
                 try:
-                    self._add(entry, *self._read(entry, store))
+                    self._add(entry, store)
                 except MapError as error:
                     log.warning("%s; the tiles beside it are made without it", error)
 
@@ -223,19 +212,15 @@ class SiteTiles:
                 clouds.append((points[near], normals[near]))
         return np.concatenate([points for points, _ in clouds]), np.concatenate([normals for _, normals in clouds])
 
-    def _read(self, entry: TileEntry, store: TileStore) -> tuple[Points, Int8s]:
+    def _add(self, entry: TileEntry, store: TileStore) -> None:
         key = entry.column, entry.row
         cloud = layer_of(entry, "cloud", store)
         points, packed = read_cloud_layer(cloud, self._grid.corner(key), self._grid.tile, self.config.voxel)
         if len(points) != entry.points:
             raise MapError(f"tile {key[0]}, {key[1]}: its cloud is not the one that the manifest counts")
-        return points, packed
-
-    def _add(self, entry: TileEntry, points: Points, packed: Int8s) -> None:
-        key = entry.column, entry.row
         index = np.zeros((0, 4), dtype=np.int64)
         if len(points):
-            points, packed, index = sort_by_tile_packed(points, packed, self.config.tile)
+            points, packed, index = sort_by_tile(points, packed, self.config.tile)
         begin = self._files.append("points", points)
         self._files.append("normals", packed)
         index[:, 2:] += begin
@@ -249,12 +234,3 @@ def layer_of(entry: TileEntry, name: str, store: TileStore) -> Arrays:
     """Return the arrays of a tile's layer; MapError where it is missing or damaged."""
     layer = entry.layers[name]
     return decode(store.get(layer.sha256, layer.bytes), str(store.path(layer.sha256)))
-
-
-def _features(entries: Sequence[TileEntry], store: TileStore) -> Arrays:
-    """Return the learned features of the tiles."""
-    layers = [layer_of(entry, "features", store) for entry in entries]
-    try:
-        return {f"learned.{name}": np.concatenate([layer[name] for layer in layers]) for name in _LEARNED}
-    except (KeyError, ValueError) as error:
-        raise MapError(f"a tile's features are not what they should be ({error}); fetch or build it again") from error

@@ -19,7 +19,7 @@ from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, assemble, layer_of
 from coview_stream.basemap.site.layers import STEPS, cloud_layer, read_cloud_layer
-from coview_stream.basemap.site.manifest import TILE, VERSION, Manifest, SiteGrid, TileEntry, in_order, is_site
+from coview_stream.basemap.site.manifest import TILE, VERSION, Manifest, SiteGrid, in_order, is_site
 from coview_stream.basemap.site.site_build import check_directory
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import put_layer, write_tile
@@ -37,16 +37,9 @@ _LIGHT = "light"  # parameter of a manifest
 
 
 def split(arrays: Arrays, parameters: dict[str, Any], directory: Path, key: SigningKey | None = None) -> Manifest:
-    """Write a map as a site. Its points are rounded to 2 cm, its normals to 2 degrees.
+    """Write a map as a site into a directory that is new, empty or a site, signed if there is a key.
 
-    Args:
-        arrays: of the map.
-        parameters: of the map.
-        directory: new or empty, or a site.
-        key: signs the manifest.
-
-    Raises:
-        MapError: the directory cannot be used, or the map cannot be cut at the borders of tiles.
+    Its points are rounded to 2 cm, its normals to 2 degrees. MapError if the directory cannot be used.
     """
     check_directory(directory)
     grid = SiteGrid((0.0, 0.0, 0.0), TILE, config_of_map(parameters["config"]))
@@ -61,26 +54,17 @@ def split(arrays: Arrays, parameters: dict[str, Any], directory: Path, key: Sign
         standing = stations[(of_stations == tile).all(axis=1)]
         features = _features(arrays, tile) if learned else None
         entries.append(write_tile(store, grid, tile, (local, *_unpacked(packed[own])), standing, features))
-    origin = tuple(float(value) for value in arrays["origin"])
-    if len(origin) != 3:
-        raise MapError("the map's origin is not one")
+    x, y, z = (float(value) for value in arrays["origin"])
     site_parameters = {name: value for name, value in parameters.items() if name not in ("crs", "site")}
-    manifest = Manifest(origin, TILE, parameters["crs"], site_parameters, in_order(entries))
+    manifest = Manifest((x, y, z), TILE, parameters["crs"], site_parameters, in_order(entries))
     manifest = Manifest.from_bytes(manifest.to_bytes(), str(directory))
     return _finish(manifest, directory, key)
 
 
 def join(directory: Path, path: Path, key: SigningKey | None = None, progress: Progress | None = None) -> str:
-    """Write a site as a map in one file, and return its sha256.
+    """Write a site as a map in one file, signed if there is a key, and return its sha256.
 
-    Args:
-        directory: of the site.
-        path: the file.
-        key: signs it.
-        progress: called with steps done and all steps.
-
-    Raises:
-        MapError: no site, a layer is missing or damaged, or the file cannot be written.
+    MapError if a layer is missing or damaged, or the file cannot be written. ``progress`` counts steps.
     """
     check_target(path)
     with ArrayFiles(path.resolve().parent) as into:
@@ -90,23 +74,33 @@ def join(directory: Path, path: Path, key: SigningKey | None = None, progress: P
 
 
 def lighten(source: Path, target: Path, key: SigningKey | None = None, progress: Progress | None = None) -> Manifest:
-    """Write a light copy of a site, and return its manifest.
+    """Write a light copy of a site into a directory that is new, empty or one, and return its manifest.
 
-    Args:
-        source: directory of the site.
-        target: new or empty directory, or a light copy, which is replaced.
-        key: signs the manifest.
-        progress: called with tiles done and all tiles.
-
-    Raises:
-        MapError: no site, a layer is missing or damaged, or the target cannot be used.
+    MapError if a layer is missing or damaged, or the target cannot be used. ``progress`` counts tiles.
     """
     manifest = Manifest.load(source)
-    _check_light(source, target, manifest)
+    here, there = source.resolve(), target.resolve()
+    if here == there:
+        raise MapError(f"{target}: is the site itself; name another directory for the light copy")
+    if here in there.parents or there in here.parents:
+        raise MapError(f"{target}: one of {source} and {target} lies in the other; name a directory beside the site")
+    if _LIGHT in manifest.parameters:
+        raise MapError(f"{source}: is a light copy already; are the names the other way round?")
+    if is_site(target) and _LIGHT not in Manifest.load(target).parameters:
+        raise MapError(f"{target}: is a whole site, which a light copy would replace; name a new directory")
+    check_directory(target)
     grid = SiteGrid(manifest.origin, manifest.tile, config_of_map(manifest.parameters["config"]))
     store, light_store, entries = TileStore(source), TileStore(target), []
+    voxel, step = grid.config.voxel, 2.0 * grid.config.voxel / STEPS
     for done, entry in enumerate(manifest.tiles, start=1):
-        entries.append(_light_tile(entry, grid, store, light_store))
+        # about the tile's corner, which lies on the cubes
+        points, packed = read_cloud_layer(layer_of(entry, "cloud", store), np.zeros(3), grid.tile, voxel)
+        chosen = one_of_each_cube(points)
+        rounded = ((np.floor(points[chosen].astype(np.float64) / step) + 0.5) * step).astype(np.float32)
+        cloud = put_layer(light_store, "cloud", cloud_layer(rounded, *_unpacked(packed[chosen]), grid.tile, voxel))
+        stations = entry.layers["stations"]
+        light_store.put(store.get(stations.sha256, stations.bytes))
+        entries.append(replace(entry, points=len(chosen), layers={"cloud": cloud, "stations": stations}))
         if progress:
             progress(done, len(manifest.tiles))
     parameters = dict(manifest.parameters) | {"learned": None, _LIGHT: {"cube": CUBE, "of": manifest.sha256}}
@@ -136,33 +130,6 @@ def _features(arrays: Arrays, key: Key) -> Arrays:
     here = (np.floor(arrays["learned.place_at"] / TILE) == key).all(axis=1)
     local = {name: np.array(arrays[f"learned.{name}"][own]) for name in ("local", "sigma", "tiles")}
     return local | {name: np.array(arrays[f"learned.{name}"][here]) for name in ("place", "place_at")}
-
-
-def _check_light(source: Path, target: Path, manifest: Manifest) -> None:
-    """Refuse to replace another site, to write a copy within a site, and to copy a copy."""
-    here, there = source.resolve(), target.resolve()
-    if here == there:
-        raise MapError(f"{target}: is the site itself; name another directory for the light copy")
-    if here in there.parents or there in here.parents:
-        raise MapError(f"{target}: one of {source} and {target} lies in the other; name a directory beside the site")
-    if _LIGHT in manifest.parameters:
-        raise MapError(f"{source}: is a light copy already; are the names the other way round?")
-    if is_site(target) and _LIGHT not in Manifest.load(target).parameters:
-        raise MapError(f"{target}: is a whole site, which a light copy would replace; name a new directory")
-    check_directory(target)
-
-
-def _light_tile(entry: TileEntry, grid: SiteGrid, store: TileStore, light_store: TileStore) -> TileEntry:
-    voxel = grid.config.voxel
-    # about the tile's corner, which lies on the cubes
-    points, packed = read_cloud_layer(layer_of(entry, "cloud", store), np.zeros(3), grid.tile, voxel)
-    chosen = one_of_each_cube(points)
-    step = 2.0 * voxel / STEPS
-    rounded = ((np.floor(points[chosen].astype(np.float64) / step) + 0.5) * step).astype(np.float32)
-    cloud = put_layer(light_store, "cloud", cloud_layer(rounded, *_unpacked(packed[chosen]), grid.tile, voxel))
-    stations = entry.layers["stations"]
-    light_store.put(store.get(stations.sha256, stations.bytes))
-    return replace(entry, points=len(chosen), layers={"cloud": cloud, "stations": stations})
 
 
 def one_of_each_cube(points: Points, cube: float = CUBE) -> Ints:

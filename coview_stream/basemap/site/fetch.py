@@ -15,16 +15,7 @@ from urllib.parse import urlsplit
 
 from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.manifest import (
-    FILE,
-    MAX_MANIFEST,
-    Around,
-    LayerEntry,
-    Manifest,
-    TileEntry,
-    part_file,
-    tiles_around,
-)
+from coview_stream.basemap.site.manifest import FILE, MAX_MANIFEST, Around, Manifest, part_file, tiles_around
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
 from coview_stream.errors import CloudError, MapError, TransportError, require_library, warn
@@ -36,11 +27,7 @@ _TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
 
 
 class SiteSource(Protocol):
-    """Source of a site's bytes, which are untrusted.
-
-    Attributes:
-        name: for messages.
-    """
+    """Source of a site's bytes, which are untrusted; ``name`` is for messages."""
 
     name: str
 
@@ -58,7 +45,6 @@ class WebSource(SiteSource):
     """A site's directory on any web server: plain files below an address."""
 
     def __init__(self, address: str) -> None:
-        """Read below an address."""
         self.name = address.rstrip("/")
         self._known: tuple[str, bytes] | None = None
 
@@ -94,13 +80,13 @@ class ObjectStoreSource(SiteSource):
     """
 
     def __init__(self, address: str) -> None:
-        """Read below a prefix; DependencyError without obstore, TransportError if the address names no store."""
+        # DependencyError without obstore, TransportError if the address names no store
         store: Any = require_library("obstore.store", "obstore>=0.6", "maps in object stores")
         self.name = address.rstrip("/")
         try:
             self._store = store.from_url(self.name)
         except Exception as error:
-            raise TransportError(f"{self.name}: {_short(error)}; check the address and the credentials") from error
+            raise TransportError(f"{self.name}: {_reason(error)}; check the address and the credentials") from error
 
     def manifest(self) -> bytes:
         """Return the manifest's bytes."""
@@ -118,8 +104,12 @@ class ObjectStoreSource(SiteSource):
                 if len(raw) > limit:
                     break
         except Exception as error:  # obstore has many classes of errors
-            raise TransportError(f"{self.name}/{path}: {_short(error)}") from error
+            raise TransportError(f"{self.name}/{path}: {_reason(error)}") from error
         return bytes(raw[: limit + 1])
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 def is_site_address(name: object) -> bool:
@@ -137,10 +127,6 @@ def _body(answer: Any, limit: int, address: str) -> bytes:
     return bytes(raw)
 
 
-def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__
-
-
 class Mirror:
     """Cached copy of a site, whole or in part; maps are opened from it, with or without a network.
 
@@ -155,7 +141,7 @@ class Mirror:
     """
 
     def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
-        """Use a source, without asking it yet. MapError: the cache cannot be used."""
+        # the source is not asked yet
         self.source = source
         self.around = around
         self.offline = ""
@@ -193,14 +179,9 @@ class Mirror:
         return self.map_path
 
     def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:
-        """Ask the source, fetch missing layers, and return whether the site has changed.
+        """Ask the source, fetch missing layers, and return whether the site has changed; errors as of :meth:`open`.
 
-        Args:
-            progress: called with bytes fetched, and bytes to fetch.
-            check: compare existing layers with their hashes, not only with their lengths.
-
-        Raises:
-            TransportError: the source cannot be reached; fetched layers are kept. MapError: see :meth:`open`.
+        ``progress`` counts bytes. ``check`` compares existing layers with their hashes, not only with their lengths.
         """
         self.offline = ""
         with contextlib.suppress(OSError):
@@ -224,7 +205,20 @@ class Mirror:
         missing = [(layer, tile) for layer, tile in wanted.values() if not exists(layer.sha256, layer.bytes)]
         done, total = 0, sum(layer.bytes for layer, _ in missing)
         for layer, tile in missing:
-            self._store.put(self._fetched(layer, tile))
+            for left in reversed(range(_TRIES)):
+                try:
+                    content = self.source.layer(layer.sha256, layer.bytes)
+                    break
+                except TransportError:
+                    if not left:
+                        raise
+                    time.sleep(_WAIT * 2 ** (_TRIES - 2 - left))
+            if len(content) != layer.bytes or hashlib.sha256(content).hexdigest() != layer.sha256:
+                raise MapError(
+                    f"{self.source.name}: a layer of tile {tile.column}, {tile.row} ({layer.sha256[:12]}) is not what "
+                    "the manifest says: damaged or swapped; nothing of it is used. Build or copy the site again"
+                )
+            self._store.put(content)
             done += layer.bytes
             if progress:
                 progress(done, total)
@@ -237,19 +231,3 @@ class Mirror:
         elif changed:
             evict(cache_folder(), self.directory)
         return changed or bool(missing)
-
-    def _fetched(self, layer: LayerEntry, tile: TileEntry) -> bytes:
-        for left in reversed(range(_TRIES)):
-            try:
-                raw = self.source.layer(layer.sha256, layer.bytes)
-                break
-            except TransportError:
-                if not left:
-                    raise
-                time.sleep(_WAIT * 2 ** (_TRIES - 2 - left))
-        if len(raw) != layer.bytes or hashlib.sha256(raw).hexdigest() != layer.sha256:
-            raise MapError(
-                f"{self.source.name}: a layer of tile {tile.column}, {tile.row} ({layer.sha256[:12]}) is not what the "
-                "manifest says: damaged or swapped; nothing of it is used. Build or copy the site again"
-            )
-        return raw

@@ -34,16 +34,11 @@ _MAGIC = b"COVIEWL1"
 _TYPES = {"u1": "|u1", "i1": "|i1", "u2": "<u2", "i2": "<i2", "i4": "<i4", "f4": "<f4"}
 _MAX_HEADER = 1 << 16  # bytes
 _MAX_ARRAYS = 32
-MAX_BYTES = 1 << 29
-"""Largest layer in memory: ten times the densest tile."""
+_MAX_BYTES = 1 << 29  # of a layer in memory: ten times the densest tile
+# no contexts: neighbouring bytes of these small numbers predict little of each other
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 22}]
-"""No contexts: neighbouring bytes of these small numbers predict little of each other."""
-
 PACKING: Mapping[str, Packing] = {"cloud": "bz2", "stations": "bz2", "features": "lzma"}
-"""Compression of the arrays of each layer."""
-
-STEPS = 12
-"""Steps of a voxel's edge."""
+STEPS = 12  # of a voxel's edge
 _CELLS = 64  # of the octahedral map, along each edge
 _PLANARITY = 15  # steps
 _MAX_LEVEL = 30_000  # voxels above or below zero
@@ -64,7 +59,9 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
             part = bz2.compress(array.tobytes())
             entry["packing"] = packing
         else:
-            part = lzma.compress(_planes(array), format=lzma.FORMAT_RAW, filters=_FILTERS)
+            # byte planes: the higher bytes of small numbers are alike
+            planes = array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()
+            part = lzma.compress(planes, format=lzma.FORMAT_RAW, filters=_FILTERS)
         entries.append(entry | {"bytes": len(part)})
         parts.append(part)
     header = json.dumps(entries, separators=(",", ":")).encode()
@@ -72,77 +69,50 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
 
 
 def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of untrusted bytes of :func:`encode`.
-
-    Args:
-        raw: the bytes.
-        name: of the layer, for messages.
-
-    Raises:
-        MapError: they are no layer, cut off, or too large.
-    """
+    """Return the arrays of untrusted bytes of :func:`encode`; MapError, with the layer's ``name``, if they are none."""
     try:
-        return _decode(raw)
+        size = int.from_bytes(raw[8:12], "little")
+        if raw[:8] != _MAGIC or size > _MAX_HEADER or 12 + size > len(raw):
+            raise ValueError("its header is not one")
+        entries = json.loads(raw[12 : 12 + size])
+        if not isinstance(entries, list) or len(entries) > _MAX_ARRAYS:
+            raise ValueError("its header lists no arrays")
+        at, total, arrays = 12 + size, 0, {}
+        for entry in entries:
+            dtype, shape, length = np.dtype(_TYPES[entry["type"]]), entry["shape"], entry["bytes"]
+            if not all(type(n) is int and 0 <= n < 1 << 31 for n in [*shape, length]) or len(shape) > 4:
+                raise ValueError("a shape is impossible")
+            wanted = math.prod(shape) * dtype.itemsize
+            total += wanted
+            if total > _MAX_BYTES or at + length > len(raw):
+                raise ValueError("it is too large or cut off")
+            content = _unpacked(raw[at : at + length], entry.get("packing", "lzma"), wanted, dtype.itemsize)
+            arrays[str(entry["name"])] = content.view(dtype).reshape(shape)
+            at += length
+        if at != len(raw):
+            raise ValueError("something follows its end")
+        return arrays
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError, EOFError, lzma.LZMAError) as error:
         raise MapError(f"{name}: is no layer of a tile ({error}); fetch or build it again") from error
 
 
-def _decode(raw: bytes) -> dict[str, npt.NDArray[Any]]:
-    size = int.from_bytes(raw[8:12], "little")
-    if raw[:8] != _MAGIC or size > _MAX_HEADER or 12 + size > len(raw):
-        raise ValueError("its header is not one")
-    entries = json.loads(raw[12 : 12 + size])
-    if not isinstance(entries, list) or len(entries) > _MAX_ARRAYS:
-        raise ValueError("its header lists no arrays")
-    at, total, arrays = 12 + size, 0, {}
-    for entry in entries:
-        dtype, shape, length = np.dtype(_TYPES[entry["type"]]), entry["shape"], entry["bytes"]
-        if not all(type(n) is int and 0 <= n < 1 << 31 for n in [*shape, length]) or len(shape) > 4:
-            raise ValueError("a shape is impossible")
-        wanted = math.prod(shape) * dtype.itemsize
-        total += wanted
-        if total > MAX_BYTES or at + length > len(raw):
-            raise ValueError("it is too large or cut off")
-        if entry.get("packing", "lzma") not in ("bz2", "lzma"):
-            raise ValueError("an array is compressed in a way that is not known")
-        unpack = _from_bz2 if entry.get("packing") == "bz2" else _from_lzma
-        arrays[str(entry["name"])] = unpack(raw[at : at + length], wanted, dtype).reshape(shape)
-        at += length
-    if at != len(raw):
-        raise ValueError("something follows its end")
-    return arrays
-
-
-def _from_lzma(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
-    planes = _whole(decoder.decompress(part, max_length=wanted + 1), wanted).reshape(dtype.itemsize, -1)
-    return np.ascontiguousarray(planes.T).view(dtype)
-
-
-def _from_bz2(part: bytes, wanted: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    return _whole(bz2.BZ2Decompressor().decompress(part, max_length=wanted + 1), wanted).view(dtype)
-
-
-def _whole(content: bytes, wanted: int) -> npt.NDArray[np.uint8]:
+def _unpacked(part: bytes, packing: object, wanted: int, itemsize: int) -> npt.NDArray[np.uint8]:
+    if packing not in ("bz2", "lzma"):
+        raise ValueError("an array is compressed in a way that is not known")
+    decoder: bz2.BZ2Decompressor | lzma.LZMADecompressor = bz2.BZ2Decompressor()
+    if packing == "lzma":
+        decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
+    content = np.frombuffer(bytearray(decoder.decompress(part, max_length=wanted + 1)), dtype=np.uint8)
     if len(content) != wanted:
         raise ValueError(f"an array has {len(content)} bytes or more, not {wanted}")
-    return np.frombuffer(bytearray(content), dtype=np.uint8)
-
-
-def _planes(array: npt.NDArray[Any]) -> bytes:
-    """Return an array's bytes, the lowest byte of all numbers first: the others of small numbers are alike."""
-    return array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()
+    return content if packing == "bz2" else np.ascontiguousarray(content.reshape(itemsize, -1).T).reshape(-1)
 
 
 def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: float, voxel: float) -> Layer:
-    """Return the arrays of a tile's cloud.
+    """Return the arrays of a tile's cloud; ``tile`` and ``voxel`` are metres.
 
-    Args:
-        points: (N, 3) float32 metres about the tile's lower corner, in [0, tile) in x and y.
-        normals: (N, 3) unit normals, none of which points down.
-        planarity: (N,) in [0, 1].
-        tile: metres.
-        voxel: metres.
+    Points (N, 3) are float32 metres about the tile's lower corner, in [0, tile) in x and y; unit normals (N, 3) do not
+    point down; planarity (N,) is in [0, 1].
     """
     across = columns_of(tile, voxel)
     cell = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
@@ -152,11 +122,16 @@ def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: floa
     cell = cell[order]
     inside = points[order].astype(np.float64) / voxel - cell
     counts = np.bincount(cell[:, 1] * across + cell[:, 0], minlength=across * across)
+    # the upper half of the octahedron is a turned square
+    normals = normals[order]
+    length = np.abs(normals).sum(axis=1, dtype=np.float64)
+    x, y = (normals[:, :2] / np.maximum(length, 1e-9)[:, None]).T
+    square = np.clip((np.stack([x + y, x - y], axis=1) + 1.0) * 0.5, 0.0, 1.0)
     return {
         "counts": counts.astype(np.uint16).reshape(across, across),
         "levels": np.diff(cell[:, 2], prepend=0).astype(np.int32),
         "inside": np.ascontiguousarray(np.clip(np.floor(inside * STEPS), 0, STEPS - 1).astype(np.uint8).T),
-        "normals": _octahedral(normals[order]),
+        "normals": np.rint(square * (_CELLS - 1)).astype(np.uint8),
         "planarity": np.rint(planarity[order] * _PLANARITY).astype(np.uint8),
     }
 
@@ -164,14 +139,8 @@ def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: floa
 def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) -> tuple[Points, Int8s]:
     """Return a tile's points (N, 3) float32, and int8 normals (N, 3) as long as the planarity.
 
-    Args:
-        layer: untrusted arrays of :func:`cloud_layer`.
-        corner: (3,) lower corner of the tile in the map's frame, metres.
-        tile: metres.
-        voxel: metres.
-
-    Raises:
-        MapError: the arrays are inconsistent.
+    ``corner`` (3,) is the tile's lower corner in the map's frame, metres. MapError if the untrusted arrays are
+    inconsistent.
     """
     across = columns_of(tile, voxel)
     try:
@@ -191,8 +160,12 @@ def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) ->
     cell = np.stack([column % across, column // across, level])
     places = (cell + (inside.astype(np.float64) + 0.5) / STEPS) * voxel
     points = (places.T + np.asarray(corner, dtype=np.float64)).astype(np.float32)
+    a, b = normals.astype(np.float64).T / (_CELLS - 1) * 2.0 - 1.0
+    x, y = (a + b) * 0.5, (a - b) * 0.5
+    unit = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1), 1e-9)[:, None]
     length = np.maximum(planarity.astype(np.float32) * np.float32(127.0 / _PLANARITY), np.float32(8.0))
-    return points, np.rint(_directions(normals) * length[:, None]).astype(np.int8)
+    return points, np.rint(unit.astype(np.float32) * length[:, None]).astype(np.int8)
 
 
 def square_metres(points: Points) -> int:
@@ -209,23 +182,6 @@ def columns_of(tile: float, voxel: float) -> int:
     return across
 
 
-def _octahedral(normals: Points) -> npt.NDArray[np.uint8]:
-    """Return cells (N, 2) of normals that do not point down: on the octahedron's upper half, a turned square."""
-    length = np.abs(normals).sum(axis=1, dtype=np.float64)
-    x, y = (normals[:, :2] / np.maximum(length, 1e-9)[:, None]).T
-    square = np.stack([x + y, x - y], axis=1)
-    return np.rint(np.clip((square + 1.0) * 0.5, 0.0, 1.0) * (_CELLS - 1)).astype(np.uint8)
-
-
-def _directions(cells: npt.NDArray[np.uint8]) -> Floats32:
-    """Return the unit normals (N, 3) of cells (N, 2)."""
-    a, b = cells.astype(np.float64).T / (_CELLS - 1) * 2.0 - 1.0
-    x, y = (a + b) * 0.5, (a - b) * 0.5
-    normal = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
-    return normal.astype(np.float32)
-
-
 def stations_layer(stations: Floats32, block: float) -> Layer:
     """Return the arrays of stations (M, 3) at the centres of blocks, metres in the site's frame."""
     cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
@@ -236,11 +192,7 @@ def stations_layer(stations: Floats32, block: float) -> Layer:
 
 
 def read_stations_layer(layer: Layer, block: float) -> Floats32:
-    """Return the stations (M, 3), by rows and columns and from low to high.
-
-    Raises:
-        MapError: the arrays, which are untrusted, are invalid.
-    """
+    """Return the stations (M, 3), by rows and columns and from low to high; MapError if the arrays are invalid."""
     steps = layer.get("steps")
     if steps is None or steps.dtype.str != "<i4" or steps.ndim != 2 or len(steps) != 3:
         raise MapError("a tile's stations are not what they should be; fetch or build it again")

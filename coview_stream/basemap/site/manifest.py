@@ -26,38 +26,25 @@ from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.arrays import Floats, Ints, Reals
 
 FORMAT = "coview-site"
-VERSION = 2
-"""Version that is written; sites of version 1, with layers compressed otherwise, can be read."""
+VERSION = 2  # is written; sites of version 1, with layers compressed otherwise, can be read
 FILE = "manifest.json"
-LAYERS = ("cloud", "stations", "features")
-"""Layers of a tile: points with normals, stations, and learned features, which are optional."""
-
-MAX_MANIFEST = 1 << 28
-"""Largest manifest, bytes: 400,000 tiles."""
-
+LAYERS = ("cloud", "stations", "features")  # of a tile; features are optional
+MAX_MANIFEST = 1 << 28  # bytes: 400,000 tiles
 _MAX_LAYER = 1 << 28  # bytes
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
 _PURPOSE = b"site manifest\n"
 
-TILE = 320.0
-"""Edge of a tile, metres: a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)."""
-HALO = 64.0
-"""Metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin."""
-FEATURE_HALO = 112.0
-"""Metres around a tile whose points affect its learned features: 64 for the network, 48 for the ground below these."""
+TILE = 320.0  # metres, a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)
+HALO = 64.0  # metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin
+FEATURE_HALO = 112.0  # likewise its learned features: 64 for the network, 48 for the ground below these
 PART_SUFFIX = ".tiles"
 _FORMAT = "coview-part"
 
 
 @dataclass(frozen=True)
 class LayerEntry:
-    """One layer of a tile.
-
-    Attributes:
-        sha256: of its bytes.
-        bytes: their number.
-    """
+    """One layer of a tile: hash and number of its bytes."""
 
     sha256: str
     bytes: int
@@ -84,6 +71,20 @@ class TileEntry:
     low: float
     high: float
     layers: Mapping[str, LayerEntry]
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> TileEntry:
+        """Read untrusted plain data; ValueError, TypeError, KeyError or AttributeError if they are invalid."""
+        column, row = (_whole(data[name], _MAX_INDEX, signed=True) for name in ("column", "row"))
+        layers = {}
+        for name, layer in data["layers"].items():
+            if name not in LAYERS or not SHA256.fullmatch(layer["sha256"]):
+                raise ValueError(f"tile {column}, {row} has a layer {str(name)[:20]!r} that is none")
+            layers[name] = LayerEntry(layer["sha256"], _whole(layer["bytes"], _MAX_LAYER))
+        if not {"cloud", "stations"} <= set(layers):
+            raise ValueError(f"tile {column}, {row} lacks a layer")
+        points, stations, area = (_whole(data[name], 1 << 31) for name in ("points", "stations", "area"))
+        return cls(column, row, points, stations, area, _number(data["low"]), _number(data["high"]), layers)
 
     @property
     def nbytes(self) -> int:
@@ -130,7 +131,7 @@ class Manifest:
         return {layer.sha256 for tile in self.tiles for layer in tile.layers.values()}
 
     def _content(self) -> bytes:
-        plain = asdict(replace(self, signer="", signature=""))
+        plain = asdict(self)
         del plain["signer"], plain["signature"]
         return json.dumps({"format": FORMAT} | plain, sort_keys=True, allow_nan=False).encode()
 
@@ -173,7 +174,17 @@ class Manifest:
                 raise MapError(
                     f"{name}: is of version {str(data.get('version'))[:20]}, this program reads {VERSION} and 1"
                 )
-            return _manifest(data)
+            origin = tuple(_number(value) for value in data["origin"])
+            if len(origin) != 3:
+                raise ValueError("origin is no list of three numbers")
+            tile, crs, parameters = _number(data["tile"]), data["crs"], data["parameters"]
+            if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
+                raise ValueError("tile, crs or parameters are invalid")
+            tiles = tuple(TileEntry.of(entry) for entry in data["tiles"])
+            if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
+                raise ValueError("a tile is named twice")
+            signed = str(data.get("signer", "")), str(data.get("signature", ""))
+            return cls(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             reason = " ".join(str(error).split())[:120]
             raise MapError(f"{name}: cannot be read as a manifest ({reason}); fetch or build the site again") from error
@@ -211,33 +222,6 @@ def is_site(path: Path) -> bool:
 def in_order(tiles: Iterable[TileEntry]) -> tuple[TileEntry, ...]:
     """Return tiles by row and column."""
     return tuple(sorted(tiles, key=lambda tile: (tile.row, tile.column)))
-
-
-def _manifest(data: dict[str, Any]) -> Manifest:
-    origin = tuple(_number(value) for value in data["origin"])
-    if len(origin) != 3:
-        raise ValueError("origin is no list of three numbers")
-    tile, crs, parameters = _number(data["tile"]), data["crs"], data["parameters"]
-    if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
-        raise ValueError("tile, crs or parameters are invalid")
-    tiles = tuple(_tile(entry) for entry in data["tiles"])
-    if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
-        raise ValueError("a tile is named twice")
-    signed = str(data.get("signer", "")), str(data.get("signature", ""))
-    return Manifest(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
-
-
-def _tile(data: dict[str, Any]) -> TileEntry:
-    column, row = (_whole(data[name], _MAX_INDEX, signed=True) for name in ("column", "row"))
-    layers = {}
-    for name, layer in data["layers"].items():
-        if name not in LAYERS or not SHA256.fullmatch(layer["sha256"]):
-            raise ValueError(f"tile {column}, {row} has a layer {str(name)[:20]!r} that is none")
-        layers[name] = LayerEntry(layer["sha256"], _whole(layer["bytes"], _MAX_LAYER))
-    if not {"cloud", "stations"} <= set(layers):
-        raise ValueError(f"tile {column}, {row} lacks a layer")
-    points, stations, area = (_whole(data[name], 1 << 31) for name in ("points", "stations", "area"))
-    return TileEntry(column, row, points, stations, area, _number(data["low"]), _number(data["high"]), layers)
 
 
 def _whole(value: Any, limit: int, signed: bool = False) -> int:
@@ -307,15 +291,13 @@ class Around:
     y: float
     radius: float
 
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
-            raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
-
     @classmethod
     def parse(cls, text: str) -> Around:
         """Parse ``X,Y,RADIUS``; ConfigError if it is something else."""
         try:
             x, y, radius = map(float, text.split(","))
+            if not all(map(math.isfinite, (x, y, radius))) or radius < 0:
+                raise ValueError("no circle")
         except ValueError:
             raise ConfigError(f"around {text!r}: give X,Y,RADIUS in the map's coordinates, metres") from None
         return cls(x, y, radius)
@@ -326,11 +308,7 @@ class Around:
 
 
 def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
-    """Return the tiles that touch a circle.
-
-    Raises:
-        MapError: there are none; the message has the distance of the nearest one.
-    """
+    """Return the tiles that touch a circle; MapError, with the distance of the nearest one, if there are none."""
     x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
     distances = {}
     for entry in manifest.tiles:
@@ -347,12 +325,9 @@ def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
 
 
 def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
-    """Write a small file that is opened like a map, with the directory and some tiles of a site; return its path.
+    """Write a small file that is opened like a map: directory and tiles of a part of a site; return its path.
 
-    There is one file for each site and ``name``.
-
-    Raises:
-        MapError: the cache cannot be written.
+    There is one file for each site and ``name``. MapError if the cache cannot be written.
     """
     place = str(directory.resolve())
     record = hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + PART_SUFFIX

@@ -21,7 +21,6 @@ from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEn
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
 from coview_stream.basemap.sources import Given, Source, short_names, sources_of
-from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.cloud_head import CloudHead, check_together
 from coview_stream.config import MapConfig
 from coview_stream.errors import CoViewError, InputError, MapError, warn
@@ -81,7 +80,11 @@ def build_site(
         ConfigError: a setting that sites cannot have.
     """
     check_directory(directory)
-    sources = _named(sources_of(given, crs))
+    listed = sources_of(given, crs)
+    if any(source.rows is not None for source in listed):
+        raise InputError("a site is built of files; save the arrays as .npy first, or build one .coview file")
+    # by name in the manifest: the order of the arguments changes nothing
+    sources = dict(sorted(zip(short_names([source.path for source in listed]), listed, strict=True)))
     work = directory / WORK
     try:
         work.mkdir(parents=True, exist_ok=True)
@@ -95,13 +98,13 @@ def build_site(
 
     names = list(sources)
     jobs = [(sources[name], name, grid, work / "parts" / f"{k:06d}") for k, name in enumerate(names)]
-    parts = run("reading", _partition, jobs, names)
+    parts = run("reading", partition, jobs, names)
     if not parts:
         raise MapError(f"{directory}: no source could be read")
     warn(check_together([CloudHead(Path(part.name), part.crs) for part in parts]))
     keys = sorted({key for part in parts for key in part.tiles}, key=lambda key: (key[1], key[0]))
     thin_jobs = [ThinJob(grid, key, tuple(part for part in parts if key in part.tiles), work / "thin") for key in keys]
-    counts = run("thinning", thin, thin_jobs, [_tile_name(job.key) for job in thin_jobs])
+    counts = run("thinning", thin, thin_jobs, ["tile {}, {}".format(*job.key) for job in thin_jobs])
     if sum(counts) < _MIN_POINTS:
         raise MapError(
             f"{names[0]}: {sum(counts)} points are left; a base map needs {_MIN_POINTS}: are they in metres?"
@@ -111,7 +114,7 @@ def build_site(
         TileJob(grid, key, tuple(thinned[k] for k in grid.around(key) if k in thinned), directory, work / "records")
         for key in thinned
     ]
-    built = run("building tiles", build_tile, tile_jobs, [_tile_name(job.key) for job in tile_jobs])
+    built = run("building tiles", build_tile, tile_jobs, ["tile {}, {}".format(*job.key) for job in tile_jobs])
     manifest = _manifest(grid, parts, in_order(entry for entry, _ in built if entry is not None), directory)
     if key is not None:
         manifest = manifest.signed(key)
@@ -127,11 +130,7 @@ def build_site(
 
 
 def check_directory(directory: Path) -> None:
-    """Refuse to build into anything but a new or empty directory, or a site.
-
-    Raises:
-        MapError: the path is a file, or a directory with other content.
-    """
+    """Refuse to build into anything but a new or empty directory, or a site (MapError)."""
     if directory.exists() and not directory.is_dir():
         raise MapError(f"{directory}: is a file; a site is a directory, a map in one file is called NAME.coview")
     if not directory.is_dir() or is_site(directory) or (directory / WORK).is_dir():
@@ -140,16 +139,8 @@ def check_directory(directory: Path) -> None:
         raise MapError(f"{directory}: is no site, and not empty; name a new directory")
 
 
-def _named(sources: list[Source]) -> dict[str, Source]:
-    """Return the sources by their names in the manifest, sorted: the order of the arguments changes nothing."""
-    if any(source.rows is not None for source in sources):
-        raise InputError("a site is built of files; save the arrays as .npy first, or build one .coview file")
-    names = short_names([source.path for source in sources])
-    return dict(sorted(zip(names, sources, strict=True)))
-
-
 def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], Floats, Floats]:
-    """Return the readable sources and the corners of their extent, from their heads where these state it."""
+    """Return the readable sources, and the corners of their extent."""
     names = list(sources)
     heads = run("looking", Source.head, list(sources.values()), names)
     usable = {name: source for name, source in sources.items() if name not in run.left_out}
@@ -161,10 +152,6 @@ def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], F
     measured = run("measuring", extent_of, unknown, [str(source.path) for source in unknown])
     lows, highs = zip(*extents, *measured, strict=True)
     return usable, np.min(lows, axis=0), np.max(highs, axis=0)
-
-
-def _partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
-    return partition(*job)
 
 
 def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ...], directory: Path) -> Manifest:
@@ -184,10 +171,6 @@ def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ..
         parameters["learned"] = {"weights": weights_sha256(), "cell": LOCAL_CELL}
     crs = next((part.crs for part in parts if part.crs is not None), None)
     return Manifest.from_bytes(Manifest(grid.origin, grid.tile, crs, parameters, tiles).to_bytes(), str(directory))
-
-
-def _tile_name(key: Key) -> str:
-    return f"tile {key[0]}, {key[1]}"
 
 
 class _Run:

@@ -5,6 +5,7 @@ Each step is a pure function of complete files and of the settings; its result i
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -32,9 +33,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
-_CODE = 2
-"""Version of the tiles' content: tiles of other versions are built again."""
-
+_CODE = 2  # version of the tiles' content: tiles of other versions are built again
 _MAX_STRAYS = 1 << 15  # columns or rows from the origin: farther points are on no site
 _SLAB = 8_000_000  # points thinned at a time: 0.6 GB
 
@@ -65,43 +64,41 @@ class Parts:
 
     def read(self, key: Key) -> Floats32:
         """Return the points (N, 3) on a tile, mapped into memory."""
-        count = self.tiles.get(key, 0)
-        if not count:
-            return np.empty((0, 3), dtype=np.float32)
-        return np.memmap(self.file(key), dtype=np.float32, mode="r", shape=(count, 3))
+        return np.memmap(self.file(key), dtype=np.float32, mode="r", shape=(self.tiles[key], 3))
 
 
 def extent_of(source: Source) -> tuple[Floats, Floats]:
-    """Read a source and return the corners (3,) of its extent, metres.
+    """Read a source and return the corners (3,) of its extent, metres; CloudError if it has no points."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
-    Raises:
-        CloudError: it cannot be read, or has no points.
-    """
-    extent = _Extent()
-    stream_cloud(source.path, extent)
-    if extent.low is None or extent.high is None:
+    class Extent(CloudBuilder):
+        def add(self, raw: Reals, classification: npt.NDArray[np.uint8] | None = None, dropped: int = 0) -> None:
+            usable = _usable(raw)
+            np.minimum(low, usable.min(axis=0, initial=np.inf), out=low)
+            np.maximum(high, usable.max(axis=0, initial=-np.inf), out=high)
+
+    stream_cloud(source.path, Extent())
+    if not np.isfinite(low).all():
         raise CloudError(f"{source.path}: holds zero points; export the cloud again")
-    return extent.low, extent.high
+    return low, high
 
 
-def partition(source: Source, name: str, grid: SiteGrid, folder: Path) -> Parts:
-    """Write the points of a source by tiles.
-
-    Args:
-        source: a file.
-        name: of it in the manifest.
-        grid: the tiles.
-        folder: for the parts of this source; ``FOLDER.json`` is written when they are complete.
+def partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
+    """Write the points of a source, by its name in the manifest, into files by tile; ``FOLDER.json`` completes them.
 
     Raises:
         CloudError: the source cannot be read. OSError: the parts cannot be written.
     """
+    source, name, grid, folder = job
     done = folder.with_suffix(".json")
     stat = source.path.stat()
     state = [str(source.path.resolve()), stat.st_size, stat.st_mtime_ns, list(grid.origin), grid.tile, source.crs]
-    complete = _complete_parts(done, state, folder, name)
-    if complete is not None:
-        return complete
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # not there, or not complete
+        facts = json.loads(done.read_bytes())
+        tiles = {(column, row): count for column, row, count in facts["tiles"]}
+        parts = Parts(folder, name, facts["sha256"], facts["crs"], facts["points"], tiles)
+        if facts["state"] == state and all(parts.file(k).stat().st_size == 12 * n for k, n in tiles.items()):
+            return parts
     shutil.rmtree(folder, ignore_errors=True)
     done.unlink(missing_ok=True)
     folder.mkdir(parents=True)
@@ -117,35 +114,6 @@ def partition(source: Source, name: str, grid: SiteGrid, folder: Path) -> Parts:
     with atomic_file(done) as file:
         file.write(json.dumps(facts).encode())
     return parts
-
-
-def _complete_parts(done: Path, state: list[object], folder: Path, name: str) -> Parts | None:
-    try:
-        facts = json.loads(done.read_bytes())
-        if facts["state"] != state:
-            return None
-        tiles = {(column, row): count for column, row, count in facts["tiles"]}
-        parts = Parts(folder, name, facts["sha256"], facts["crs"], facts["points"], tiles)
-        whole = all(parts.file(key).stat().st_size == 12 * count for key, count in tiles.items())
-        return parts if whole else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-class _Extent(CloudBuilder):
-    """Builder that stores only the extent."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.low: Floats | None = None
-        self.high: Floats | None = None
-
-    def add(self, raw: Reals, classification: npt.NDArray[np.uint8] | None = None, dropped: int = 0) -> None:
-        usable = _usable(raw)
-        if len(usable):
-            low, high = usable.min(axis=0), usable.max(axis=0)
-            self.low = low if self.low is None else np.minimum(self.low, low)
-            self.high = high if self.high is None else np.maximum(self.high, high)
 
 
 class _Writer(CloudBuilder):
@@ -182,14 +150,7 @@ def _usable(raw: Reals) -> Floats:
 
 @dataclass(frozen=True)
 class ThinJob:
-    """Arguments of :func:`thin`.
-
-    Attributes:
-        grid: the tiles.
-        key: the tile.
-        parts: of the sources with points there, in the order of their names.
-        folder: for the thinned points.
-    """
+    """Arguments of :func:`thin`: a tile, the parts with points there, by name, and a folder for the thinned points."""
 
     grid: SiteGrid
     key: Key
@@ -210,14 +171,9 @@ class ThinJob:
 
 @dataclass(frozen=True)
 class TileJob:
-    """Arguments of :func:`build_tile`.
+    """Arguments of :func:`build_tile`: a tile, the site's directory, and a folder for entries of finished tiles.
 
-    Attributes:
-        grid: the tiles.
-        key: the tile.
-        thinned: of the tile and the tiles around it: key, file of the thinned points, and hash of their inputs.
-        site: directory of the site.
-        records: folder for the entries of tiles that are done.
+    ``thinned`` has of the tile and the tiles around it key, file of the thinned points, and hash of their inputs.
     """
 
     grid: SiteGrid
@@ -260,21 +216,15 @@ def thin(job: ThinJob) -> int:
 
 
 def build_tile(job: TileJob) -> tuple[TileEntry | None, bool]:
-    """Write a tile's layers into the site's store.
-
-    Returns:
-        The tile's entry, None if no points are left after cleaning; and whether it existed already.
-    """
+    """Write a tile's layers; return its entry, None if no points are left, and whether it existed already."""
     store, record = TileStore(job.site), job.record
-    try:
+    with contextlib.suppress(OSError, ValueError):  # not there, or not complete
         plain = json.loads(record.read_bytes())
         if plain is None:
             return None, True
         layers = {name: LayerEntry(**layer) for name, layer in plain.pop("layers").items()}
         if all(store.is_whole(layer.sha256, layer.bytes) for layer in layers.values()):
             return TileEntry(layers=layers, **plain), True
-    except (OSError, ValueError):
-        pass
     entry = _build(job, store)
     job.records.mkdir(parents=True, exist_ok=True)
     with atomic_file(record) as file:
@@ -284,7 +234,13 @@ def build_tile(job: TileJob) -> tuple[TileEntry | None, bool]:
 
 def _build(job: TileJob, store: TileStore) -> TileEntry | None:
     config, tile = job.grid.config, job.grid.tile
-    region = _region(job, FEATURE_HALO if config.learned else HALO)
+    halo = FEATURE_HALO if config.learned else HALO
+    around = []  # thinned points (N, 3) on the tile and around it, about its corner
+    for key, file, _ in job.thinned:
+        shift = np.array([key[0] - job.key[0], key[1] - job.key[1], 0.0]) * tile
+        moved = (np.load(file, mmap_mode="r", allow_pickle=False) + shift).astype(np.float32)
+        around.append(moved[_within(moved, tile, halo)])
+    region = np.concatenate(around)
     if config.outlier_neighbours:
         region, _ = remove_outliers(region, config.outlier_neighbours, config.outlier_std_ratio)
     near = region[_within(region, tile, HALO)]
@@ -316,13 +272,8 @@ def write_tile(
 ) -> TileEntry:
     """Write the layers of a tile, and return its entry.
 
-    Args:
-        store: of the site.
-        grid: the tiles.
-        key: the tile.
-        cloud: points (N, 3) about the tile's corner, unit normals (N, 3) and planarity (N,).
-        stations: (M, 3) relative to the site's origin.
-        features: learned features, None without.
+    ``cloud`` has points (N, 3) about the tile's corner, unit normals (N, 3) and planarity (N,); stations (M, 3) are
+    relative to the site's origin.
     """
     points = cloud[0]
     layers = {
@@ -339,17 +290,6 @@ def put_layer(store: TileStore, name: str, arrays: Mapping[str, npt.NDArray[np.g
     """Write a layer, and return its entry."""
     content = encode(arrays, PACKING[name])
     return LayerEntry(store.put(content), len(content))
-
-
-def _region(job: TileJob, halo: float) -> Points:
-    """Return the thinned points (N, 3) on a tile and around it, about its corner."""
-    region = []
-    for key, file, _ in job.thinned:
-        points = np.load(file, mmap_mode="r", allow_pickle=False)
-        shift = np.array([key[0] - job.key[0], key[1] - job.key[1], 0.0]) * job.grid.tile
-        moved = (points + shift).astype(np.float32)
-        region.append(moved[_within(moved, job.grid.tile, halo)])
-    return np.concatenate(region)
 
 
 def _within(points: Points, tile: float, margin: float) -> Bools:

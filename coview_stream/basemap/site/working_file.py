@@ -37,13 +37,7 @@ log = logging.getLogger("coview_stream.maps")
 def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, Loaded]:
     """Return the working file of a site, or of the part of one in a file, and its content; a damaged one is made again.
 
-    Args:
-        place: directory of the site, or the file of a part of it.
-        check: compare the content with its checksum, unless that has been done since it was written.
-        verify_key: must have signed the site.
-
-    Raises:
-        MapError: see :func:`working_file`.
+    ``check`` compares the content with its checksum, unless that has been done since it was written.
     """
     directory, keys = (place, None) if place.is_dir() else read_part(place)
     return open_made(lambda: working_file(directory, verify_key, keys=keys), check)
@@ -72,15 +66,9 @@ def working_file(
     progress: bool | None = None,
     keys: Collection[Key] | None = None,
 ) -> Path:
-    """Return the working file of a site, and write it if it does not exist.
+    """Return the working file of a site, or of some tiles, and write it if it does not exist, some seconds a tile.
 
-    That takes some seconds a tile; tiles that an earlier working file of the site has are copied.
-
-    Args:
-        directory: of the site.
-        verify_key: must have signed the site.
-        progress: show a bar on stderr; None shows it on a terminal.
-        keys: tiles of the file; None for all.
+    Tiles that the earlier working file has are copied. ``progress`` None shows a bar on a terminal.
 
     Raises:
         MapError: no site, a layer is missing or damaged, not signed with the key, or no room in the cache.

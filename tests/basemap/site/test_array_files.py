@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-
 import numpy as np
 import pytest
 
@@ -52,38 +49,15 @@ def test_rows_of_another_kind_and_names_that_are_taken_are_refused(tmp_path):
             files.zeros("a", (1,), np.int8)
 
 
-def test_full_disk_is_an_error_that_names_the_folder(tmp_path, monkeypatch):
-    def full(*args):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
-    with ArrayFiles(tmp_path) as files, pytest.raises(MapError, match=r"No space left.*COVIEW_CACHE"):
+def test_full_disk_is_an_error_that_names_the_folder(tmp_path, full_disk):
+    with full_disk(9), ArrayFiles(tmp_path) as files, pytest.raises(MapError, match=r"File too large.*COVIEW_CACHE"):
         files.zeros("a", (10,), np.int8)
 
 
-def test_rows_that_found_no_room_are_not_among_the_others(tmp_path, monkeypatch):
+def test_rows_that_found_no_room_are_not_among_the_others(tmp_path, full_disk):
     with ArrayFiles(tmp_path) as files:
         files.append("a", np.full((4, 2), 1, np.int32))
-        file = files._files["a"]
-        files._files["a"] = Full(file)
-        with pytest.raises(MapError, match="No space left"):
-            files.append("a", np.full((4, 2), 2, np.int32))
-        files._files["a"] = file
+        with full_disk(38), pytest.raises(MapError, match="File too large"):
+            files.append("a", np.full((4, 2), 2, np.int32))  # of which six bytes are written
         assert files.append("a", np.full((1, 2), 3, np.int32)) == 4
         np.testing.assert_array_equal(files.arrays()["a"], [[1, 1]] * 4 + [[3, 3]])
-
-
-class Full:
-    """A file that takes a few bytes more."""
-
-    def __init__(self, file):
-        self.file, self.left = file, 6
-
-    def seek(self, at):
-        self.file.seek(at)
-
-    def write(self, content):
-        if not self.left:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        written, self.left = self.file.write(content[: self.left]), 0
-        return written
