@@ -112,9 +112,9 @@ class EarlierMap:
         self, arrays: Arrays | None = None, spans: Mapping[Key, tuple[slice, slice]] | None = None, channels: Any = ()
     ) -> None:
         """Take arrays, spans (stations, rows of the field) of the unchanged tiles, and the descriptors' channels."""
-        self._arrays = arrays or {}
-        self._index = StationIndex.from_arrays(self._arrays, channels)
-        usable = self._index is not None and all(name in self._arrays for name in FIELD_ARRAYS)
+        self.arrays = arrays or {}
+        self._index = StationIndex.from_arrays(self.arrays, channels)
+        usable = self._index is not None and all(name in self.arrays for name in FIELD_ARRAYS)
         self._spans = dict(spans or {}) if usable else {}
 
     def stations(self, key: Key) -> slice | None:
@@ -123,11 +123,7 @@ class EarlierMap:
 
     def field(self, key: Key) -> Arrays | None:
         """Return the field of a tile; None for a tile that has changed."""
-        return {name: self._arrays[name][self._spans[key][1]] for name in FIELD_ARRAYS} if key in self._spans else None
-
-    def codes(self, name: str, part: slice) -> I16:
-        """Return some codes of a tier."""
-        return np.asarray(self._arrays[name][part])
+        return {name: self.arrays[name][self._spans[key][1]] for name in FIELD_ARRAYS} if key in self._spans else None
 
     def tiers(self, into: Sequence[I16]) -> list[StationCodes] | None:
         """Return codes with the earlier map's basis, to fill in.
@@ -146,8 +142,8 @@ class EarlierMap:
     def release(self) -> None:
         """Release the memory of mapped pages."""
         for name in (*CODES, *FIELD_ARRAYS):
-            if name in self._arrays:
-                release(self._arrays[name])
+            if name in self.arrays:
+                release(self.arrays[name])
 
 
 def map_arrays(
@@ -213,7 +209,7 @@ def _station_codes(
             for start in range(0, count, _COPIED):
                 end = min(start + _COPIED, count)
                 for name, codes in zip(CODES, made, strict=True):
-                    codes[begin + start : begin + end] = earlier.codes(name, before)[start:end]
+                    codes[begin + start : begin + end] = earlier.arrays[name][before][start:end]
                 into.release()
                 earlier.release()
         begin += count

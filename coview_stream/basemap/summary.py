@@ -297,7 +297,11 @@ class MapView:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> MapView:
         """Read untrusted data of :meth:`to_json`; MessageError names a field that is missing or invalid."""
-        count, ground = (_whole(data, name) for name in ("count", "ground"))
+        count: Any = data.get("count")
+        ground: Any = data.get("ground")
+        for name, value in (("count", count), ("ground", ground)):
+            if type(value) is not int or not 0 <= value <= _MAX_POINTS:
+                raise MessageError(f"map view: {name} is no number of points up to {_MAX_POINTS}")
         step: Any = data.get("step_m")
         crs, sha256 = data.get("crs"), data.get("map_sha256")
         origin = data.get("origin")
@@ -355,13 +359,6 @@ def _is_ground(base_map: SummarizedMap, points: Points) -> Bools:
         for along in (-1, 0, 1):
             off = np.fmin(off, np.abs(points[:, 2] - heights[column + across, row + along]))
     return np.asarray(off <= _GROUND_BAND)
-
-
-def _whole(data: dict[str, Any], name: str) -> int:
-    value = data.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_POINTS:
-        raise MessageError(f"map view: {name} is no number of points up to {_MAX_POINTS}")
-    return value
 
 
 def _finite(value: object, limit: float) -> bool:

@@ -82,8 +82,6 @@ def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0
     Outliers are points (float32, finite) whose mean distance to the nearest ``neighbours`` exceeds the cloud's mean by
     ``std_ratio`` standard deviations. 1.6 s per million points on two cores: run it after ``voxel_grid`` on large maps.
     """
-    if neighbours < 1 or not std_ratio > 0:
-        raise ConfigError(f"neighbours={neighbours}, std_ratio={std_ratio}: both must be positive")
     mask = np.ones(len(points), dtype=bool)
     if len(points) <= neighbours:
         return points, mask
@@ -99,10 +97,8 @@ def voxel_grid(points: Points, voxel: float) -> Points:
     NumPy is several times faster here than Open3D's filter on 10 M points, and its order does not depend on threads.
 
     Points (N, 3) are float32 metres, finite; borders of voxels are multiples of the edge ``voxel``, metres. ConfigError
-    if it is not positive, or so small for this extent that keys would overflow.
+    if it is so small for this extent that keys would overflow.
     """
-    if not voxel > 0:
-        raise ConfigError(f"voxel={voxel}: must be positive")
     if not len(points):
         return points.reshape(0, 3)
     low = np.floor(points.min(axis=0).astype(np.float64) / voxel)
@@ -133,8 +129,6 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
 
     Points (N, 3) are float32 metres, finite; neighbours are the ``k`` nearest, within ``radius`` metres if it is given.
     """
-    if k < 3 or (radius is not None and not radius > 0):
-        raise ConfigError(f"k={k}, radius={radius}: k must be at least 3 and the radius positive")
     if not len(points):
         return points.reshape(0, 3), np.empty(0, dtype=np.float32)
     geometry = open3d().geometry

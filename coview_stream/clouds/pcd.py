@@ -49,9 +49,15 @@ def read_pcd(path: Path) -> Cloud:
     """
     content = path.read_bytes()
     header = _parse_header(content, path)
-    read = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
     builder = CloudBuilder()
-    builder.add(read(content, header, path))
+    if header.encoding == "binary":
+        stored = (len(content) - header.data_start) // header.row.itemsize
+        if stored < header.points:
+            raise _truncated(path, header, stored)
+        rows = np.frombuffer(content, header.row, header.points, header.data_start)
+        builder.add(_stack([rows[f"f{field}"][:, 0] for field in header.axes]))
+    else:
+        builder.add((_ascii if header.encoding == "ascii" else _compressed)(content, header, path))
     return builder.finish(os.fspath(path))
 
 
@@ -134,15 +140,6 @@ def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
     if len(rows) < header.points:
         raise _truncated(path, header, len(rows))
     return rows
-
-
-def _binary(content: bytes, header: _Header, path: Path) -> Reals:
-    row = header.row
-    stored = (len(content) - header.data_start) // row.itemsize
-    if stored < header.points:
-        raise _truncated(path, header, stored)
-    rows = np.frombuffer(content, row, header.points, header.data_start)
-    return _stack([rows[f"f{field}"][:, 0] for field in header.axes])
 
 
 def _compressed(content: bytes, header: _Header, path: Path) -> Reals:

@@ -46,12 +46,10 @@ def test_voxel_centroids_match_numpy_grouping(seed: int, voxel: float, count: in
     np.testing.assert_allclose(voxel_grid(points, voxel), expected, atol=1e-5)
 
 
-def test_voxel_grid_of_no_points_and_invalid_voxel_sizes() -> None:
+def test_voxel_grid_of_no_points_and_of_too_many_cells() -> None:
     assert voxel_grid(np.zeros((0, 3), np.float32), 0.5).shape == (0, 3)
     with pytest.raises(ConfigError, match="too small"):
         voxel_grid(np.array([[0, 0, 0], [1e7, 1e7, 1e7]], np.float32), 1e-3)
-    with pytest.raises(ConfigError, match="positive"):
-        voxel_grid(np.zeros((1, 3), np.float32), 0.0)
 
 
 def test_normals_of_a_tilted_plane_point_up() -> None:
@@ -80,18 +78,6 @@ def test_isolated_points_have_a_vertical_normal() -> None:
     np.testing.assert_array_equal(planarity, [0, 0])
     normals, planarity = estimate_normals(np.zeros((0, 3), np.float32))
     assert (normals.shape, planarity.shape) == ((0, 3), (0,))
-
-
-def test_filters_refuse_bad_parameters() -> None:
-    points = np.zeros((5, 3), np.float32)
-    with pytest.raises(ConfigError):
-        remove_outliers(points, neighbours=0)
-    with pytest.raises(ConfigError):
-        remove_outliers(points, std_ratio=float("nan"))
-    with pytest.raises(ConfigError):
-        estimate_normals(points, k=2)
-    with pytest.raises(ConfigError):
-        estimate_normals(points, radius=0.0)
 
 
 @pytest.fixture
