@@ -127,7 +127,9 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     after = parts(lambda movable: movable.now(rng[_SPARE], changed)) if changed else before
     mapped = before.state(site)
     now = after.state(site) if changed else mapped
-    return Scene(kind, size, mapped, now, site, layout.route, tuple(footprints), (before, after), tuple(houses))
+    return Scene(
+        kind, size, mapped, now, site, layout.route, tuple(footprints), parts=(before, after), houses=tuple(houses)
+    )
 
 
 def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[int], list[Mesh]]:
