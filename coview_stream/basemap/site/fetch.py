@@ -39,6 +39,7 @@ class SiteSource(Protocol):
 
     def close(self) -> None:
         """Close connections, if any are open."""
+        return
 
 
 class WebSource(SiteSource):
