@@ -191,16 +191,15 @@ def is_pose(T: Reals) -> bool:
 
 def why_no_pose(T: Reals) -> str:
     """Return the fault of a matrix that is no pose (:func:`is_pose`), and the remedy, as a clause."""
-    R = T[:3, :3]
     if T.shape != (4, 4):
         flaw = f"it has shape {T.shape}; give a 4x4 matrix"
     elif not np.isfinite(T).all():
         flaw = "it holds NaN or infinite numbers; leave such frames out"
     elif is_pose(T.T):
         flaw = "it is transposed, with its translation in the last row; give its transpose, whose T[:3, 3] it is"
-    elif np.abs(R @ R.T - np.eye(3)).max() >= 1e-3:
+    elif np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() >= 1e-3:
         flaw = "its rotation is not orthonormal; check the order of the quaternion (x, y, z, w)"
-    elif np.linalg.det(R) < 0:
+    elif np.linalg.det(T[:3, :3]) < 0:
         flaw = "it mirrors (determinant -1); axes have to be right-handed"
     else:
         flaw = f"its last row is {T[3].tolist()}; give 0 0 0 1"
