@@ -12,6 +12,7 @@ from __future__ import annotations
 import pickle
 import time
 from argparse import ArgumentParser
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
 
-RECORDED = 15  # keyframes of a recording: thirty metres
+RECORDED = 5  # keyframes of a search
 ERRORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 
 
@@ -33,7 +34,7 @@ def record(out: Path, site: Site) -> None:
     """Record the runs on one map that are not there: their map, and the search requests of each."""
     base: BaseMap | None = None
     for run in site:
-        file = out / "rec" / f"{run.family.replace(' ', '-').replace(',', '')}-{run.kind}-{run.seed}-{run.number}.pkl"
+        file = out / "rec" / f"{run.kind}-{run.seed}-{run.number}.pkl"
         if file.is_file():
             continue
         begin, drive = time.perf_counter(), drive_of(run)
@@ -48,18 +49,16 @@ def record(out: Path, site: Site) -> None:
         print(f"{file} {time.perf_counter() - begin:.1f} s", flush=True)
 
 
-def smallest_errors(site: Path, drives: list[dict[str, Any]], count: int) -> list[float]:
-    """Return the smallest stated error of each drive through another site than the map's."""
+def smallest_errors(site: Path, drives: list[dict[str, Any]]) -> Iterator[float]:
+    """Yield the smallest stated error of each drive through another site than the map's."""
     base, config = BaseMap.load(site), LocalizerConfig()
     search = GlobalSearch(base, config, LocalMaps(base, config.registration.source_range))
     search.prepare()
-    out = []
     for drive in drives:
         if drive["site"] != site.stem:
             search.reset()
-            evidence = [search.update(request).evidence for request in drive["requests"][:count]]
-            out.append(min(1.0 - (each.confidence or 0.0) for each in evidence))
-    return out
+            evidence = [search.update(request).evidence for request in drive["requests"]]
+            yield min(1.0 - (keyframe.confidence or 0.0) for keyframe in evidence)
 
 
 def main() -> None:
@@ -67,17 +66,15 @@ def main() -> None:
     parser = ArgumentParser(prog="python -m bench.integrity.calibrate", description=__doc__)
     parser.add_argument("place", type=Path, metavar="DIR")
     parser.add_argument("--runs", type=int, default=60, help="of the calibration plan (60)")
-    parser.add_argument("--keyframes", type=int, default=5, help="of each search (5)")
     asked = parser.parse_args()
     for name in ("rec", "worlds"):
         (asked.place / name).mkdir(parents=True, exist_ok=True)
     for site in plan("calibration", asked.runs):
         record(asked.place, site)
     drives = [pickle.loads(file.read_bytes()) for file in sorted((asked.place / "rec").glob("*.pkl"))]
-    stated: list[float] = []
-    for file in sorted((asked.place / "worlds").glob("*.coview")):
-        stated += smallest_errors(file, drives, asked.keyframes)
-    print(f"{len(stated)} searches of {asked.keyframes} keyframes where every place is wrong\n")
+    sites = sorted((asked.place / "worlds").glob("*.coview"))
+    stated = [error for file in sites for error in smallest_errors(file, drives)]
+    print(f"{len(stated)} searches of {RECORDED} keyframes where every place is wrong\n")
     lines = []
     for error in ERRORS:
         count = int((np.array(stated) < error).sum())

@@ -13,7 +13,6 @@ import os
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -25,11 +24,8 @@ from bench.integrity.plan import FAMILIES, STATED, Site, plan
 from bench.integrity.run import Result, everywhere
 from coview_stream.errors import InputError
 
-OUTCOMES = ("right", "false", "none")
-"""Outcomes of a run that counts; a failed run, or one without a street, does not."""
-
-FIX = 1e-4
-"""Stated error below which a first fix counts in the table of reliability; of larger ones see :data:`STATED`."""
+OUTCOMES = ("right", "false", "none")  # of a run that counts; a failed run, or one without a street, does not
+FIX = 1e-4  # stated error below which a first fix counts in the table of reliability
 
 
 @dataclass(frozen=True)
@@ -43,25 +39,22 @@ class Tally:
     false: int
     ambiguous: int  # runs without a fix whose last state is AMBIGUOUS
     searching: int  # runs without a fix in any other state
-    median_m: float  # metres to a right first fix
-    most_m: float  # its 90th percentile
+    metres: tuple[float, ...]  # to each right first fix
 
     @classmethod
     def of(cls, results: Iterable[Result]) -> Tally:
         """Count results."""
-        counted = [run for run in results if run["outcome"] in OUTCOMES]
-        outcome = Counter(run["outcome"] for run in counted)
-        ambiguous = sum(run["outcome"] == "none" and run["state"] == "AMBIGUOUS" for run in counted)
-        metres = [run["metres"] for run in counted if run["outcome"] == "right"]
-        median, most = (float(np.quantile(metres, q)) if metres else np.nan for q in (0.5, 0.9))
-        sites, sites_false = (
-            {(run["kind"], run["seed"]) for run in counted if run["outcome"] in outcomes}
-            for outcomes in (OUTCOMES, ("false",))
-        )
-        return cls(
-            len(counted), len(sites), len(sites_false), outcome["right"], outcome["false"], ambiguous,
-            outcome["none"] - ambiguous, median, most,
-        )  # fmt: skip
+        runs = [run for run in results if run["outcome"] in OUTCOMES]
+        by_outcome = {name: [run for run in runs if run["outcome"] == name] for name in OUTCOMES}
+        sites, sites_false = (len({(run["kind"], run["seed"]) for run in some}) for some in (runs, by_outcome["false"]))
+        ambiguous = sum(run["state"] == "AMBIGUOUS" for run in by_outcome["none"])
+        right, false, none = (len(some) for some in by_outcome.values())
+        metres = tuple(run["metres"] for run in by_outcome["right"])
+        return cls(len(runs), sites, sites_false, right, false, ambiguous, none - ambiguous, metres)
+
+    def within(self, share: float) -> float:
+        """Return the metres after which a share of the right first fixes was there; NaN without one."""
+        return float(np.quantile(self.metres, share)) if self.metres else np.nan
 
     @property
     def bound(self) -> float:
@@ -104,7 +97,7 @@ def class_table(results: Sequence[Result]) -> str:
     lines = [
         [
             name, *map(str, (t.runs, t.sites, t.right, t.false, t.ambiguous + t.searching)), percent(t.bound),
-            percent(t.site_bound), percent(t.found, 1), number(t.median_m, 1), number(t.most_m, 1),
+            percent(t.site_bound), percent(t.found, 1), number(t.within(0.5), 1), number(t.within(0.9), 1),
         ]
         for name, t in classes(results).items()
     ]  # fmt: skip
@@ -138,14 +131,9 @@ def reliability_table(results: Sequence[Result]) -> str:
     return table(("stated error", "first times", "mean stated", "wrong"), lines)
 
 
-RUNS, QUICK = 1080, 60
-"""Runs planned, and with ``--quick``."""
-
-MOST = {"all": 0.003, "near copies": 0.0075, "outside": 0.01}
-"""Shares of false first fixes that the bounds have to be below."""
-
-LEAST_FOUND, MEDIAN_METRES = 0.97, 10.0
-"""Of ordinary runs."""
+RUNS, QUICK = 1080, 60  # runs planned, and with ``--quick``
+MOST = {"all": 0.003, "near copies": 0.0075, "outside": 0.01}  # shares of false fixes that bounds have to be below
+LEAST_FOUND, MEDIAN_METRES = 0.97, 10.0  # of ordinary runs
 
 
 def options(parser: ArgumentParser) -> None:
@@ -192,9 +180,10 @@ def verdicts(results: Sequence[Result]) -> Iterator[Row]:
         text = f"{ordinary.right} of {ordinary.runs}: {percent(ordinary.found, 1)}"
         holds = ordinary.found >= LEAST_FOUND
         yield judged("integrity/found, ordinary", text, f">= {percent(LEAST_FOUND, 0)}", holds, ordinary.found)
-        text = f"{ordinary.median_m:.1f} m, 90 % within {ordinary.most_m:.1f} m"
-        holds = ordinary.median_m <= MEDIAN_METRES
-        yield judged("integrity/median first fix, ordinary", text, f"<= {MEDIAN_METRES:g} m", holds, ordinary.median_m)
+        median = ordinary.within(0.5)
+        text = f"{median:.1f} m, 90 % within {ordinary.within(0.9):.1f} m"
+        holds = median <= MEDIAN_METRES
+        yield judged("integrity/median first fix, ordinary", text, f"<= {MEDIAN_METRES:g} m", holds, median)
     if failed := [result["key"] for result in results if result["outcome"] == "failed"]:
         yield judged("integrity/runs that failed", f"{len(failed)}: {failed[0]}", "0", False, len(failed))
 

@@ -1,7 +1,4 @@
-"""Sites that look alike in many places: equal things in rows, an avenue, a court, a storey between others.
-
-All sizes are set by hand.
-"""
+"""Sites that look alike in many places: equal things in rows, an avenue, a court. All sizes are set by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +9,6 @@ import numpy as np
 from bench.integrity.sites import (
     MARGIN,
     Contents,
-    footprint,
     furnished,
     layout_of,
     loop,
@@ -30,7 +26,7 @@ from coview_stream.sim.scenes import Scene
 from coview_stream.sim.vegetation import TreeMix
 
 _GARDEN = TreeMix((3.0, 9.0))
-_DRAWN, _NOW, _OTHER, _ROUND = range(4)  # random streams
+_DRAWN, _NOW, _OTHER = range(3)  # random streams
 _BOX = (12.2, 2.44, 2.6)  # metres, a container of forty feet
 
 
@@ -91,19 +87,17 @@ def terraces(seed: int, size: float, changed: float) -> Scene:
     mesh = buildings.house(rng, width, depth)
     spots = _row_spots(site, yaw, (width, depth), width, spacing, 1.5)
     houses = [stand(mesh, site, *spot) for spot in spots]
-    plots = [footprint(mesh, site, spot.xy, (width, depth), spot.yaw) for spot in spots]
     things = movables(rng, site, 0.002, _GARDEN, 0.4, 28.0)
     before = furnished(things, site, None, 0.0)
     after = furnished(things, site, _rng("terraces", seed, _NOW), changed)
     mapped, now = (Contents([*houses, *each.solid], each.foliage) for each in (before, after))
-    return scene_of("terraces", size, site, mapped, now, plots)
+    return scene_of("terraces", size, site, mapped, now)
 
 
 def rows(seed: int, size: float, changed: float) -> Scene:
-    """Draw equal houses with gardens in parallel streets, of which one beside the drive is another house now.
+    """Draw equal houses with gardens in parallel streets; one beside the drive is another house now.
 
-    For even seeds the survey knows that house elsewhere, between the same neighbours. ``changed`` of the cars, trees
-    and poles are others now.
+    ``changed`` of the cars, trees and poles are others now.
     """
     rng = _rng("rows", seed, _DRAWN)
     spacing, width, depth = rng.uniform(40.0, 48.0), rng.uniform(9.0, 12.0), rng.uniform(8.0, 10.0)
@@ -111,31 +105,23 @@ def rows(seed: int, size: float, changed: float) -> Scene:
     usual, other = buildings.house(rng, width, depth), buildings.house(rng, width, depth)
     spots = _row_spots(site, yaw, (width, depth), width + rng.uniform(4.0, 7.0), spacing, 3.0)
     far = np.array([np.linalg.norm(site.layout.route - spot.xy, axis=1).min() for spot in spots])
-    here, there = int(rng.choice(np.flatnonzero(far < 20.0))), int(rng.choice(np.flatnonzero(far > 30.0)))
-    known = there if seed % 2 == 0 else None
-
-    def houses(odd: int | None) -> list[Mesh]:
-        return [stand(other if k == odd else usual, site, *spot) for k, spot in enumerate(spots)]
-
+    odd = int(rng.choice(np.flatnonzero(far < 20.0)))
+    houses = [stand(usual, site, *spot) for spot in spots]
+    houses_now = [*houses[:odd], stand(other, site, *spots[odd]), *houses[odd + 1 :]]
     things = movables(rng, site, 0.003, _GARDEN, 0.3, 32.0)
     before = furnished(things, site, None, 0.0)
     after = furnished(things, site, _rng("rows", seed, _NOW), changed)
-    mapped = Contents([*houses(known), *before.solid], before.foliage)
-    now = Contents([*houses(here), *after.solid], after.foliage)
-    plots = [footprint(usual, site, spot.xy, (width, depth), spot.yaw) for spot in spots]
-    return scene_of("rows", size, site, mapped, now, plots)
+    mapped = Contents([*houses, *before.solid], before.foliage)
+    now = Contents([*houses_now, *after.solid], after.foliage)
+    return scene_of("rows", size, site, mapped, now)
 
 
 def plantation(seed: int, size: float, changed: float) -> Scene:
-    """Draw equal objects on a grid beside a few tracks: trees or, for odd seeds, silos; some are missing.
-
-    With ``changed`` they stand on a grid of another offset now, and others are missing.
-    """
+    """Draw equal silos on a grid beside a few tracks, some missing; ``changed``: the grid has another offset now."""
     rng = _rng("plantation", seed, _DRAWN)
     site, yaw = _streets(rng, size, rng.uniform(58.0, 70.0), rng.uniform(58.0, 70.0), 2.4, rng.uniform(0.2, 1.2))
-    pitch = rng.uniform((4.0, 5.0), (7.0, 8.0)) if seed % 2 == 0 else rng.uniform((7.0, 7.0), (10.0, 10.0))
-    height, radius, missing = rng.uniform(4.0, 7.0), rng.uniform(0.18, 0.28), rng.uniform(0.05, 0.3)
-    silo = cylinder(1.6, height, 12, top=1.2)
+    pitch = rng.uniform((7.0, 7.0), (10.0, 10.0))
+    silo, missing = cylinder(1.6, rng.uniform(4.0, 7.0), 12, top=1.2), rng.uniform(0.05, 0.3)
 
     def stock(draw: np.random.Generator) -> Contents:
         count = int(1.5 * site.half / pitch.min())
@@ -143,15 +129,11 @@ def plantation(seed: int, size: float, changed: float) -> Scene:
         xy = turned(grid + draw.uniform(0, 1, 2) * pitch, yaw)
         xy = xy[(np.abs(xy) < site.half - 2).all(axis=1)]
         xy = xy[(site.road_distance(*xy.T) > site.layout.half_width + 1.8) & (draw.random(len(xy)) > missing)]
-        if seed % 2:
-            return Contents([stand(silo, site, each, 0.0) for each in xy])
-        tree = np.array([height, radius * height, 0.0, 0.0, 0.0, 7.0])
-        trees, ground = np.column_stack([xy, np.tile(tree, (len(xy), 1))]), site.z(*xy.T)
-        return Contents([vegetation.trunks(trees, ground)], [vegetation.crowns(trees, ground)])
+        return Contents([stand(silo, site, each, 0.0) for each in xy])
 
     mapped = stock(_rng("plantation", seed, _NOW))
     now = stock(_rng("plantation", seed, _OTHER)) if changed else mapped
-    return scene_of("plantation", size, site, mapped, now, ())
+    return scene_of("plantation", size, site, mapped, now)
 
 
 def yard(seed: int, size: float, changed: float) -> Scene:
@@ -176,13 +158,13 @@ def yard(seed: int, size: float, changed: float) -> Scene:
 
     mapped = Contents([*masts, *cargo(_rng("yard", seed, _NOW))])
     now = Contents([*masts, *cargo(_rng("yard", seed, _OTHER))]) if changed else mapped
-    return scene_of("yard", size, site, mapped, now, ())
+    return scene_of("yard", size, site, mapped, now)
 
 
 def boxes(seed: int, size: float, changed: float) -> Scene:
     """Draw 24 x 40 equal boxes, 16 and 7 metres apart, and one mast 250 m away; nothing changes (``changed``).
 
-    Its streets are the lanes along the boxes, then those across; the route is one of either for every other seed.
+    The streets are the lanes along the boxes, then those across; the drive is in one of the first.
     """
     del changed
     rng = _rng("boxes", seed, _DRAWN)
@@ -191,18 +173,13 @@ def boxes(seed: int, size: float, changed: float) -> Scene:
     ends = (xs[-1] + 8.0, ys[-1] + 3.5)
     along = [np.array([[-ends[0], y], [ends[0], y]]) for y in ys[:-1] + 3.5]
     across = [np.array([[x, -ends[1]], [x, ends[1]]]) for x in xs[:-1] + 8.0]
-    lanes = along if seed % 2 else across
-    route = there_and_back(lanes[int(rng.integers(len(lanes)))], 0.6)
+    route = there_and_back(along[int(rng.integers(len(along)))], 0.6)
     site = Site(rng, layout_of(route, [*along, *across], half, 1.0, yaw), half, relief=0.1, roughness=0.01, ditch=0.0)
     grid = turned(np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2), yaw)
     angle = rng.uniform(0, 2 * np.pi)
     mast = stand(box(0.5, 0.5, 25.0), site, 250.0 * np.array([np.cos(angle), np.sin(angle)]), 0.0)
     stacked = Contents([mast, *(stand(box(*_BOX), site, xy, yaw) for xy in grid)])
-    return scene_of("boxes", size, site, stacked, stacked, ())
-
-
-_SHELL = (54.0, 36.0)  # metres, of a storey
-_CEILING = 3.0  # metres above its floor
+    return scene_of("boxes", size, site, stacked, stacked)
 
 
 def _flat(layout: Layout, half: float) -> Site:
@@ -235,7 +212,7 @@ def avenue(seed: int, size: float, changed: float) -> Scene:
             solid.append(vegetation.trunks(trees, ground))
             foliage.append(vegetation.crowns(trees, ground))
     same = Contents(solid, foliage)
-    return scene_of("avenue", size, site, same, same, ())
+    return scene_of("avenue", size, site, same, same)
 
 
 def court(seed: int, size: float, changed: float) -> Scene:
@@ -270,86 +247,4 @@ def court(seed: int, size: float, changed: float) -> Scene:
     trees = np.array([vegetation.draw_tree(rng, xy[0], xy[1], TreeMix((4.0, 10.0))) for xy in free])
     solid.append(vegetation.trunks(trees, np.zeros(len(trees))))
     same = Contents(solid, [*foliage, vegetation.crowns(trees, np.zeros(len(trees)))])
-    return scene_of("court", size, site, same, same, ())
-
-
-def storey(seed: int, size: float, changed: float) -> Scene:
-    """Draw two storeys of one building: the same shell, columns and stairs, other partitions.
-
-    The map is of the lower. With ``changed`` the robot is on the upper one; heights are above each one's own floor.
-    """
-    rng = _rng("storey", seed, _DRAWN)
-    half, yaw = size / 2 + MARGIN, rng.uniform(0, np.pi / 2)
-    w, d = _SHELL[0] * rng.uniform(0.8, 1.2), _SHELL[1] * rng.uniform(0.8, 1.2)
-    shell = [_wall((x0, y0), (x1, y1)) for (x0, y0), (x1, y1) in _sides(w, d)]
-    shell.append(placed(box(w, d, 0.2), 0.0, 0.0, _CEILING))
-    shell += [placed(box(0.5, 0.5, _CEILING), x, y) for x in _axis(w, 7.5) for y in _axis(d, 7.5)]
-    shell += [placed(box(3.0, 6.0, _CEILING), s * (w / 2 - 1.6), rng.uniform(-0.25, 0.25) * d) for s in (1.0, -1.0)]
-    floors = []
-    for stream in (_OTHER, _NOW):
-        way = _way(_rng("storey", seed, _ROUND + stream), w, d)
-        rooms = _partitions(_rng("storey", seed, stream), w, d, way)
-        floors.append((way, Contents([placed(join([*shell, *rooms]), 0.0, 0.0, 0.0, yaw)])))
-    (_, lower), (way, here) = floors[0], floors[1 if changed else 0]
-    site = _flat(layout_of(way, [way], half, 1.0, yaw), half)
-    return scene_of("storey", size, site, lower, here, ())
-
-
-def _axis(length: float, step: float) -> Floats:
-    """Return columns between the walls, half a step off the drive's lanes."""
-    count = int((length / 2 - 1.0) / step)
-    return np.asarray((np.arange(-count, count) + 0.5) * step)
-
-
-def _way(rng: np.random.Generator, w: float, d: float) -> Floats:
-    """Return the drive round a storey: between the columns."""
-    x = 7.5 * float(rng.integers(1, int((w / 2 - 4.0) / 7.5) + 1))
-    y = 7.5 * float(rng.integers(1, int((d / 2 - 3.0) / 7.5) + 1))
-    return loop((-x, x), (-y, y), 1.5)
-
-
-def _sides(w: float, d: float) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    at = [(-w / 2, -d / 2), (w / 2, -d / 2), (w / 2, d / 2), (-w / 2, d / 2)]
-    return list(zip(at, [*at[1:], at[0]], strict=True))
-
-
-def _wall(start: tuple[float, float], end: tuple[float, float], thick: float = 0.15) -> Mesh:
-    (x0, y0), (x1, y1) = start, end
-    turn = float(np.arctan2(y1 - y0, x1 - x0))
-    return placed(box(float(np.hypot(x1 - x0, y1 - y0)), thick, _CEILING), (x0 + x1) / 2, (y0 + y1) / 2, 0.0, turn)
-
-
-def _partitions(rng: np.random.Generator, w: float, d: float, way: Floats) -> list[Mesh]:
-    """Divide a storey into rooms of 4 to 9 metres with doors, and leave 1.1 metres on either side of the way free."""
-    out: list[Mesh] = []
-
-    def divide(x0: float, x1: float, y0: float, y1: float) -> None:
-        long = max(x1 - x0, y1 - y0)
-        if long < rng.uniform(6.0, 10.0):
-            return
-        share = rng.uniform(0.35, 0.65)
-        if x1 - x0 >= y1 - y0:
-            x = x0 + share * (x1 - x0)
-            raise_wall(np.array([x, y0]), np.array([x, y1]))
-            divide(x0, x, y0, y1)
-            divide(x, x1, y0, y1)
-        else:
-            y = y0 + share * (y1 - y0)
-            raise_wall(np.array([x0, y]), np.array([x1, y]))
-            divide(x0, x1, y0, y)
-            divide(x0, x1, y, y1)
-
-    def raise_wall(a: Floats, b: Floats) -> None:
-        length = float(np.linalg.norm(b - a))
-        at = np.arange(0.1, length, 0.2)
-        points = a + (b - a) * (at / length)[:, None]
-        free = np.linalg.norm(points[:, None] - way[None], axis=2).min(axis=1) > 1.1
-        door = rng.uniform(0.5, max(length - 1.5, 0.6))
-        free &= np.abs(at - door - 0.5) > 0.5
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(np.int8)))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
-            p, q = (a + (b - a) * (0.2 * k / length) for k in (first, last))
-            out.append(_wall((float(p[0]), float(p[1])), (float(q[0]), float(q[1]))))
-
-    divide(-w / 2, w / 2, -d / 2, d / 2)
-    return out
+    return scene_of("court", size, site, same, same)

@@ -1,12 +1,11 @@
 """The plan: sites, the runs on each site's map, and the family of each run.
 
-A site is drawn and mapped once and serves several runs, each with its own drive. Calibration sites are for fitting and
-are never reported.
+A site is drawn and mapped once and serves several runs, each with its own drive.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from typing import Literal
@@ -31,7 +30,7 @@ STREETS: dict[str, tuple[str, ...]] = {
 
 COPIES: dict[str, tuple[str, ...]] = {
     "calibration": ("terraces", "plantation"),
-    "reported": ("yard", "rows", "boxes", "avenue", "court", "storey"),
+    "reported": ("yard", "rows", "boxes", "avenue", "court"),
 }
 """Kinds of sites that are near copies of themselves."""
 
@@ -48,11 +47,10 @@ FAMILIES: dict[str, Class] = {
     "terraces": "near copies",  # identical terraces; for half of the runs with other trees, cars and poles
     "plantation": "near copies",  # equal objects on a grid; for half of the runs on another grid now
     "yard": "near copies",  # container yard, every stack another: right by ground and masts
-    "rows": "near copies",  # equal rows of houses, one house changed or swapped with one elsewhere
+    "rows": "near copies",  # equal rows of houses, of which one is another house now
     "boxes": "near copies",  # 24 x 40 equal boxes, driven along or across
     "avenue": "near copies",  # facades, trees or walls that are the same all along
     "court": "near copies",  # court of 4-fold symmetry
-    "storey": "near copies",  # map of another storey with the same shell: every fix is false
     "mirrored": "near copies",  # the map mirrored: every fix is false
     "shifted": "near copies",  # all buildings 4 m off: right by ground and trees
     "old": "near copies",  # 50 % of buildings, trees, cars and poles others
@@ -84,11 +82,6 @@ class Run:
         return f"{self.group}/{self.kind}-{self.seed}/{self.number}-{self.family}"
 
     @property
-    def of_class(self) -> Class:
-        """Class of its family."""
-        return FAMILIES[self.family]
-
-    @property
     def drive_seed(self) -> int:
         """Seed of the drive, and of its site if that is another one."""
         return 16 * self.seed + self.number
@@ -101,21 +94,18 @@ Site = tuple[Run, ...]
 def plan(group: Group, runs: int) -> list[Site]:
     """Return the sites of the first ``runs`` runs, in the proportions of all."""
     out: list[Site] = []
-    for site in sites(group):
-        left = runs - sum(map(len, out))
-        if left <= 0:
-            break
-        out.append(site[:left])
-    return out
-
-
-def sites(group: Group) -> Iterator[Site]:
-    """Yield sites without end, streets and near copies in turn; two sites have at least three runs of each class."""
     kinds, altered, copies = STREETS[group], ALTERED[group], COPIES[group]
-    for k in count():
+    for k in count():  # streets and near copies in turn
         seed = FIRST_SEED[group] + 2 * k
-        yield _street(group, kinds[k % len(kinds)], seed, altered[k % len(altered)], k // len(altered))
-        yield _copy(group, copies[k % len(copies)], seed + 1, k // len(copies))
+        for site in (
+            _street(group, kinds[k % len(kinds)], seed, altered[k % len(altered)], k // len(altered)),
+            _copy(group, copies[k % len(copies)], seed + 1, k // len(copies)),
+        ):
+            out.append(site[:runs])
+            runs -= len(out[-1])
+            if not runs:
+                return out
+    raise AssertionError("count() ended")
 
 
 def _street(group: Group, kind: str, seed: int, altered: tuple[str, ...], turn: int) -> Site:
@@ -143,8 +133,8 @@ def _copy(group: Group, kind: str, seed: int, turn: int) -> Site:
     """Two runs on the map of one near copy of itself."""
     rng, sensor = _choices(seed)
     shares = {
-        "terraces": (0.0, 1.0), "plantation": (float(turn % 2), 1.0 - turn % 2),
-        "yard": (1.0, 1.0), "storey": (1.0, 1.0), "rows": tuple(rng.uniform(0.0, 0.3, 2).round(3)),
+        "terraces": (0.0, 1.0), "plantation": (float(turn % 2), 1.0 - turn % 2), "yard": (1.0, 1.0),
+        "rows": tuple(rng.uniform(0.0, 0.3, 2).round(3)),
     }.get(kind, (0.0, 0.0))  # fmt: skip
     return tuple(Run(group, kind, kind, seed, k, sensor(k), float(share)) for k, share in enumerate(shares))
 

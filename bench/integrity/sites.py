@@ -1,8 +1,4 @@
-"""Building blocks of made-up sites: streets in rows, ground, and what may change between the survey and now.
-
-Frame: the scene's own, z up, metres, origin in the middle; a site's own axes are turned by a yaw of its seed. All sizes
-are set by hand.
-"""
+"""Building blocks of made-up sites and changes of scenes; metres, z up, origin in the middle, axes turned by a yaw."""
 
 from __future__ import annotations
 
@@ -13,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.tracking.worlds import earlier, owners
-from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.geometry.arrays import Floats
 from coview_stream.sim import furniture, vegetation
 from coview_stream.sim.layout import Layout, Site, resample
 from coview_stream.sim.mesh import Mesh, join, placed
-from coview_stream.sim.scenes import Footprint, Scene, SceneState
+from coview_stream.sim.scenes import Scene, SceneState
 from coview_stream.sim.vegetation import TreeMix
 
 MARGIN = 50.0
@@ -76,22 +72,15 @@ def layout_of(route: Floats, streets: Sequence[Floats], half: float, half_width:
     return Layout(resample(turned(route, yaw), _ROUTE_STEP), tuple(inside), half_width)
 
 
-def scene_of(kind: str, size: float, site: Site, mapped: Contents, now: Contents, plots: Sequence[Footprint]) -> Scene:
-    """Put a scene together; ``plots`` are its buildings."""
+def scene_of(kind: str, size: float, site: Site, mapped: Contents, now: Contents) -> Scene:
+    """Put a scene together; no building of it is rebuilt or shifted, so it has no footprints."""
     states = [SceneState(join([site.mesh(), *each.solid]), join(each.foliage)) for each in (mapped, now)]
-    return Scene(kind, size, states[0], states[1], site, site.layout.route, tuple(plots))
+    return Scene(kind, size, states[0], states[1], site, site.layout.route, ())
 
 
 def stand(mesh: Mesh, site: Site, xy: Floats, yaw: float) -> Mesh:
     """Put a mesh on the ground at ``xy``."""
     return placed(mesh, float(xy[0]), float(xy[1]), site.height(float(xy[0]), float(xy[1])), yaw)
-
-
-def footprint(mesh: Mesh, site: Site, xy: Floats, size: tuple[float, float], yaw: float) -> Footprint:
-    """Describe a building that :func:`stand` has put there."""
-    ground = site.height(float(xy[0]), float(xy[1]))
-    top = ground + float(mesh.vertices[:, 2].max())
-    return Footprint(float(xy[0]), float(xy[1]), *size, yaw, ground, top)
 
 
 class Movables(NamedTuple):
@@ -140,24 +129,22 @@ NEAR, FAR = 10.0, 40.0  # metres from the border
 _SHORTEST = 24.0  # metres, of a stretch that is worth driving to and fro
 
 
-def beside_border(scene: Scene, seed: int, outside: bool | None = None) -> Floats | None:
-    """Return a closed way (N, 2) on a street, 10 to 40 m from the map's border; None where there is no such street.
-
-    ``outside`` asks for a way beyond the border or within it; None takes either.
-    """
-    stretches = []
+def beside_border(scene: Scene, seed: int, outside: bool) -> Floats | None:
+    """Return a closed way (N, 2) on a street, 10 to 40 m inside or ``outside`` of the border; None without a street."""
+    stretches, lengths = list[Floats](), list[float]()
     for line in (*scene.site.layout.streets, scene.route[::4]):
-        depth = scene.size / 2 - np.abs(line).max(axis=1)  # positive inside
-        for sign in (1.0, -1.0):
-            if outside is not None and (sign < 0) != outside:
-                continue
-            fits = (sign * depth >= NEAR) & (sign * depth <= FAR) & (np.abs(line).max(axis=1) < scene.size / 2 + 42.0)
-            stretches += [line[run] for run in _runs(fits) if _length(line[run]) >= _SHORTEST]
+        depth = (scene.size / 2 - np.abs(line).max(axis=1)) * (-1.0 if outside else 1.0)
+        fits = (depth >= NEAR) & (depth <= FAR)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], fits, [False]]).astype(np.int8)))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            length = float(np.linalg.norm(np.diff(line[begin:end], axis=0), axis=1).sum())
+            if end - begin > 3 and length >= _SHORTEST:
+                stretches.append(line[begin:end])
+                lengths.append(length)
     if not stretches:
         return None
-    weights = np.array([_length(each) for each in stretches])
     rng = np.random.default_rng([seed, 220])
-    return there_and_back(stretches[int(rng.choice(len(stretches), p=weights / weights.sum()))])
+    return there_and_back(stretches[int(rng.choice(len(stretches), p=np.divide(lengths, sum(lengths))))])
 
 
 def lane(scene: Scene, seed: int, across: bool) -> Floats:
@@ -168,20 +155,8 @@ def lane(scene: Scene, seed: int, across: bool) -> Floats:
     return there_and_back(streets[int(np.random.default_rng([seed, 221]).choice(chosen))], 0.6)
 
 
-def _runs(inside: Bools) -> list[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 3]
-
-
-def _length(line: Floats) -> float:
-    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-
-
 def rebuilt(scene: Scene, seed: int, share: float) -> Scene:
-    """Return the scene with a ``share`` of its buildings others now: gone, smaller, or turned round and shifted.
-
-    It is :func:`bench.tracking.worlds.earlier` the other way round: the survey stays as it was.
-    """
+    """Return the scene with a ``share`` of its buildings others now: ``earlier`` the other way round."""
     other = earlier(replace(scene, mapped=scene.now, now=scene.now), seed, share)
     return replace(scene, now=other.mapped)
 
