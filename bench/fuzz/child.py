@@ -1,15 +1,16 @@
-"""Fuzzing targets, and the process that runs them: ``python -m bench.fuzz.child NAME CORPUS FOUND SECONDS WAY SEED``.
+"""Fuzzing targets, and the process that runs them: ``python -m bench.fuzz.child NAMES CORPUS FOUND SECONDS SEED``.
 
 A target is a function of bytes that returns a value or raises a CoViewError. Another exception is a finding, and FOUND
 gets its input, once per place in the code. Memory is limited, and an input that takes too long ends the process, so
-``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAME (separated
-by commas). It imports the product late, because atheris instruments modules on import.
+``FOUND/result.json`` is written often. With 0 seconds the process replays the corpora of all targets in NAMES
+(separated by commas).
 """
 
 from __future__ import annotations
 
 import contextlib
 import faulthandler
+import functools
 import hashlib
 import json
 import logging
@@ -22,6 +23,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,155 +31,116 @@ from unittest.mock import Mock
 
 import numpy as np
 
-Target = Callable[[bytes], object]
-
-
-def _file(name: str, read: Callable[[Path], object]) -> Target:
-    """Return a target that reads a file with these bytes, in memory where the machine has /dev/shm."""
-    place = Path("/dev/shm")
-    folder = Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=place if os.access(place, os.W_OK) else None))
-    path = folder / name
-
-    def run(data: bytes) -> object:
-        path.write_bytes(data)
-        return read(path)
-
-    return run
-
-
-def _cloud(name: str) -> Target:
-    import laspy  # noqa: F401 - now, so its coverage is seen
-
-    from coview_stream.clouds import read_cloud
-
-    return _file(name, read_cloud)
-
-
-def _message(kind: str, codec: str) -> Target:
-    from coview_stream import messages
-    from coview_stream.messages.types import Sample
-
-    decode: Any = getattr(messages, f"decode_{kind}")
-
-    def run(data: bytes) -> object:
-        size = data[0] % 41 if data else 0  # of the attachment
-        return decode(Sample("coview/r1/in", data[1 + size :], "", data[1 : 1 + size] or None), codec)
-
-    return run
-
-
-def _encoding() -> Target:
-    from coview_stream import messages
-    from coview_stream.errors import CoViewError
-    from coview_stream.messages.types import Sample
-
-    def run(data: bytes) -> None:
-        encoding, key, payload = (*data.split(b"\n", 2), b"", b"")[:3]
-        sample = Sample(key.decode("utf-8", "replace"), payload, encoding.decode("utf-8", "replace"))
-        for decode in (messages.decode_cloud, messages.decode_odometry, messages.decode_pose):
-            with contextlib.suppress(CoViewError):
-                decode(sample)
-
-    return run
-
-
-def _trajectory() -> Target:
-    from coview_stream.clouds.trajectory import read_kitti_poses, read_times, read_tum
-
-    readers = [_file("a.txt", reader) for reader in (read_tum, read_kitti_poses, read_times)]
-    return lambda data: readers[data[0] % 3](data[1:]) if data else None
-
-
-def _map() -> Target:
-    from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.errors import MapError
-
-    def use(path: Path) -> object:
-        with contextlib.suppress(MapError):  # nearly always the checksum: an attacker would have it right
-            BaseMap.load(path)
-        loaded = BaseMap.load(path, check=False)
-        if loaded.learned is not None:
-            loaded.learned.check()
-        loaded.surveyed(np.zeros((1, 2)))
-        return loaded.crop(np.zeros(3), 5.0)
-
-    return _file("a.coview", use)
-
-
-def _state() -> Target:
-    from coview_stream.stream.node import last_place
-
-    logging.getLogger("coview_stream").setLevel(logging.CRITICAL)
-    name = last_place.file_of(Path(), "r1", "0" * 64).name
-    return _file(name, lambda path: last_place.load(path.parent, "r1", "0" * 64))
-
-
-def _bag(name: str) -> Target:
+GUIDED = find_spec("atheris") is not None  # it instruments modules on import
+if GUIDED:
+    import atheris
+with atheris.instrument_imports(include=["coview_stream", "rosbags", "laspy"]) if GUIDED else contextlib.nullcontext():
+    import laspy  # noqa: F401 - here, so its coverage is seen
     import rosbags.rosbag1
-    import rosbags.rosbag2  # noqa: F401 - as above
+    import rosbags.rosbag2  # noqa: F401
 
-    from coview_stream.recordings.open_run import open_run
-
-    def use(path: Path) -> object:
-        run = open_run(path)
-        return run.read(0) if len(run) else None
-
-    return _file(name, use)
-
-
-def _rpc() -> Target:
-    from coview_stream.errors import CoViewError
+    from coview_stream import messages
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.clouds import read_cloud
+    from coview_stream.clouds.trajectory import read_kitti_poses, read_times, read_tum
+    from coview_stream.errors import CoViewError, MapError
     from coview_stream.messages.json_messages import read_object
+    from coview_stream.messages.types import Sample
+    from coview_stream.recordings.open_run import open_run
     from coview_stream.stream.client.fleet_table import FleetTable
+    from coview_stream.stream.node import last_place
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors
     from coview_stream.stream.transport.keys import NodeIdentity
     from coview_stream.stream.transport.transport import MAX_REPLY
 
-    log = logging.getLogger("coview_stream")
-    log.setLevel(logging.CRITICAL)
+Target = Callable[[bytes], object]
+LOG = logging.getLogger("coview_stream")
 
-    def run(data: bytes) -> object:
-        text = data.decode("utf-8", "replace")
-        pairs = [(name, value) for name, _, value in (part.partition("=") for part in text.split(";"))]
-        answers = zenoh_io.Answers(RateLimitedErrors(log))
-        query = SimpleNamespace(parameters=pairs, key_expr="k", reply=Mock(), reply_err=Mock())
-        answers.callback("k", dict, threading.Event())(query)
-        answers.end()
-        answers.run()
-        zenoh_io._error_of(data)
-        NodeIdentity.read(data)
+
+@functools.cache
+def _folder() -> Path:
+    """Make a folder, in memory where the machine has /dev/shm."""
+    memory = Path("/dev/shm")
+    return Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+
+
+def _file(name: str, read: Callable[[Path], object], data: bytes) -> object:
+    path = _folder() / name
+    path.write_bytes(data)
+    return read(path)
+
+
+def _message(decode: Callable[[Sample, str], object], codec: str, data: bytes) -> object:
+    size = data[0] % 41 if data else 0  # of the attachment
+    return decode(Sample("coview/r1/in", data[1 + size :], "", data[1 : 1 + size] or None), codec)
+
+
+def _encoding(data: bytes) -> None:
+    encoding, key, payload = (*data.split(b"\n", 2), b"", b"")[:3]
+    sample = Sample(key.decode("utf-8", "replace"), payload, encoding.decode("utf-8", "replace"))
+    for decode in (messages.decode_cloud, messages.decode_odometry, messages.decode_pose):
         with contextlib.suppress(CoViewError):
-            table = FleetTable()
-            table.add_status("r1", read_object(data), 1.0)
-            table.table(2.0)
-        return zenoh_io._json_object("k", data, MAX_REPLY)
-
-    return run
+            decode(sample)
 
 
-TARGETS: dict[str, Callable[[], Target]] = {
-    **{
-        f"{kind}-{codec}": (lambda kind=kind, codec=codec: _message(kind, codec))  # type: ignore[misc]
-        for kind, codecs in {
-            "cloud": ("xyz", "xyzi", "foxglove", "cdr", "keelson"),
-            "odometry": ("json", "foxglove", "cdr", "keelson"),
-            "pose": ("json", "foxglove", "cdr", "keelson"),
-        }.items()
-        for codec in codecs
-    },
+def _trajectory(data: bytes) -> object:
+    readers: tuple[Callable[[Path], object], ...] = (read_tum, read_kitti_poses, read_times)
+    return _file("a.txt", readers[data[0] % 3], data[1:]) if data else None
+
+
+def _map(path: Path) -> object:
+    with contextlib.suppress(MapError):  # nearly always the checksum: an attacker would have it right
+        BaseMap.load(path)
+    loaded = BaseMap.load(path, check=False)
+    if loaded.learned is not None:
+        loaded.learned.check()
+    loaded.surveyed(np.zeros((1, 2)))
+    return loaded.crop(np.zeros(3), 5.0)
+
+
+def _state(data: bytes) -> object:
+    name = last_place.file_of(Path(), "r1", "0" * 64).name
+    return _file(name, lambda path: last_place.load(path.parent, "r1", "0" * 64), data)
+
+
+def _bag(path: Path) -> object:
+    run = open_run(path)
+    return run.read(0) if len(run) else None
+
+
+def _rpc(data: bytes) -> object:
+    pairs = [tuple(part.partition("=")[::2]) for part in data.decode("utf-8", "replace").split(";")]
+    answers = zenoh_io.Answers(RateLimitedErrors(LOG))
+    query = SimpleNamespace(parameters=pairs, key_expr="k", reply=Mock(), reply_err=Mock())
+    answers.callback("k", dict, threading.Event())(query)
+    answers.end()
+    answers.run()
+    zenoh_io._error_of(data)
+    NodeIdentity.read(data)
+    with contextlib.suppress(CoViewError):
+        table = FleetTable()
+        table.add_status("r1", read_object(data), 1.0)
+        table.table(2.0)
+    return zenoh_io._json_object("k", data, MAX_REPLY)
+
+
+_P = functools.partial
+_CODECS: dict[str, tuple[Callable[..., object], tuple[str, ...]]] = {
+    "cloud": (messages.decode_cloud, ("xyz", "xyzi", "foxglove", "cdr", "keelson")),
+    "odometry": (messages.decode_odometry, ("json", "foxglove", "cdr", "keelson")),
+    "pose": (messages.decode_pose, ("json", "foxglove", "cdr", "keelson")),
+}
+TARGETS: dict[str, Target] = {
+    **{f"{kind}-{c}": _P(_message, decode, c) for kind, (decode, codecs) in _CODECS.items() for c in codecs},
     "encoding": _encoding,
-    **{suffix: (lambda suffix=suffix: _cloud(f"a.{suffix}")) for suffix in ("las", "laz", "ply", "pcd", "npy", "bin")},  # type: ignore[misc]
+    **{end: _P(_file, f"a.{end}", read_cloud) for end in ("las", "laz", "ply", "pcd", "npy", "bin")},
     "trajectory": _trajectory,
-    "map": _map,
+    "map": _P(_file, "a.coview", _map),
     "state": _state,
-    "mcap": lambda: _bag("a.mcap"),
-    "db3": lambda: _bag("a.db3"),
-    "bag": lambda: _bag("a.bag"),
+    **{end: _P(_file, f"a.{end}", _bag) for end in ("mcap", "db3", "bag")},
     "rpc": _rpc,
 }
-"""Functions that make a target and import its libraries, by name."""
-
 
 LIMIT_S = 10  # seconds of one input of a few kB: a hundred times more than any of them needs
 MEMORY = 2 << 30  # bytes besides the libraries: LAZ and PCD may unpack to a hundred times
@@ -189,11 +152,8 @@ class Watch:
     """A target and its counts: executions, accepted inputs, findings by place."""
 
     def __init__(self, target: Target, found: Path) -> None:
-        from coview_stream.errors import CoViewError
-
-        self._expected, self._target, self._found = CoViewError, target, found
+        self._target, self._found, self._written = target, found, 0.0
         self.books: dict[str, Any] = {"executions": 0, "values": 0, "places": {}}
-        self._written = 0.0
 
     def __call__(self, data: bytes) -> None:
         """Run one input."""
@@ -201,9 +161,9 @@ class Watch:
         try:
             self._target(data)
             self.books["values"] += 1
-        except self._expected:
+        except CoViewError:
             pass
-        except (Exception, RecursionError) as error:
+        except Exception as error:
             frames = [f for f in traceback.extract_tb(error.__traceback__) if "coview_" in f.filename]
             where = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
             if (place := f"{type(error).__name__} at {where}") not in self.books["places"]:
@@ -220,23 +180,11 @@ class Watch:
         self(data[:MAX_INPUT])
         faulthandler.cancel_dump_traceback_later()
 
-    def write(self) -> None:
-        """Write the counts."""
+    def write(self, done: bool = False) -> None:
+        """Write the counts; ``done`` tells that no input ended the process."""
         self._written = time.monotonic()
-        (self._found / "result.part").write_text(json.dumps(self.books))
+        (self._found / "result.part").write_text(json.dumps(self.books | {"done": done}))
         (self._found / "result.part").replace(self._found / "result.json")
-
-    def end(self) -> None:
-        """Record that no input ended the process."""
-        (self._found / "current").unlink(missing_ok=True)
-        self.books["done"] = True
-        self.write()
-
-
-def limit_memory() -> None:
-    """Limit the address space to its present size and :data:`MEMORY`."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
 
 
 def mutated(rng: random.Random, seeds: list[bytes]) -> bytes:
@@ -244,35 +192,27 @@ def mutated(rng: random.Random, seeds: list[bytes]) -> bytes:
     data = bytearray(rng.choice(seeds))
     for _ in range(rng.randint(1, 6)):
         at, size = rng.randrange(len(data) + 1), rng.choice((1, 1, 2, 4, 8, 64))
-        match rng.randrange(5):
-            case 0:
-                data[at : at + 1] = bytes([rng.randrange(256)])
-            case 1:
-                word = rng.choice(_ODD)
-                data[at : at + len(word)] = word
-            case 2:
-                del data[at : at + size]
-            case 3:
-                other = rng.choice(seeds)
-                begin = rng.randrange(len(other) + 1)
-                data[at:at] = other[begin : begin + size]
-            case _:
-                data[at : at + size] = data[at : at + size] * 2
+        other = rng.choice(seeds)
+        begin = rng.randrange(len(other) + 1)
+        piece, odd = other[begin : begin + size], rng.choice(_ODD)
+        cut, new = rng.choice(
+            ((1, rng.randbytes(1)), (len(odd), odd), (size, b""), (0, piece), (0, data[at : at + size]))
+        )
+        data[at : at + cut] = new
     return bytes(data)
 
 
-def main(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: int) -> None:
+def main(names: str, corpus: Path, found: Path, seconds: float, seed: int) -> None:
     """Fuzz one target, or replay several."""
-    if way == "atheris" and seconds:
-        import atheris
-
-        with atheris.instrument_imports(include=["coview_stream", "rosbags", "laspy"]):
-            watch = Watch(TARGETS[names](), found)
-        limit_memory()
+    LOG.setLevel(logging.CRITICAL)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    if GUIDED and seconds:
         options = [
             f"-max_total_time={max(1, round(seconds))}", f"-timeout={LIMIT_S}", "-rss_limit_mb=0", f"-seed={seed}",
             f"-max_len={MAX_INPUT}", f"-artifact_prefix={found}/",
         ]  # fmt: skip
+        watch = Watch(TARGETS[names], found)
         atheris.Setup([sys.argv[0], *options, str(found / "corpus"), str(corpus)], watch)
         atheris.Fuzz()
         return
@@ -281,15 +221,15 @@ def main(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: 
         place, own = (found, corpus) if seconds else (found / name, corpus / name)
         place.mkdir(exist_ok=True)
         seeds = [path.read_bytes() for path in sorted(own.iterdir())]
-        watch = Watch(TARGETS[name](), place)
-        limit_memory()
+        watch = Watch(TARGETS[name], place)
         end = time.monotonic() + seconds
         for data in [] if seconds else seeds:
             watch.within_time(data)
         while time.monotonic() < end:
             watch.within_time(mutated(rng, seeds))
-        watch.end()
+        watch.write(done=True)
+        (place / "current").unlink(missing_ok=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]), sys.argv[5], int(sys.argv[6]))
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5]))

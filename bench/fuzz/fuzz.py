@@ -7,7 +7,6 @@ a value or raise a CoViewError; all else is a finding, and its input is stored.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import subprocess
@@ -19,8 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from bench.fuzz.child import TARGETS
-from bench.harness.files import ROOT
+from bench.fuzz.child import GUIDED, TARGETS
+from bench.harness.files import PYTHON, ROOT, environment
 from bench.harness.rows import Row
 from coview_stream.errors import InputError
 
@@ -41,11 +40,10 @@ def rows(asked: argparse.Namespace) -> Iterator[Row]:
     if unknown := [name for name in names if name not in TARGETS]:
         raise InputError(f"--targets: no target {', '.join(unknown)}; there are {', '.join(TARGETS)}")
     seconds = min(asked.seconds, 5.0) if asked.quick else asked.seconds
-    way = "atheris" if importlib.util.find_spec("atheris") else "mutations"
     below = asked.found or Path(tempfile.mkdtemp(prefix="coview-fuzz-"))
-    print(f"... by {way}; inputs of findings in {below}", file=sys.stderr)
+    print(f"... by {'atheris' if GUIDED else 'mutations'}; inputs of findings in {below}", file=sys.stderr)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        outcomes = pool.map(lambda name: fuzzed(name, below / name, seconds, way), names)
+        outcomes = pool.map(lambda name: fuzzed(name, below / name, seconds), names)
         for name, outcome in zip(names, outcomes, strict=True):
             count, holds = outcome["executions"], not outcome["places"] and outcome["executions"] > 0
             yield Row(f"fuzz/{name}", count, unit="inputs", target="no finding", holds=holds, details=outcome)
@@ -53,7 +51,7 @@ def rows(asked: argparse.Namespace) -> Iterator[Row]:
                 print(f"    {name}: {place}: {text}", file=sys.stderr, flush=True)
 
 
-def fuzzed(name: str, found: Path, seconds: float, way: str) -> dict[str, Any]:
+def fuzzed(name: str, found: Path, seconds: float) -> dict[str, Any]:
     """Fuzz one target, again and again where an input ends the child."""
     (found / "corpus").mkdir(parents=True, exist_ok=True)
     outcome: dict[str, Any] = {"executions": 0, "values": 0, "places": {}}
@@ -61,7 +59,7 @@ def fuzzed(name: str, found: Path, seconds: float, way: str) -> dict[str, Any]:
     while attempt == 0 or time.monotonic() < end - 1.0:
         attempt += 1
         (found / "result.json").unlink(missing_ok=True)
-        code, output = _child(name, CORPUS / name, found, max(0.0, end - time.monotonic()), way, attempt)
+        code, output = _child(name, CORPUS / name, found, max(1.0, end - time.monotonic()), attempt)
         if (found / "result.json").is_file():
             books = json.loads((found / "result.json").read_text())
             outcome["executions"] += books["executions"]
@@ -79,7 +77,7 @@ def fuzzed(name: str, found: Path, seconds: float, way: str) -> dict[str, Any]:
 
 def replayed(names: Sequence[str], found: Path) -> dict[str, dict[str, Any]]:
     """Replay the corpora of several targets in one process; a target without ``done`` was not finished."""
-    code, output = _child(",".join(names), CORPUS, found, 0.0, "replay", 0)
+    code, output = _child(",".join(names), CORPUS, found, 0.0, 0)
     outcomes = {}
     for name in names:
         file = found / name / "result.json"
@@ -89,14 +87,12 @@ def replayed(names: Sequence[str], found: Path) -> dict[str, dict[str, Any]]:
     return outcomes
 
 
-def _child(names: str, corpus: Path, found: Path, seconds: float, way: str, seed: int) -> tuple[int, str]:
-    words = ["-P", "-m", "bench.fuzz.child", names, str(corpus), str(found), str(seconds), way, str(seed)]
-    paths = os.pathsep.join([str(ROOT), *(path for path in sys.path if path)])
-    own = {"PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+def _child(names: str, corpus: Path, found: Path, seconds: float, seed: int) -> tuple[int, str]:
+    words = [*PYTHON, "-m", "bench.fuzz.child", names, str(corpus), str(found), str(seconds), str(seed)]
     try:
         done = subprocess.run(
-            [sys.executable, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, errors="replace", env=os.environ | own, timeout=seconds + _SPARE_S, check=False,
+            words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            text=True, errors="replace", env=environment(1), timeout=seconds + _SPARE_S, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         return -1, f"does not end\n{error.output!r}"

@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import random
 import socket
-import time
 from multiprocessing.connection import Connection
 
 # modes: open; cut; flapping, a cut every 2 s; silent, half-open: nothing passes or ends; slow, 200 ms each way; thin,
 # 1 Mbit/s each way; lossy, a fifth of the pieces comes 200 ms later, as TCP's repeats do; corrupt, flipped bits
-_PIECE, _QUEUED = 16_384, 64  # bytes; pieces
-_WINDOW = 65_536  # bytes of the receive buffer: a thin link must not hold seconds of data
-_SLOW, _THIN, _AGAIN, _EVERY, _FLIPS = 0.2, 125_000.0, 0.2, 2.0, 0.05  # s, bytes per s, s, s, share of pieces
+_PIECE, _WINDOW = 16_384, 65_536  # bytes; of the receive buffer: a thin link must not hold seconds of data
+_LATE, _THIN, _LOST, _EVERY, _FLIPS = 0.2, 125_000.0, 0.2, 2.0, 0.05  # s, bytes per s, share of pieces, s, share
 
 
 class Link:
@@ -26,29 +24,28 @@ class Link:
 
     async def run(self, conn: Connection) -> None:
         """Forward until None is received; every other order is a mode."""
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        ended = asyncio.Event()
 
         def order() -> None:
-            mode = conn.recv()
-            if mode is None:
+            if (mode := conn.recv()) is None:
                 ended.set()
-            else:
-                self._mode = mode
-                if mode == "cut":
-                    self._cut()
+                return
+            self._mode = mode
+            if mode == "cut":
+                self._cut()
 
         with socket.socket() as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WINDOW)
             listener.bind(("127.0.0.1", self._port))
             server = await asyncio.start_server(self._accept, sock=listener.dup())
-        loop.add_reader(conn.fileno(), order)
+        asyncio.get_running_loop().add_reader(conn.fileno(), order)
         flapper = asyncio.create_task(self._flap())
         conn.send("ready")
         async with server:
             await ended.wait()
-        flapper.cancel()
-        self._cut()
+            flapper.cancel()
+            self._cut()
 
     async def _flap(self) -> None:
         while True:
@@ -62,10 +59,9 @@ class Link:
         self._open.clear()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._mode == "cut":
-            writer.transport.abort()
-            return
         try:
+            if self._mode == "cut":
+                raise ConnectionRefusedError
             far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._target)
         except OSError:
             writer.transport.abort()
@@ -80,34 +76,19 @@ class Link:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        queue: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_QUEUED)
-        forward = asyncio.create_task(self._send(queue, writer))
-        try:
-            while piece := await reader.read(_PIECE):
-                await queue.put((time.monotonic(), piece))
-                while self._mode == "thin" and queue.qsize() > 1:
-                    await asyncio.sleep(0.01)
-        except OSError:
-            pass
-        finally:
-            forward.cancel()
-
-    async def _send(self, queue: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter) -> None:
-        while True:
-            came, piece = await queue.get()
+        loop, due = asyncio.get_running_loop(), 0.0
+        while piece := await reader.read(_PIECE):
             while self._mode == "silent":
                 await asyncio.sleep(0.05)
-            if self._mode == "slow":
-                await asyncio.sleep(max(0.0, came + _SLOW - time.monotonic()))
-            elif self._mode == "thin":
+            late = self._mode == "slow" or (self._mode == "lossy" and self._rng.random() < _LOST)
+            if self._mode == "thin":
                 await asyncio.sleep(len(piece) / _THIN)
-            elif self._mode == "lossy" and self._rng.random() < 0.2:
-                await asyncio.sleep(_AGAIN)
             elif self._mode == "corrupt" and self._rng.random() < _FLIPS:
                 broken = bytearray(piece)
                 broken[self._rng.randrange(len(broken))] ^= 1 << self._rng.randrange(8)
                 piece = bytes(broken)
-            writer.write(piece)
+            due = max(due + 1e-6, loop.time() + _LATE * late)  # pieces keep their order
+            loop.call_at(due, writer.write, piece)
             await writer.drain()
 
 

@@ -1,9 +1,8 @@
 """Robots that drive for hours with a fault every minute: false poses, stuck states, time to recover, leaks.
 
-A router, a node per site (``coview-stream serve``) and robots that replay simulated drives without end. Every fault
-comes once before any comes again. In a town the robots have to be localized again within 60 s of a fault. On two
-deceptive sites (a yard of equal boxes, and one whose containers were all moved) no pose is right. Needs the extra
-``bench``.
+A router, a node (``coview-stream serve``) and robots that replay simulated drives without end. Every fault comes once
+before any comes again. Robots in the town of the map have to be localized again within 60 s of a fault; every other
+robot drives in another town, where no pose is right. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -14,47 +13,44 @@ import sys
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from random import Random
 
 import numpy as np
 
 from bench.harness.files import folder
-from bench.harness.rows import Row, judged, table
-from bench.soak.robots import KINDS, Robot, prepare
-from bench.soak.stage import ENDS_PROCESSES, FAULTS, SoakNode, Stage, slope
+from bench.harness.rows import Row, bounded, informs, judged, table
+from bench.harness.worlds import map_of, prepare, prepared_run
+from bench.soak.robots import Robot
+from bench.soak.stage import ENDS_PROCESSES, FAULTS, Stage, slope
 from coview_stream.errors import InputError
+from coview_stream.sim import SimulationConfig
 
 STUCK = 60.0  # seconds without a pose after a fault, while frames arrive
 FIRST_FIX = 90.0  # seconds, on a machine that starts everything at once
 WARM = 600.0  # seconds at a process's start that its slope leaves out
+FED = 2.0  # seconds without odometry at the router after which a robot counts as disconnected
 MIN_HOURS = 0.25  # a slope over less is no evidence
 LEAKS = (("megabytes", 1.0, "MB/h"), ("descriptors", 1.0, "per h"))  # figure, target per hour, unit
 
 
 @dataclass
 class Event:
-    """One fault: its start, and the recovery of every robot in the town."""
+    """One fault and its outcome."""
 
     fault: str
     begin: float  # seconds since the first robot drove
-    recoveries: dict[str, float | None] = field(default_factory=dict)  # seconds; None: not within STUCK
+    recoveries: dict[str, float | None] = field(default_factory=dict)  # seconds of each robot; None: not within STUCK
     stuck: list[str] = field(default_factory=list)  # robots that did not recover although frames arrived
     unfed: list[str] = field(default_factory=list)  # robots whose frames did not reach the router
     false: int = 0
     crashes: int = 0
 
-    def text(self) -> str:
-        """Describe the fault's outcome."""
-        back = [f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in self.recoveries.items()]
-        marks = [f"{self.false} FALSE"] * bool(self.false) + [f"{self.crashes} CRASHES"] * bool(self.crashes)
-        return "; ".join([*(back or ["no robot to localize"]), *marks])
-
 
 def options(parser: ArgumentParser) -> None:
     """Add duration, robots and faults."""
     parser.add_argument("--minutes", type=float, default=60.0, help="from the first fixes on (60)")
-    parser.add_argument("--robots", type=int, default=2, help="in a town, a yard of equal boxes, a rearranged yard ...")
+    parser.add_argument("--robots", type=int, default=2, help="on the map and elsewhere, in turns (2)")
     parser.add_argument("--every", type=float, default=60.0, metavar="S", help="seconds from fault to fault (60)")
     parser.add_argument("--seed", type=int, default=3101, help="of worlds and faults (3101)")
     parser.add_argument("--faults", nargs="+", metavar="WORD", default=[], help="only those whose names have a word")
@@ -81,36 +77,44 @@ def rows(asked: Namespace) -> Iterator[Row]:
     first = next(faults)
     if asked.robots < 1:
         raise InputError(f"--robots {asked.robots}: at least one")
-    kinds = [KINDS[k % len(KINDS)] for k in range(asked.robots)]
-    sites = {kind: prepare(folder(), kind, asked.seed, asked.quick) for kind in dict.fromkeys(kinds)}
-    stage = Stage([sites[kind] for kind in kinds], folder() / "soak", asked.seed)
-    wanted = [robot for robot in stage.robots if not robot.site.deceptive]
-    begin, events, ended = time.monotonic(), list[Event](), list[float]()
+    home = SimulationConfig(seed=asked.seed, size=220.0, length=80.0)
+    if asked.quick:
+        home = replace(home, size=140.0, length=30.0, density=10.0)
+    towns = [prepare(folder(), home), prepared_run(folder(), replace(home, seed=home.seed + 1))]
+    robots = [Robot(f"r{k + 1}", towns[k % 2], elsewhere=k % 2 == 1) for k in range(asked.robots)]
+    stage = Stage(map_of(folder(), home), robots, folder() / "soak.log", asked.seed)
+    wanted = [robot for robot in robots if not robot.elsewhere]
+    begin, events = time.monotonic(), list[Event]()
     try:
-        try:
-            stage.wait(120.0, lambda: all(robot.state for robot in stage.robots))
-            stage.begin()
-            recovered(stage, wanted, time.monotonic(), FIRST_FIX)
-            fixes = {robot.name: robot.recovered and round(robot.recovered - robot.start, 1) for robot in wanted}
-            text = "; ".join(f"{name} {seconds}" for name, seconds in fixes.items())
-            yield Row("soak/first fix, s", text=text, details=fixes)
-            begin = time.monotonic()
-            stage.wait(min(10.0, asked.every / 3))
-            for name in itertools.chain([first], faults):
-                events.append(play(stage, wanted, name, begin, asked.every))
-                yield Row(f"soak/{len(events)}: {name}", text=events[-1].text(), details=asdict(events[-1]))
-                if time.monotonic() > begin + 60 * asked.minutes:
-                    break
-        except KeyboardInterrupt:
-            print("soak: interrupted; the rows so far:", file=sys.stderr)
+        stage.wait(120.0, lambda: all(robot.state for robot in robots))
+        stage.begin()
+        recovered(stage, wanted, time.monotonic(), FIRST_FIX)
+        fixes = {robot.name: robot.recovered and round(robot.recovered - robot.start, 1) for robot in wanted}
+        text = "; ".join(f"{name} {seconds}" for name, seconds in fixes.items())
+        yield Row("soak/first fix, s", text=text, details=fixes)
+        begin = time.monotonic()
+        stage.wait(min(10.0, asked.every / 3))
+        for name in itertools.chain([first], faults):
+            event = play(stage, wanted, name, begin, asked.every)
+            events.append(event)
+            times = (f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in event.recoveries.items())
+            text = "; ".join((*times, f"{event.false} false, {event.crashes} crashes"))
+            yield Row(f"soak/{len(events)}: {name}", text=text, details=asdict(event))
+            if time.monotonic() > begin + 60 * asked.minutes:
+                break
+    except KeyboardInterrupt:
+        print("soak: interrupted; the rows so far:", file=sys.stderr)
     finally:
         ended = stage.close()
     hours = (time.monotonic() - begin) / 3600
-    for robot in stage.robots:
+    for robot in robots:
         yield from figures(robot, hours)
-    yield from survived(events)
-    yield from processes(stage.nodes, hours)
-    yield Row("soak/end after SIGTERM, worst s", max(ended, default=math.nan))
+    stuck, unfed = ([name for event in events for name in getattr(event, kind)] for kind in ("stuck", "unfed"))
+    text = f"{len(stuck)} of {len(events) * len(wanted)}"
+    yield judged("soak/stuck for 60 s while frames came", text, "0", not stuck, len(stuck))
+    yield informs("soak/robots of the bench that did not reach the router again", len(unfed), "")
+    yield from processes(stage, hours)
+    yield informs("soak/end after SIGTERM, worst", ended, "s")
 
 
 def recovered(stage: Stage, robots: Sequence[Robot], since: float, seconds: float) -> None:
@@ -123,71 +127,54 @@ def recovered(stage: Stage, robots: Sequence[Robot], since: float, seconds: floa
 def play(stage: Stage, wanted: Sequence[Robot], name: str, start: float, every: float) -> Event:
     """Make one fault; wait until all robots have recovered and the next fault is due."""
     begin, event = time.monotonic(), Event(name, time.monotonic() - start)
-    false, crashes = stage.count()
+    false, crashes = count(stage)
     whole = FAULTS[name](stage)
     recovered(stage, wanted, whole, STUCK)
     for robot in wanted:
         event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
         if robot.recovered is None:
-            (event.stuck if robot.fed(time.monotonic()) else event.unfed).append(robot.name)
-    for node in stage.nodes:
-        node.revive()
+            (event.stuck if time.monotonic() < robot.fed + FED else event.unfed).append(robot.name)
+    stage.revive()
     if event.stuck or event.unfed:  # counted; the next fault needs working robots
         stage.rescue()
         recovered(stage, wanted, time.monotonic(), STUCK)
     stage.wait(max(5.0 if every >= 30 else 1.0, begin + every - time.monotonic()))
-    now_false, now_crashes = stage.count()
-    event.false, event.crashes = now_false - false, now_crashes - crashes
+    event.false, event.crashes = (now - before for now, before in zip(count(stage), (false, crashes), strict=True))
     return event
 
 
+def count(stage: Stage) -> tuple[int, int]:
+    """Return the false or unreadable poses and the crashes so far."""
+    return sum(len(robot.false) + robot.unreadable for robot in stage.robots), len(stage.crashes)
+
+
 def figures(robot: Robot, hours: float) -> Iterator[Row]:
-    """Yield poses, false poses and latency of a robot."""
-    name = f"soak/{robot.name} ({robot.site.name})"
-    details = {"states": dict(robot.states), "false": robot.false[:100], "unreadable": robot.unreadable}
-    yield Row(f"{name}: poses", robot.poses, text=f"{robot.poses} in {hours:.2f} h", details=details)
-    wrong = len(robot.false) + robot.unreadable
-    yield judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
-    yield Row(f"{name}: worst pose, m / degrees", text=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}")
+    """Yield false poses and latency of a robot."""
+    name, wrong = f"soak/{robot.name}{', elsewhere' * robot.elsewhere}", len(robot.false) + robot.unreadable
+    figures = {"states": dict(robot.states), "false": robot.false[:100], "worst": robot.worst, "hours": hours}
+    row = judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
+    yield replace(row, details=figures)
     if robot.latencies:
         parts = np.percentile(1e3 * np.array(robot.latencies), (50, 95, 99))
         yield Row(f"{name}: cloud to pose p50 / p95 / p99, ms", text=" / ".join(f"{part:.0f}" for part in parts))
 
 
-def survived(events: Sequence[Event]) -> Iterator[Row]:
-    """Yield the faults, and the robots that did not recover."""
-    times = [seconds for event in events for seconds in event.recoveries.values() if seconds is not None]
-    stuck, unfed = (sum(len(getattr(event, name)) for event in events) for name in ("stuck", "unfed"))
-    yield Row("soak/faults", len(events), text=f"{len(events)} of {len({event.fault for event in events})} kinds")
-    if times:
-        yield Row("soak/back after, median / worst s", text=f"{np.median(times):.1f} / {max(times):.1f}")
-    yield judged("soak/stuck for 60 s while frames came", f"{stuck} of {len(times) + stuck}", "0", stuck == 0, stuck)
-    yield Row("soak/robots of the bench that did not reach the router again", float(unfed))
-
-
-def processes(nodes: Sequence[SoakNode], hours: float) -> Iterator[Row]:
-    """Yield crashes, and the growth of memory and descriptors of all nodes' processes."""
-    crashes = [f"{node.site.name}: {crash}" for node in nodes for crash in node.crashes]
-    text = "; ".join(crashes) or "0"
-    yield judged("soak/ended by themselves, or not when asked", text, "0", not crashes, len(crashes))
-    logs = (node.log.read_text(errors="replace") for node in nodes)
-    traces = sum(log.count("Traceback (most recent call last)") for log in logs)
-    yield judged("soak/tracebacks in logs", str(traces), "0", traces == 0, traces)
-    for node in nodes:
-        parts = sorted({part for part, _ in node.samples})
-        for figure, most, unit in LEAKS:
-            slopes = {p: slope([s for (of, _), s in node.samples.items() if of == p], figure, WARM) for p in parts}
-            known = [value for value in slopes.values() if value is not None]
-            total = sum(known) if known else math.nan
-            text = "; ".join(f"{part} {'-' if value is None else f'{value:+.2f}'}" for part, value in slopes.items())
-            long = hours >= MIN_HOURS and bool(known)
-            yield judged(
-                f"soak/{node.site.name}: {figure} of its processes, slope after 10 min",
-                f"{total:+.2f} {unit} ({text})" if known else "-",
-                f"< {most:g} {unit}" if long else "", total < most if long else None, total,
-            )  # fmt: skip
-        last = {part: samples[-1].megabytes for (part, _), samples in node.samples.items()}
-        yield Row(f"soak/{node.site.name}: memory of its own at the end, MB", sum(last.values()), details=last)
+def processes(stage: Stage, hours: float) -> Iterator[Row]:
+    """Yield crashes, and the growth of memory and descriptors of the node's processes."""
+    crashes = "; ".join(stage.crashes) or "0"
+    yield judged("soak/ended by itself, or not when asked", crashes, "0", not stage.crashes, len(stage.crashes))
+    traces = stage.node.log.read_text(errors="replace").count("Traceback (most recent call last)")
+    yield judged("soak/tracebacks in the log", str(traces), "0", traces == 0, traces)
+    for figure, most, unit in LEAKS:
+        slopes = {}
+        for part in sorted({part for part, _ in stage.samples}):
+            change = slope([samples for (of, _), samples in stage.samples.items() if of == part], figure, WARM)
+            if change is not None:
+                slopes[part] = change
+        name = f"soak/{figure} of all processes, slope after 10 min"
+        total = sum(slopes.values()) if slopes else math.nan
+        row = bounded(name, total, unit, most) if slopes and hours >= MIN_HOURS else informs(name, total, unit)
+        yield replace(row, details=slopes)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:

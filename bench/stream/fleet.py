@@ -12,6 +12,7 @@ import contextlib
 import itertools
 import time
 from argparse import ArgumentParser, Namespace
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,11 +44,10 @@ def options(parser: ArgumentParser) -> None:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Play the periods, and yield what was measured."""
+    """Play the periods, and yield their figures."""
     robots, clouds = (60, 6) if asked.quick else (asked.robots, asked.clouds)
     config = SimulationConfig(seed=3101, size=220.0, length=80.0)
-    worlds.prepare(folder(), config)
-    world, site = folder() / worlds.world_name(config), worlds.map_of(folder(), config)
+    world, site = worlds.prepare(folder(), config), worlds.map_of(folder(), config)
     names = [f"r{k + 1}" for k in range(robots)]
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
@@ -73,6 +73,7 @@ def _play(
     """Yield the rows of all periods, each of ``period`` seconds; the first ``clouds`` robots send clouds."""
     count, title = len(names), f"fleet/{len(names)} robots"
     silent = _cores(nodes, period)
+    yield informs(f"{title}: silent, a robot and node", 1e6 * silent / count / NODES, "us/s")
     blind = RobotPlan("", 3 * period + 50.0, cloud_period=0.0, odometry_period=1.0 / ODOMETRY_RATE, points=POINTS)
     odometry = [replace(blind, robot=name) for name in names[clouds:]]
     seeing = [replace(blind, robot=name, cloud_period=1.0 / CLOUD_RATE) for name in names[:clouds]]
@@ -80,51 +81,50 @@ def _play(
     plain.begin()
     time.sleep(3.0)
     driving = _cores(nodes, period)
-    begin = full.begin()
-    time.sleep(25.0)
-    with_clouds = _cores(nodes, period)
-    memory = sum(process.memory_full_info().pss for node in nodes for _, process in node.family()) / 1e6 / len(nodes)
-    before = {name: recorder.told(name)[-1].fields["node"]["id"] for name in names[:clouds]}
-    shares = {node: list(before.values()).count(node) for node in set(before.values())}
-    victim = min(shares)
-    logs = [node.log.read_text(errors="replace") for node in nodes]
-    number = next((k for k, log in enumerate(logs) if f"this node is {victim}" in log), 0)
-    killed_at = time.monotonic()
-    _kill(nodes.pop(number))
-    time.sleep(12.0)
-    orphans = [
-        name for name in names[:clouds] if before[name] == victim and recorder.poses(name, killed_at - 1.5, killed_at)
-    ]
-    gaps = [_gap(recorder, name, killed_at) for name in orphans]
-    taken = [_taken_over(recorder, name, victim, killed_at) for name in orphans]
-    plain.stop()
-    full.stop()
-    lag = max(plain.result().longest_lag, full.result().longest_lag)
-    wrong = total = 0
-    for plan in seeing:
-        poses, drive = recorder.poses(plan.robot, begin), Drive(world, plan)
-        metres, degrees = scores.errors(poses, drive.truth)
-        wrong, total = wrong + scores.false_poses(metres, degrees), total + len(poses)
-    found = [gap for gap in gaps if gap is not None]
-    yield Row(f"{title}: those with clouds, on each node", text=" and ".join(map(str, sorted(shares.values()))))
-    yield informs(f"{title}: silent, a robot and node", 1e6 * silent / count / NODES, "us/s")
     cost = 1e3 * (driving - silent) / (count - clouds)
     yield informs(f"{title}: odometry {ODOMETRY_RATE:g} Hz, a robot", cost, "ms/s")
-    cost = 1e3 * (with_clouds - driving) / (clouds * CLOUD_RATE)
+    begin = full.begin()
+    time.sleep(25.0)
+    cost = 1e3 * (_cores(nodes, period) - driving) / (clouds * CLOUD_RATE)
     yield informs(f"{title}: a cloud of {POINTS} points", cost, "ms")
+    memory = sum(process.memory_full_info().pss for node in nodes for _, process in node.family()) / 1e6 / len(nodes)
     yield informs(f"{title}: memory of a node, PSS", memory, "MB")
-    yield informs(f"{title}: senders behind by, most", 1e3 * lag, "ms")
-    yield reached(f"{title}: robots of the killed node posed again", len(found), "", len(orphans))
-    yield bounded(f"{title}: served by another one after its death, median", _median(taken), "s", MAX_GAP)
-    yield bounded(f"{title}: served by another one after its death, latest", max(taken, default=np.inf), "s", MAX_GAP)
+
+    servers = {name: recorder.told(name)[-1].fields["node"]["id"] for name in names[:clouds]}
+    victim = Counter(servers.values()).most_common()[-1][0]
+    logs = [node.log.read_text(errors="replace") for node in nodes]
+    number = next((k for k, log in enumerate(logs) if f"this node is {victim}" in log), 0)
+    death = time.monotonic()
+    _kill(nodes.pop(number))
+    time.sleep(12.0)
+    orphans = [name for name in servers if servers[name] == victim and recorder.poses(name, death - 1.5, death)]
+    taken, gaps = [], []
+    for name in orphans:
+        told = recorder.told(name, death)
+        taken.append(min((s.arrival - death for s in told if s.fields["node"]["id"] != victim), default=np.inf))
+        arrivals = [pose.arrival for pose in recorder.poses(name, death - 1.5)]
+        if arrivals[-1] > death + 6.0:
+            gaps.append(max(b - a for a, b in itertools.pairwise(arrivals)))
+    yield reached(f"{title}: robots of the killed node posed again", len(gaps), "", len(orphans))
+    yield bounded(f"{title}: served by another one, latest", max(taken, default=np.inf), "s", MAX_GAP)
     wait = f"{title}: without poses, a cloud each {1.0 / CLOUD_RATE:g} s"
-    yield informs(f"{wait}, median", _median(found), "s")
-    yield informs(f"{wait}, longest", max(found, default=np.inf), "s")
+    yield informs(f"{wait}, median", float(np.median(gaps or [np.inf])), "s")
+    yield informs(f"{wait}, longest", max(gaps, default=np.inf), "s")
+
+    for sender in (plain, full):
+        sender.send("stop")
+    lag = max(plain.result().longest_lag, full.result().longest_lag)
+    yield informs(f"{title}: senders behind by, most", 1e3 * lag, "ms")
+    wrong = total = 0
+    for plan in seeing:
+        poses = recorder.poses(plan.robot, begin)
+        wrong += scores.false_poses(*scores.errors(poses, Drive(world, plan).truth))
+        total += len(poses)
     yield judged(f"{title}: false poses", f"{wrong} of {total}", "none", wrong == 0)
 
 
 def _cores(nodes: Sequence[Node], seconds: float) -> float:
-    """Cores that the nodes keep busy together."""
+    """Return the number of cores that the nodes keep busy together."""
 
     def spent() -> dict[int, float]:
         out = {}
@@ -140,25 +140,7 @@ def _cores(nodes: Sequence[Node], seconds: float) -> float:
 
 
 def _kill(node: Node) -> None:
-    """SIGKILL to the node and its engines: the machine is gone."""
+    """Send SIGKILL to the node and its engines: the machine is gone."""
     for _, process in node.family():
         with contextlib.suppress(psutil.Error):
             process.kill()
-
-
-def _taken_over(recorder: Recorder, name: str, victim: str, since: float) -> float:
-    """Seconds until a status of a robot came from another node; infinite if none did."""
-    others = (each.arrival for each in recorder.told(name) if each.fields["node"]["id"] != victim)
-    return min((arrival - since for arrival in others if arrival > since), default=np.inf)
-
-
-def _gap(recorder: Recorder, name: str, since: float) -> float | None:
-    """Longest time between two poses of a robot around a node's death; None if none came after it."""
-    arrivals = [pose.arrival for pose in recorder.poses(name, since - 1.5)]
-    if not arrivals or arrivals[-1] < since + 6.0:
-        return None
-    return max(b - a for a, b in itertools.pairwise(arrivals))
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if values else np.inf

@@ -12,8 +12,9 @@ import multiprocessing
 import random
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -36,7 +37,7 @@ EPOCH_NS = 1_700_000_000 * 10**9
 
 _APART = 31  # frames between the starts of neighbouring robots
 
-Kind = Literal["odometry", "cloud"]
+Kind = Literal["odom", "cloud"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class RobotPlan:
 
     def schedule(self) -> list[tuple[float, Kind]]:
         """Return the times of all messages with their kinds, in order; at equal times odometry first."""
-        periods: dict[Kind, float] = {"odometry": self.odometry_period, "cloud": self.cloud_period}
+        periods: dict[Kind, float] = {"odom": self.odometry_period, "cloud": self.cloud_period}
         counts = {kind: round(self.seconds / period) if period else 0 for kind, period in periods.items()}
         times = [(round(k * periods[kind], 6), kind) for kind, count in counts.items() for k in range(count)]
         return sorted(times, key=lambda item: item[0])
@@ -120,7 +121,6 @@ def _cloud(world: Path, index: int, points: int | None) -> Points:
 
 METRONOME = "bench/metronome"
 TICK = 0.1
-_KEYS = {"cloud": "cloud", "odometry": "odom"}
 _AHEAD = 0.5  # seconds between the order to start and the first message
 
 _SPAWN = multiprocessing.get_context("spawn")  # a fork of a process with an open session hangs
@@ -134,7 +134,7 @@ def free_port() -> int:
 
 
 def open_session(mode: str, connect: Sequence[str] = (), listen: Sequence[str] = ()) -> Any:
-    """Open zenoh without discovery, and quick to reconnect: the node is what is measured."""
+    """Open zenoh without discovery and quick to reconnect: the benchmarks measure the node."""
     import zenoh
 
     config = zenoh.Config()
@@ -149,8 +149,19 @@ def open_session(mode: str, connect: Sequence[str] = (), listen: Sequence[str] =
     return zenoh.open(config)
 
 
+def put(session: Any, robot: str, kind: Kind, message: Encoded) -> None:
+    """Send a message to a robot's input; clouds may be dropped on a slow link, odometry waits."""
+    import zenoh
+
+    control = zenoh.CongestionControl.DROP if kind == "cloud" else zenoh.CongestionControl.BLOCK
+    session.put(
+        f"coview/{robot}/in/{kind}", message.payload, encoding=message.encoding or None,
+        attachment=message.attachment, congestion_control=control,
+    )  # fmt: skip
+
+
 class Helper:
-    """A process that says when it is ready, waits for ``begin``, works, and sends back its result."""
+    """A process that reports when it is ready, waits for ``begin``, works, and sends back its result."""
 
     def __init__(self, work: Callable[..., None], *args: Any) -> None:
         self._ours, theirs = _SPAWN.Pipe()
@@ -159,30 +170,30 @@ class Helper:
         theirs.close()
         self.result(120.0)
 
+    def send(self, order: Any) -> None:
+        """Give an order; most helpers end their work at any order after the first."""
+        self._ours.send(order)
+
     def begin(self, at: float | None = None) -> float:
-        """Let it start at that monotonic time; returns it."""
+        """Order the start at a monotonic time; return it."""
         at = time.monotonic() + _AHEAD if at is None else at
-        self._ours.send(at)
+        self.send(at)
         return at
 
-    def stop(self) -> None:
-        """End the work early; it still sends its result."""
-        self._ours.send("stop")
-
     def result(self, timeout: float = 300.0) -> Any:
-        """Wait for what it says next."""
+        """Wait for the next report."""
         if not self._ours.poll(timeout):
             raise TimeoutError(f"a helper process of the benchmark said nothing for {timeout} s")
         return self._ours.recv()
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """Send SIGKILL and wait."""
         self.process.kill()
         self.process.join(10)
 
 
 def route(conn: Connection, port: int) -> None:
-    """Be a router until told to stop; tick all the while."""
+    """Be a router and tick until an order comes."""
     with open_session("router", listen=[f"tcp/127.0.0.1:{port}"]) as session:
         publisher = session.declare_publisher(METRONOME, express=True)
         conn.send("ready")
@@ -193,7 +204,7 @@ def route(conn: Connection, port: int) -> None:
 
 
 class Sent(NamedTuple):
-    """What a sender did: per robot (N, 2) stamps and times of its cloud puts; its longest delay, s."""
+    """Stamps and times of each robot's cloud puts, (N, 2); the sender's longest delay, seconds."""
 
     puts: dict[str, Floats]
     longest_lag: float
@@ -201,14 +212,11 @@ class Sent(NamedTuple):
 
 def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan]) -> None:
     """Stream the plans' robots through one session, on time; every cloud is loaded before."""
-    import zenoh
-
     drives = {plan.robot: Drive(world, plan) for plan in plans}
     todo = sorted(((due, plan) for plan in plans for due in plan.schedule()), key=lambda item: item[0][0])
     for (content, kind), plan in todo:
         if kind == "cloud":
             drives[plan.robot].cloud(content)
-    controls = {"cloud": zenoh.CongestionControl.DROP, "odometry": zenoh.CongestionControl.BLOCK}
     puts: dict[str, list[tuple[int, float]]] = {plan.robot: [] for plan in plans}
     lag = 0.0
     with open_session("client", connect=[endpoint]) as session:
@@ -219,119 +227,101 @@ def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan
                 time.sleep(wait)
             if conn.poll():
                 break
-            drive, stamp, key = drives[plan.robot], stamp_of(content), f"coview/{plan.robot}/in/"
+            drive, stamp = drives[plan.robot], stamp_of(content)
             if kind == "cloud":
                 message = encode_cloud(CloudMessage(stamp, drive.cloud(content)), plan.cloud)
                 puts[plan.robot].append((stamp, time.monotonic()))
             else:
                 message = encode_odometry(OdometryMessage(stamp, drive.T_odom_body(content)), plan.odometry)
-            session.put(
-                key + _KEYS[kind], message.payload, encoding=message.encoding, attachment=message.attachment,
-                congestion_control=controls[kind],
-            )  # fmt: skip
+            put(session, plan.robot, kind, message)
             lag = max(lag, -wait)
     conn.send(Sent({robot: np.array(rows, np.float64).reshape(-1, 2) for robot, rows in puts.items()}, lag))
 
 
 def vandalise(conn: Connection, endpoint: str, robot: str, rate: float) -> None:
-    """Send rubbish to a robot's inputs, ``rate`` messages a second, until told to stop; sends back how many."""
-    source = rubbish(7)
-    with open_session("client", connect=[endpoint]) as session:
-        conn.send("ready")
-        due, count = float(conn.recv()), 0
-        while not conn.poll(max(0.0, due - time.monotonic())):
-            message, key = next(source), f"coview/{robot}/in/{list(_KEYS.values())[count % 2]}"
-            session.put(key, message.payload, encoding=message.encoding or None, attachment=message.attachment)
-            count += 1
-            due = max(due + 1.0 / rate, time.monotonic() - 0.5)
-    conn.send(count)
-
-
-_STRANGE = ("", "text/plain", "application/x-unheard-of", "application/cdr;some_msgs/msg/Other", "a;b;c;d", "image/png")
-
-
-def rubbish(seed: int) -> Iterator[Encoded]:
-    """Endless: random bytes, up to 1 MB, and valid messages with flipped bytes or a missing end."""
-    rng = random.Random(seed)
+    """Send random bytes and damaged messages to a robot's inputs, ``rate`` a second, until an order comes."""
+    rng = random.Random(7)
     cloud, odometry = CloudMessage(EPOCH_NS, np.zeros((300, 3), np.float32)), OdometryMessage(EPOCH_NS, np.eye(4))
     valid = [encode_cloud(cloud, name) for name in CLOUD_CODECS]
     valid += [encode_odometry(odometry, name) for name in ODOMETRY_CODECS]
-    encodings = (*(message.encoding for message in valid), *_STRANGE)
-    while True:
-        whole, beside = rng.choice(valid), rng.choice((None, b"", rng.randbytes(8), rng.randbytes(33)))
-        if rng.random() < 0.5:
-            size = 1 << 20 if rng.random() < 0.04 else rng.randrange(5001)
-            yield Encoded(rng.randbytes(size), rng.choice(encodings), beside)
-        else:
-            end = rng.randrange(1, len(whole.payload)) if rng.random() < 0.5 else None
-            broken = bytearray(whole.payload[:end])
+    strange = ("", "text/plain", "application/x-unheard-of", "application/cdr;some_msgs/msg/Other", "a;b;c;d")
+    kinds: tuple[Kind, Kind] = ("odom", "cloud")
+    with open_session("client", connect=[endpoint]) as session:
+        conn.send("ready")
+        due = float(conn.recv())
+        while not conn.poll(max(0.0, due - time.monotonic())):
+            whole = rng.choice(valid)
+            payload = bytearray(whole.payload[: rng.choice((None, rng.randrange(1, len(whole.payload))))])
             for _ in range(rng.randrange(1, 9)):
-                broken[rng.randrange(len(broken))] = rng.randrange(256)
-            yield Encoded(bytes(broken), whole.encoding, rng.choice((whole.attachment, beside)))
+                payload[rng.randrange(len(payload))] = rng.randrange(256)
+            if rng.random() < 0.5:
+                payload = bytearray(rng.randbytes(1 << 20 if rng.random() < 0.04 else rng.randrange(5001)))
+            encoding = rng.choice((whole.encoding, whole.encoding, *strange))
+            attachment = rng.choice((whole.attachment, None, b"", rng.randbytes(8), rng.randbytes(33)))
+            put(session, robot, rng.choice(kinds), Encoded(bytes(payload), encoding, attachment))
+            due = max(due + 1.0 / rate, time.monotonic() - 0.5)
 
 
-@dataclass
 class Recorder:
-    """All outputs of the robots with their times of arrival; costs microseconds a message."""
+    """Arrivals of all outputs of the robots, and of further ``keys``; a message costs microseconds."""
 
-    endpoint: str
-    arrived: list[tuple[float, str, bytes, str]] = field(default_factory=list)
-    tokens: dict[str, bool] = field(default_factory=dict)
-    unreadable: int = 0
-
-    def __enter__(self) -> Recorder:
+    def __init__(self, endpoint: str, *keys: str) -> None:
         import zenoh
+
+        self.endpoint, self.unreadable = endpoint, 0
+        self.arrived: deque[tuple[float, str, bytes, str]] = deque()  # time, key, payload, encoding
+        self._tokens: dict[str, bool] = {}
 
         def record(sample: Any) -> None:
             at = time.monotonic()
             self.arrived.append((at, str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
 
         def token(sample: Any) -> None:
-            self.tokens[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
+            self._tokens[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
 
-        self.session = open_session("client", connect=[self.endpoint])
+        self.session = open_session("client", connect=[endpoint])
         direct = zenoh.handlers.Callback(record, indirect=False)
-        self._held = [self.session.declare_subscriber(key, direct) for key in ("coview/*/out/*", METRONOME)]
+        self._held = [self.session.declare_subscriber(key, direct) for key in ("coview/*/out/*", METRONOME, *keys)]
         self._held.append(self.session.liveliness().declare_subscriber("coview/*/alive", token, history=True))
+
+    def __enter__(self) -> Recorder:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.session.close()
 
     def _of(self, key: str, begin: float, end: float) -> list[tuple[float, str, bytes, str]]:
-        return [row for row in list(self.arrived) if row[1] == key and begin <= row[0] < end]
+        return [row for row in self.arrived.copy() if row[1] == key and begin <= row[0] < end]
 
     def poses(self, robot: str, begin: float = 0.0, end: float = float("inf")) -> list[Posed]:
-        """Poses of a robot that arrived within a period; unreadable ones are counted instead."""
-        found = []
+        """Return a robot's poses that arrived within a period; count the unreadable ones."""
+        poses = []
         for at, key, payload, encoding in self._of(f"coview/{robot}/out/pose", begin, end):
             try:
                 pose = decode_pose(Sample(key, payload, encoding))
-                found.append(Posed(at, pose.stamp_ns, pose.T_map_body, pose.age))
+                poses.append(Posed(at, pose.stamp_ns, pose.T_map_body, pose.age))
             except MessageError as error:
                 self.unreadable += 1
                 print(f"unreadable pose, {encoding}: {error!r}")
-        return found
+        return poses
 
     def told(self, robot: str, begin: float = 0.0, end: float = float("inf")) -> list[Told]:
-        """Statuses of a robot that arrived within a period."""
+        """Return a robot's statuses that arrived within a period."""
         statuses = self._of(f"coview/{robot}/out/status", begin, end)
         return [Told(at, json.loads(payload)) for at, _, payload, _ in statuses]
 
-    def ticks(self, begin: float = 0.0, end: float = float("inf")) -> list[float]:
-        """Arrivals of the metronome."""
+    def ticks(self, begin: float, end: float) -> list[float]:
+        """Return the metronome's arrivals."""
         return [at for at, *_ in self._of(METRONOME, begin, end)]
 
     def alive(self, robot: str) -> bool:
-        """Whether the robot's token is there."""
-        return self.tokens.get(f"coview/{robot}/alive", False)
+        """Tell whether the robot's token is there."""
+        return self._tokens.get(f"coview/{robot}/alive", False)
 
 
-def wait_until(true: Callable[[], bool], seconds: float, every: float = 0.05) -> bool:
-    """Wait for a condition; returns whether it came."""
+def wait_until(true: Callable[[], bool], seconds: float) -> bool:
+    """Wait for a condition; return whether it came."""
     deadline = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(every)
-    return True
+    while not (met := true()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return met

@@ -1,4 +1,4 @@
-"""Scores of a recorded stream of poses and statuses: pure functions of what arrived when.
+"""Scores of a recorded stream of poses and statuses: pure functions of the arrivals.
 
 Arrivals are seconds of a monotonic clock of the machine; stamps are nanoseconds of the robot's sensor clock.
 """
@@ -17,7 +17,7 @@ from coview_stream.geometry.arrays import Floats
 
 FALSE_METRES, FALSE_DEGREES = 2.0, 5.0  # a pose further from the truth than either is a false one
 MAX_MISMATCH_NS = 2_000_000
-"""A frame is recognised by its stamp; ages come as decimal seconds, so that stamps made of them are rounded."""
+"""A frame is recognised by its stamp; ages are decimal seconds, which rounds stamps made of them."""
 
 
 class Posed(NamedTuple):
@@ -52,42 +52,36 @@ def errors(poses: Sequence[Posed], truth: Callable[[int], Floats]) -> tuple[Floa
 
 
 def false_poses(metres: Floats, degrees: Floats) -> int:
-    """How many poses are too far from the truth; one that is not a number is."""
+    """Count the poses that are too far from the truth; NaN is."""
     return int(np.sum(~((metres <= FALSE_METRES) & (degrees <= FALSE_DEGREES))))
 
 
 def tracking_intervals(arrivals: Sequence[float], told: Sequence[Told]) -> Floats:
-    """Seconds between successive poses, however long, without a status in between of a robot that is not tracked."""
+    """Seconds between successive poses, without intervals in which a status tells that the robot is not tracked."""
     untracked = [status.arrival for status in told if status.state != "TRACKING"]
     pairs = itertools.pairwise(arrivals)
     return np.array([end - begin for begin, end in pairs if not any(begin < at < end for at in untracked)])
 
 
-def rate_hz(intervals: Floats) -> float | None:
-    """Poses per second over those intervals; None without any."""
-    return float(len(intervals) / intervals.sum()) if len(intervals) and intervals.sum() > 0 else None
+def rate_hz(intervals: Floats) -> float:
+    """Poses per second over those intervals; NaN without any."""
+    return float(len(intervals) / intervals.sum()) if len(intervals) else math.nan
 
 
-def jitter_ms(intervals: Floats, period: float = 0.1) -> tuple[float, ...] | None:
-    """p50 and p99 of how far the intervals are from ``period`` seconds, in milliseconds; None without any."""
-    return percentiles_ms(np.abs(intervals - period), 50, 99)
+def jitter_ms(intervals: Floats, period: float = 0.1) -> float:
+    """p99 of the distance of the intervals from ``period`` seconds, in milliseconds; NaN without any."""
+    return percentile_ms(np.abs(intervals - period), 99)
 
 
-def percentiles_ms(seconds: Floats, *percents: float) -> tuple[float, ...] | None:
-    """Percentiles in milliseconds; None without any."""
-    return tuple(np.percentile(seconds * 1e3, percents).tolist()) if len(seconds) else None
-
-
-def steps_back(stamps_ns: Sequence[int]) -> int:
-    """How often a stamp is older than the one before."""
-    return sum(b < a for a, b in itertools.pairwise(stamps_ns))
+def percentile_ms(seconds: Floats, percent: float) -> float:
+    """Percentile in milliseconds; NaN without any."""
+    return float(np.percentile(seconds * 1e3, percent)) if len(seconds) else math.nan
 
 
 def share_posed(arrivals: Sequence[float], begin: float, end: float, bin_s: float = 0.2) -> float:
     """Share of the ``bin_s`` long pieces of ``begin`` to ``end`` that hold a pose."""
     count = max(1, int((end - begin) / bin_s))
-    held = {int((at - begin) / bin_s) for at in arrivals if begin <= at < begin + count * bin_s}
-    return len(held) / count
+    return len({int((at - begin) / bin_s) for at in arrivals if begin <= at < begin + count * bin_s}) / count
 
 
 def jain(shares: Sequence[float]) -> float:
@@ -96,16 +90,8 @@ def jain(shares: Sequence[float]) -> float:
     return sum(shares) ** 2 / (len(shares) * squares) if squares else 0.0
 
 
-def put_time(puts: Floats, stamp_ns: float) -> float | None:
-    """When the frame with that stamp was put; ``puts`` (N, 2) are stamps and times; None if unknown."""
-    if not len(puts):
-        return None
-    stamp, put = puts[np.abs(puts[:, 0] - stamp_ns).argmin()]
-    return float(put) if abs(stamp - stamp_ns) <= MAX_MISMATCH_NS else None
-
-
 def reaction(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
-    """Seconds from the put of a frame until something first told of it; ``seen`` are (arrival, stamp) in order."""
+    """Seconds from the put of a frame to the first message about it; ``seen`` are (arrival, stamp) in order."""
     newest, first = -math.inf, []
     for arrival, stamp_ns in seen:
         if stamp_ns > newest + MAX_MISMATCH_NS:
@@ -115,9 +101,16 @@ def reaction(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
 
 
 def staleness(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
-    """Seconds since the put of the newest frame that each arrival tells of: its maximum is the worst starvation."""
-    known = ((arrival, put_time(puts, stamp_ns)) for arrival, stamp_ns in seen)
-    return np.array([arrival - put for arrival, put in known if put is not None])
+    """Seconds from the put of a frame to each message about it; unknown frames do not count.
+
+    ``puts`` (N, 2) are stamps and times. The maximum is the worst starvation.
+    """
+    if not len(puts) or not len(seen):
+        return np.zeros(0)
+    arrivals, stamps = np.array(seen, dtype=np.float64).T
+    apart = np.abs(puts[:, 0] - stamps[:, None])
+    known = apart.min(axis=1) <= MAX_MISMATCH_NS
+    return np.asarray((arrivals - puts[apart.argmin(axis=1), 1])[known])
 
 
 def corrected(poses: Sequence[Posed]) -> list[tuple[float, float]]:

@@ -1,17 +1,19 @@
-"""A stage for each scenario: router, node and recorder; the measures of a stream, and the rows of a scenario."""
+"""A stage for each scenario: router, node and recorder; the measures of a stream, and their rows."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from bench.accuracy.scores import rms
 from bench.harness.node import Node
-from bench.harness.rows import Row, judged
+from bench.harness.rows import Row, bounded, informs, judged, reached
 from bench.stream import scores
 from bench.stream.processes import Drive, Helper, Recorder, RobotPlan, Sent, free_port, route, send, wait_until
 
@@ -23,57 +25,8 @@ MAX_LAG = 0.3
 """Seconds; where a sender was later than that, the machine was too busy for any of the figures to mean anything."""
 
 
-@dataclass
-class Findings:
-    """Rows of a scenario, and all its numbers."""
-
-    name: str
-    rows: list[Row] = field(default_factory=list)
-    numbers: dict[str, Any] = field(default_factory=dict)
-
-    def judge(self, what: str, measured: Any, target: str = "", met: bool | None = None) -> None:
-        """Add a row; without a target it informs."""
-        value = float(measured) if isinstance(measured, (int, float)) else float("nan")
-        self.rows.append(judged(f"stream/{self.name}/{what}", shown(measured)[:110], target, met, value))
-
-    def most(self, what: str, value: float | None, limit: float) -> None:
-        """Add a row of a number that must be there and may be ``limit`` at most."""
-        self.judge(what, value, f"<= {limit:g}", value is not None and value <= limit)
-
-    def none(self, what: str, count: int, of: int | None = None) -> None:
-        """Add a row of a count, perhaps of so many, that must be zero."""
-        self.judge(what, count if of is None else f"{count} of {of}", "0", count == 0)
-
-    def stream(self, numbers: dict[str, Any], label: str = "") -> None:
-        """Judge a stream that ought to have been served well from its first fix on."""
-        rate, jitter, fix, share = (numbers[key] for key in ("rate_hz", "jitter_ms", "first_fix_m", "share_posed"))
-        found = fix is not None and fix <= MAX_FIRST_FIX
-        self.judge(f"{label}first fix, s / m", (numbers["first_fix_s"], fix), f"<= {MAX_FIRST_FIX:.0f} m", found)
-        self.none(f"{label}false or unreadable poses", numbers["false"] + numbers["unreadable"], numbers["poses"])
-        self.judge(f"{label}RMSE, m / deg", numbers["rmse_m_deg"])
-        steady = rate is not None and abs(rate - RATE) <= RATE_SHARE * RATE
-        self.judge(f"{label}rate while TRACKING, Hz", rate, f"{RATE:.0f} +- {RATE_SHARE:.0%}", steady)
-        still = jitter is not None and jitter[1] < MAX_JITTER
-        self.judge(f"{label}jitter p50 / p99, ms", jitter, f"p99 < {MAX_JITTER:.0f}", still)
-        self.judge(f"{label}... of the machine itself, ms", numbers["machine_jitter_ms"])
-        self.none(f"{label}stamps that go back", numbers["steps_back"])
-        self.judge(f"{label}time posed after the first fix", share, f">= {MIN_POSED}", share >= MIN_POSED)
-        self.judge(f"{label}cloud to pose p50/p95/p99, ms", numbers["cloud_to_pose_ms"])
-
-
-def shown(value: Any) -> str:
-    """Write numbers briefly, nothing as a dash."""
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    if isinstance(value, (tuple, list)):
-        return " / ".join(shown(part) for part in value)
-    return str(value)
-
-
 class Setting(NamedTuple):
-    """What all scenarios share: the world, another one, the first one's map, and how long."""
+    """Common to all scenarios: the world, another one, the first one's map, and whether times are short."""
 
     world: Path
     stranger: Path
@@ -84,23 +37,24 @@ class Setting(NamedTuple):
 class Stage:
     """Router, recorder and a node started through the command line, ready; the node is watched from outside."""
 
-    def __init__(self, setting: Setting, found: Findings, robots: Sequence[str], *arguments: str) -> None:
-        self.setting, self.found, self.robots = setting, found, tuple(robots)
-        self._arguments = arguments
-        self._helpers: list[Helper] = []
-
-    def __enter__(self) -> Stage:
+    def __init__(self, setting: Setting, log: str, robots: Sequence[str], *arguments: str) -> None:
+        self.setting, self.robots = setting, robots
         port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{port}"
-        self.helper(route, port)
-        self.recorder = Recorder(self.endpoint).__enter__()
-        words = ("--no-state", "--robot", *self.robots, "--connect", self.endpoint, *self._arguments)
-        self.node = Node(self.setting.site, self.setting.world / f"{self.found.name}.log", *words)
-        wait_until(lambda: all(map(self.recorder.alive, self.robots)) or not self.running(), _READY)
-        if not self.running() or not all(map(self.recorder.alive, self.robots)):
-            tail = "\n".join(self.node.log.read_text(errors="replace").splitlines()[-15:])
+        self._helpers = [Helper(route, port)]
+        self.recorder = Recorder(self.endpoint)
+        words = ("--no-state", "--robot", *robots, "--connect", self.endpoint, *arguments)
+        self.node = Node(setting.site, setting.world / log, *words)
+
+    def __enter__(self) -> Stage:
+        def ready() -> bool:
+            return all(map(self.recorder.alive, self.robots))
+
+        wait_until(lambda: ready() or not self.running(), _READY)
+        if not ready():
             self.__exit__()
-            raise RuntimeError(f"the node did not announce {self.robots} in {_READY} s:\n{tail}")
+            log = self.node.log.read_text(errors="replace")
+            raise RuntimeError(f"the node did not announce {self.robots} in {_READY} s: {log[-1000:]}")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -109,18 +63,14 @@ class Stage:
                 helper.kill()
         if self.node.end()[0] == math.inf:
             print("the node did not end after SIGTERM; killed")
-        self.recorder.__exit__()
+        self.recorder.session.close()
 
     def running(self) -> bool:
-        """Whether the node's main process lives."""
+        """Tell whether the node's main process lives."""
         return self.node.process.poll() is None
 
-    def seconds(self, full: float, quick: float) -> float:
-        """How long something lasts."""
-        return quick if self.setting.quick else full
-
     def helper(self, work: Any, *args: Any) -> Helper:
-        """Start a process that ends with the stage, and wait until it has loaded what it needs."""
+        """Start a process that ends with the stage, and wait until it is ready."""
         self._helpers.append(Helper(work, *args))
         return self._helpers[-1]
 
@@ -128,34 +78,52 @@ class Stage:
         """Return a sender that waits for its beginning."""
         return self.helper(send, self.endpoint, world or self.setting.world, plans)
 
-    def sent(self, sender: Helper, label: str = "") -> Sent:
-        """Wait for a sender's end, and judge whether the measurement itself can be trusted."""
-        sent: Sent = sender.result()
-        self.found.most(f"{label}sender late by, s (else: measure again)", sent.longest_lag, MAX_LAG)
-        return sent
-
     def measure(self, plan: RobotPlan, sent: Sent, start: float) -> dict[str, Any]:
-        """All numbers of a robot's stream that began at ``start``; seconds, metres, degrees unless named otherwise."""
+        """Return all numbers of a robot's stream that began at ``start``; NaN without poses."""
         recorder, drive, end = self.recorder, Drive(self.setting.world, plan), start + plan.seconds
         time.sleep(max(0.0, end + 0.5 - time.monotonic()))
         poses, told = recorder.poses(plan.robot, start, end), recorder.told(plan.robot, start, end)
         arrivals = [pose.arrival for pose in poses]
         metres, degrees = scores.errors(poses, drive.truth)
         intervals = scores.tracking_intervals(arrivals, told)
-        ticks = scores.tracking_intervals(recorder.ticks(start, end), [])
+        ticks = np.diff(recorder.ticks(start, end))
         puts = sent.puts[plan.robot]
         return {
             "poses": len(poses),
-            "unreadable": recorder.unreadable,
-            "false": scores.false_poses(metres, degrees),
-            "first_fix_s": arrivals[0] - start if poses else None,
-            "first_fix_m": drive.metres(poses[0].stamp_ns) if poses else None,
-            "rmse_m_deg": [rms(metres), rms(degrees)] if poses else None,
+            "wrong": scores.false_poses(metres, degrees) + recorder.unreadable,
+            "first_fix_m": drive.metres(poses[0].stamp_ns) if poses else math.nan,
+            "rmse_m": rms(metres) if poses else math.nan,
             "rate_hz": scores.rate_hz(intervals),
             "jitter_ms": scores.jitter_ms(intervals),
             "machine_jitter_ms": scores.jitter_ms(ticks),
-            "steps_back": scores.steps_back([pose.stamp_ns for pose in poses]),
             "share_posed": scores.share_posed(arrivals, arrivals[0], end) if poses else 0.0,
-            "cloud_to_pose_ms": scores.percentiles_ms(scores.reaction(puts, scores.corrected(poses)), 50, 95, 99),
+            "cloud_to_pose_ms": scores.percentile_ms(scores.reaction(puts, scores.corrected(poses)), 95),
             "clouds_sent": len(puts),
+            "late_s": sent.longest_lag,
         }
+
+
+def rated(name: str, rates: Sequence[float]) -> Row:
+    """Judge rates of poses, which must all be constant."""
+    text = " to ".join(f"{rate:.2f}" for rate in sorted({min(rates), max(rates)}))
+    constant = all(abs(rate - RATE) <= RATE_SHARE * RATE for rate in rates)
+    return judged(f"{name}, Hz", text, f"{RATE:.0f} +- {RATE_SHARE:.0%}", constant, min(rates))
+
+
+def punctual(label: str, late: float) -> Row:
+    """Judge whether the senders were on time, else the measurement cannot be trusted."""
+    return bounded(f"{label}sender late by (else: measure again)", late, "s", MAX_LAG)
+
+
+def served(numbers: dict[str, Any], label: str = "") -> Iterator[Row]:
+    """Judge a stream that ought to have been served well from its first fix on."""
+    yield replace(punctual(label, numbers["late_s"]), details=numbers)
+    yield bounded(f"{label}first fix", numbers["first_fix_m"], "m", MAX_FIRST_FIX)
+    wrong = numbers["wrong"]
+    yield judged(f"{label}false or unreadable poses", f"{wrong} of {numbers['poses']}", "0", wrong == 0)
+    yield informs(f"{label}RMSE", numbers["rmse_m"], "m")
+    yield rated(f"{label}rate while TRACKING", [numbers["rate_hz"]])
+    yield bounded(f"{label}jitter p99", numbers["jitter_ms"], "ms", MAX_JITTER)
+    yield informs(f"{label}... of the machine itself", numbers["machine_jitter_ms"], "ms")
+    yield reached(f"{label}share of time posed after the first fix", numbers["share_posed"], "", MIN_POSED)
+    yield informs(f"{label}cloud to pose p95", numbers["cloud_to_pose_ms"], "ms")

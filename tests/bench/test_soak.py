@@ -1,4 +1,4 @@
-"""Scores of the soak: false poses, recoveries, stamps of odd clocks, slopes of memory; and a short one."""
+"""Scores of the soak: false poses, recoveries, slopes of memory; and a short one."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from nightly import nightly
 
 from bench.harness.files import ROOT, environment
 from bench.harness.rows import Row
-from bench.soak.robots import Manner, Robot, Site, content_of, stamp
+from bench.soak.robots import Robot
 from bench.soak.soak import chosen
 from bench.soak.stage import ENDS_PROCESSES, FAULTS, Sampled, slope
+from bench.stream.processes import stamp_of
 from coview_stream.clouds import write_tum
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
@@ -31,19 +32,17 @@ def robot(tmp_path: Path) -> Robot:
     truth = np.tile(np.eye(4), (400, 1, 1))
     truth[:, 0, 3] = 0.5 * np.arange(400)
     write_tum(tmp_path / "truth.tum", 1000.0 + 0.1 * np.arange(400), truth)
-    return Robot("r1", Site("town", tmp_path, tmp_path / "site.coview", deceptive=False), start=START)
+    return Robot("r1", tmp_path, elsewhere=False, start=START)
 
 
-def say(
-    robot: Robot, content: float, x: float = 0.0, degrees: float = 0.0, age: float = 0.0, manner: Manner | None = None
-) -> None:
+def say(robot: Robot, moment: float, x: float = 0.0, degrees: float = 0.0, age: float = 0.0) -> None:
     """Have a pose arrive 0.1 s after its moment, off by metres and degrees."""
     off, a = np.eye(4), math.radians(degrees)
     off[:2, :2], off[0, 3] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]], x
-    T = robot.drive.truth(stamp(content, Manner())) @ off
-    message = PoseMessage(stamp(content, manner or Manner()), "r1", "TRACKING", T, np.eye(6), 1.0, "0" * 64, age)
+    T = robot.drive.truth(stamp_of(moment)) @ off
+    message = PoseMessage(stamp_of(moment), "r1", "TRACKING", T, np.eye(6), 1.0, "0" * 64, age)
     sent = encode_pose(message, "json")
-    robot.take_pose(START + content + 0.1, Sample("coview/r1/out/pose", sent.payload, sent.encoding))
+    robot.take(START + moment + 0.1, Sample("coview/r1/out/pose", sent.payload, sent.encoding))
 
 
 @pytest.mark.parametrize(("x", "degrees", "false"), [(2.9, 4.9, 0), (3.1, 0.0, 1), (0.0, 5.1, 1)])
@@ -54,17 +53,12 @@ def test_a_pose_is_false_beyond_three_metres_or_five_degrees(
     assert len(robot.false) + robot.unreadable == false
 
 
-def test_a_pose_is_judged_by_its_stamp_whatever_the_sensor_clock(robot: Robot) -> None:
-    late = Manner(offset=3600.0)
-    say(robot, 10.0, manner=late)
-    assert len(robot.false) == 1  # of a clock that the robot never had
-    robot.manners.append(late)
-    say(robot, 10.2, manner=late)
-    say(robot, 10.4)
-    assert (len(robot.false), robot.poses) == (1, 3)
-    robot.take_pose(START, Sample("coview/r1/out/pose", b"\xff", "application/json"))
-    robot.take_status(b"[]")
-    assert robot.unreadable == 2
+def test_every_pose_elsewhere_is_false_and_rubbish_is_unreadable(robot: Robot) -> None:
+    robot.elsewhere = True
+    say(robot, 10.0)
+    robot.take(START, Sample("coview/r1/out/pose", b"\xff", "application/json"))
+    robot.take(START, Sample("coview/r1/out/status", b"[]"))
+    assert (len(robot.false), robot.poses, robot.unreadable) == (1, 1, 2)
 
 
 def test_only_a_frame_taken_afterwards_is_a_recovery(robot: Robot) -> None:
@@ -73,13 +67,6 @@ def test_only_a_frame_taken_afterwards_is_a_recovery(robot: Robot) -> None:
     assert robot.recovered is None
     say(robot, 11.2, age=0.2)
     assert robot.recovered == pytest.approx(START + 11.3)
-
-
-@pytest.mark.parametrize("manner", [Manner(), Manner(offset=3600.0), Manner(offset=-600.0), Manner(unit_ns=1_000_000)])
-def test_a_stamp_gives_the_moment_of_the_drive_whatever_the_clock_did(manner: Manner) -> None:
-    known = [Manner(), Manner(offset=3600.0), Manner(offset=-600.0), Manner(unit_ns=1_000_000)]
-    for content in (0.1, 250.25, 3599.9):
-        assert content_of(stamp(content, manner), known, near=content + 2.0) == pytest.approx(content, abs=1e-3)
 
 
 def test_every_fault_comes_once_before_any_comes_again_and_processes_grow_old_every_other_round() -> None:

@@ -42,19 +42,16 @@ def test_intervals_count_unless_the_robot_was_known_to_be_untracked():
     np.testing.assert_allclose(known, [0.1, 0.1, 0.1, 1.5])
     assert stream_scores.rate_hz(known[:3]) == pytest.approx(10.0)
     assert stream_scores.rate_hz(np.array([0.2, 0.3])) == pytest.approx(4.0)
-    assert stream_scores.rate_hz(np.array([])) is None
+    assert np.isnan(stream_scores.rate_hz(np.array([])))
 
 
 def test_jitter_is_the_distance_from_the_period_either_way():
     intervals = np.array([0.1] * 98 + [0.06, 0.14])
-    p50, p99 = stream_scores.jitter_ms(intervals)
-    assert p50 == pytest.approx(0.0, abs=1e-9)
-    assert p99 == pytest.approx(40.0)
-    assert stream_scores.jitter_ms(np.array([])) is None
+    assert stream_scores.jitter_ms(intervals) == pytest.approx(40.0)
+    assert np.isnan(stream_scores.jitter_ms(np.array([])))
 
 
-def test_steps_back_and_share_posed():
-    assert stream_scores.steps_back([1, 2, 2, 5, 4, 6, 1]) == 2
+def test_share_posed():
     assert stream_scores.share_posed([0.05, 0.1, 0.65], 0.0, 1.0) == pytest.approx(0.4)
     assert stream_scores.share_posed([5.0], 0.0, 1.0) == 0.0
 
@@ -72,7 +69,6 @@ def test_reactions_and_staleness_are_counted_from_the_put_of_the_frame():
     np.testing.assert_allclose(stream_scores.reaction(puts, seen), [0.05, 0.4])
     np.testing.assert_allclose(stream_scores.staleness(puts, seen), [0.05, 0.15, 0.4])
     assert stream_scores.staleness(np.zeros((0, 2)), seen).size == 0
-    assert stream_scores.put_time(puts[:1], puts[0, 0]) == 50.0
 
 
 def test_statuses_and_ages_name_frames():
