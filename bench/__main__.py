@@ -1,8 +1,7 @@
 """Measure one thing: ``python -m bench NAME [options]``; without a name, the list. ``results`` writes docs/results.md.
 
-Prints a row per figure: ours, the best formulation without us beside it, how many times better ours is, and whether
-the target holds; then the benchmark's own tables. Exit code 1 if a target does not hold, 2 if nothing could be
-measured. Run it on an otherwise idle machine.
+Prints a row per figure: ours, the baseline's, their ratio, and whether the target holds; then the benchmark's own
+tables. Exit code 1 if a target does not hold, 2 if nothing could be measured. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -11,13 +10,11 @@ import argparse
 import contextlib
 import importlib
 import json
-import math
 import os
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -31,15 +28,11 @@ from coview_stream.errors import CoViewError
 
 
 class Benchmark(NamedTuple):
-    """One name: the module of its ``rows`` below ``bench``, one line about it, and its thread counts.
-
-    For each thread count it runs in a process of its own; None leaves the count to the machine. Without any it runs in
-    this process.
-    """
+    """The module of a benchmark's ``rows`` below ``bench``, one line about it, and its thread counts."""
 
     module: str
     about: str
-    threads: tuple[int | None, ...] = ()
+    threads: tuple[int | None, ...] = ()  # a process for each, None: as the machine has; without any, this process
 
     def load(self) -> Any:
         """Import its module."""
@@ -85,11 +78,11 @@ def counted(threads: int) -> str:
     return "1 thread" if threads == 1 else f"{threads} threads"
 
 
-def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = math.inf) -> Iterator[Row]:
+def run(name: str, words: Sequence[str], threads: int | None) -> Iterator[Row]:
     """Yield the rows of ``python -m bench NAME WORDS`` as they come.
 
-    A benchmark that ends in an exception, is killed, runs past its limit or yields nothing adds a row that does not
-    hold; its own output is shown on stderr only then. Raises CoViewError as it did.
+    A benchmark that ends in an exception, is killed or yields nothing adds a row that does not hold; its own output is
+    shown on stderr only then. Raises CoViewError as it did.
     """
     conditions = (threads and counted(threads), "--quick" in words and "quick")
     label = "".join(f", {text}" for text in conditions if text)
@@ -101,43 +94,26 @@ def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = m
             stderr=subprocess.STDOUT, start_new_session=True,  # its own children end with it
         )  # fmt: skip
         os.close(write)
-        late, count = threading.Event(), 0
-
-        def end_late() -> None:
-            late.set()
-            _end(process)
-
-        watch = threading.Timer(min(limit_s, threading.TIMEOUT_MAX), end_late)
-        watch.daemon = True
-        watch.start()
+        why = "yielded no row"
         try:
-            for line in pipe:
-                if line.endswith("\n"):  # not cut off
-                    count += 1
-                    row = Row.from_dict(json.loads(line))
+            for text in pipe:
+                if text.endswith("\n"):  # not cut off
+                    row, why = Row.from_dict(json.loads(text)), ""
                     yield replace(row, name=f"{row.name}{label}")
             code = process.wait()
         finally:
-            watch.cancel()
-            _end(process)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         output.seek(0)
         tail = output.read().splitlines()[-12:]
         if code == 2 and tail:
             raise CoViewError(tail[-1].removeprefix(f"bench {name}: "))
-        if code < 0:
-            why = f"ran past its {limit_s:g} s" if late.is_set() else f"ended by signal {signal.Signals(-code).name}"
-        else:
-            why = f"ended with exit code {code}" if code else "" if count else "yielded no row"
+        if code:
+            why = f"ended by signal {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         if why:
             print("\n".join(tail), file=sys.stderr)
             yield failed(f"{name}{label}", why)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process with its children."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 BUSY = 0.7  # load average above which another process computes
@@ -216,8 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for part, text in tables_of(name, rows, asked).items():
             print(f"\n{f'{name} {part}'.strip()}\n\n{text}")
         if asked.json:
-            with atomic_path(asked.json) as part:
-                part.write_text(json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False) + "\n")
+            with atomic_path(asked.json) as file:
+                file.write_text(json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False) + "\n")
     except KeyboardInterrupt:
         print(f"\nbench {name}: interrupted, nothing written", file=sys.stderr)
         return 130

@@ -17,7 +17,7 @@ from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.__main__ import BUSY, parser_of, tables_of
+from bench.__main__ import BENCHMARKS, BUSY, parser_of, tables_of
 from bench.harness.files import ROOT, commit, environment
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
@@ -27,25 +27,15 @@ from coview_stream.errors import InputError
 PAGE = ROOT / "docs" / "results.md"
 
 COMMANDS = {
-    **{name: name for name in ("kernels", "match", "frame", "map_build", "registration", "engine")},
-    "search": "search",
-    "scale": "scale",
+    **{name: name for name in BENCHMARKS if name not in ("odometry", "ground")},
     "city": "city --side 2 4",
-    "start": "start",
-    "peers": "peers",
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
-    "conditions": "conditions",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20",
-    "ablation": "ablation",
-    "tracking": "tracking",
-    "protection": "protection",
-    "integrity": "integrity",
-    **{name: name for name in ("forest", "forest_runs", "forest_scale", "changes", "joint", "stream", "fleet")},
     "fuzz": "fuzz --seconds 60",
     "soak": "soak --minutes 600",
 }
-"""Name of each table, and the command that prints it."""
+"""Name of each table, and the command that prints it; ``odometry`` and ``ground`` need files of the user."""
 
 HEAD = """# Results
 
@@ -69,10 +59,9 @@ def block(name: str, command: str, text: str, date: str, version: str, machine: 
 
 def replaced(page: str, name: str, part: str) -> str:
     """Put a part into its place in the page, or at its end."""
-    place = re.compile(rf"\n<!-- results: {re.escape(name)} -->\n.*?<!-- end -->\n", re.DOTALL)
-    if place.search(page):
-        return place.sub(lambda _: part, page)
-    return f"{page.rstrip()}\n{part}"
+    place = rf"(?s)\n<!-- results: {re.escape(name)} -->\n.*?<!-- end -->\n"
+    new, count = re.subn(place, lambda _: part, page)
+    return new if count else f"{page.rstrip()}\n{part}"
 
 
 def measured(command: str) -> str:
@@ -93,12 +82,9 @@ def measured(command: str) -> str:
     parts = [f"{title}\n\n{text}".strip() for title, text in own.items()]
     shown = [row for row in rows if row.target] if own else rows
     if shown:
-        parts.append(table(COLUMNS, [[_short(row.name, name), *row.cells()[1:]] for row in shown]))
+        cells = [[row.name.removeprefix(name).lstrip("/,: "), *row.cells()[1:]] for row in shown]
+        parts.append(table(COLUMNS, cells))
     return re.sub(r"(?m)^\|.*$", lambda line: re.sub(r" *\| *", "|", line[0]), "\n\n".join(parts))
-
-
-def _short(row: str, name: str) -> str:
-    return row.removeprefix(name).lstrip("/,: ")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -4,13 +4,12 @@ Sites surveyed from the air, ten years later, after one drive of 60 m. Truth is 
 surfaces of the world then and now. A point of the run is truly new if it lies on a surface now (within 0.4 m: crowns
 are deep) and half a metre from all of then, a point of the map truly gone if half a metre from all of now. A tag within
 0.3 m of a surface of the other time is wrong, and so is a new point that lies on no surface. Recall of new is of all
-points that the run added, so what stands below roofs and crowns counts against it; recall of gone is of all points of
-the map within 25 m of the way, seen or not.
+points that the run added, below roofs and crowns as well; recall of gone is of all points of the map within 25 m of the
+way, visible or not.
 """
 
 from __future__ import annotations
 
-import itertools
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,13 +38,13 @@ _TAGS = ("new", "gone")
 
 
 def options(parser: ArgumentParser) -> None:
-    """Worlds can be chosen."""
+    """Add worlds."""
     parser.add_argument("worlds", nargs="*", metavar="SCENE", help="scenes to look at (all)")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row for each world: precision and recall."""
-    chosen = [each for each in _WORLDS if not asked.worlds or each[0] in asked.worlds][: 1 if asked.quick else None]
+    chosen = [world for world in _WORLDS if not asked.worlds or world[0] in asked.worlds][: 1 if asked.quick else None]
     for scene, sensor, seed in chosen:
         config = SimulationConfig(scene, sensor, seed, size=160.0, length=60.0, changed=0.4, dirt=parse_dirt(_DIRT, 0))
         figures = measure(config, folder() / f"changes-{scene}-{sensor}-{seed}")
@@ -59,10 +58,10 @@ def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
     for figures in (row.details for row in rows):
         tags = [(f"{n:,}", f"{precision:.0%}", f"{recall:.0%}") for n, precision, recall in (figures[t] for t in _TAGS)]
         count, standing, lost = figures["moving"]
-        lines.append([figures["world"], *itertools.chain(*tags), f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
-    heads = [(tag, "precision", "recall") for tag in _TAGS]
+        lines.append([figures["world"], *tags[0], *tags[1], f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
+    share = ("precision", "recall")
     moving = ("left out as moving", "of these standing", "of all that stands")
-    return {"": table(("world", *itertools.chain(*heads), *moving), lines)}
+    return {"": table(("world", "new", *share, "gone", *share, *moving), lines)}
 
 
 def measure(config: SimulationConfig, place: Path) -> dict[str, Any]:
@@ -78,10 +77,15 @@ def measure(config: SimulationConfig, place: Path) -> dict[str, Any]:
     fused = fuse(base_map, [run], FuseConfig(changes=True))
     scene = scene_of(config)
     origin = base_map.origin - np.array(config.origin)
+    standing = distance(scene.now, whole.points + origin) < _ON
+    out = ~_within(fused.points, whole.points, 1e-4)
+    points = np.asarray(fused.base_map.points) + origin
+    tagged, to_now = fused.base_change == GONE, distance(scene.now, points)
+    near = _within(run.poses[:, :3, 3] - config.origin, points, REACH)
     return {
         "new": _new(fused, scene.mapped, scene.now, origin),
-        "gone": _gone(fused, scene.now, origin, run.poses[:, :3, 3] - config.origin),
-        "moving": _moving(whole, fused, scene.now, origin),
+        "gone": (int(tagged.sum()), _share(to_now > _OFF, tagged), _share(tagged, near & (to_now > _APART))),
+        "moving": (int(out.sum()), _share(standing, out), _share(out, standing)),
     }
 
 
@@ -92,22 +96,10 @@ def _new(fused: Fused, then: SceneState, now: SceneState, origin: Floats) -> tup
     return int(tagged.sum()), _share((to_then > _OFF) & (to_now < _ON), tagged), _share(tagged, truly)
 
 
-def _gone(fused: Fused, now: SceneState, origin: Floats, way: Floats) -> tuple[int, float, float]:
+def _within(others: Floats | Floats32, points: Floats | Floats32, reach: float) -> Bools:
     from scipy.spatial import cKDTree
 
-    points = np.asarray(fused.base_map.points) + origin
-    tagged, to_now = fused.base_change == GONE, distance(now, points)
-    near = np.isfinite(cKDTree(way).query(points, distance_upper_bound=REACH)[0])
-    return int(tagged.sum()), _share(to_now > _OFF, tagged), _share(tagged, near & (to_now > _APART))
-
-
-def _moving(whole: Fused, fused: Fused, now: SceneState, origin: Floats) -> tuple[int, float, float]:
-    """Return what was left out, the share of it that stands, and the share of all that stands which that is."""
-    from scipy.spatial import cKDTree
-
-    out = ~np.isfinite(cKDTree(fused.points).query(whole.points, distance_upper_bound=1e-4)[0])
-    standing = distance(now, whole.points + origin) < _ON
-    return int(out.sum()), _share(standing, out), _share(out, standing)
+    return np.asarray(np.isfinite(cKDTree(others).query(points, distance_upper_bound=reach)[0]))
 
 
 def distance(state: SceneState, points: Floats) -> Floats32:

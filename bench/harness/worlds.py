@@ -1,8 +1,7 @@
-"""Simulated worlds for the benchmarks, made once and kept, and places along a run.
+"""Simulated worlds for the benchmarks, made once, and places along a run.
 
-A place is what a robot that was just switched on there sees, at the end of a drive of eight metres. The localizer gets
-the five keyframes of that drive one after the other, other libraries the same points at once, as one gravity-aligned
-submap about the robot.
+A place is the end of a drive of eight metres by a robot that was just switched on. The localizer gets the five
+keyframes of that drive one after the other, other libraries the same points at once, as one gravity-aligned submap.
 """
 
 from __future__ import annotations
@@ -36,15 +35,9 @@ LIDARS = ("vlp16", "os64", "mid360")
 UTM = (512_000.0, 5_403_000.0, 120.0)
 
 SIMULATOR = ("coview_stream/sim",)
-MAPPER = (
-    *SIMULATOR,
-    "coview_stream/basemap",
-    "coview_stream/clouds",
-    "coview_stream/descriptors",
-    "coview_stream/localization/search",
-    "coview_kernels",
-)
-"""What makes worlds, and what makes their maps."""
+MAPPER = (*(f"coview_stream/{part}" for part in ("sim", "basemap", "clouds", "descriptors", "localization/search")),
+          "coview_kernels")  # fmt: skip
+"""Code that makes worlds, and code that makes their maps."""
 
 
 def world_name(config: SimulationConfig) -> str:
