@@ -30,18 +30,15 @@ class Track:
     @classmethod
     def of(cls, fixes: Sequence[Fix | None], stamps: Floats) -> Track:
         """Collect fixes at the ``stamps``; a refused frame has None."""
-        poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
-        levels = np.full((len(fixes), 2), np.nan)
-        states = ["SKIPPED" if fix is None else fix.state.reported for fix in fixes]
+        poses, covariances, levels = (np.full((len(fixes), *shape), np.nan) for shape in ((4, 4), (6, 6), (2,)))
         for k, fix in enumerate(fixes):
-            if fix is None:
-                continue
-            if fix.T_map_body is not None:
+            if fix is not None and fix.T_map_body is not None:
                 poses[k] = fix.T_map_body
-            if fix.covariance is not None:
+            if fix is not None and fix.covariance is not None:
                 covariances[k] = fix.covariance
-            if fix.protection is not None:
+            if fix is not None and fix.protection is not None:
                 levels[k] = fix.protection.metres, fix.protection.degrees
+        states = ["SKIPPED" if fix is None else fix.state.reported for fix in fixes]
         return cls(stamps, states, poses, covariances, levels)
 
     @property
@@ -96,18 +93,13 @@ def losses(states: Sequence[str]) -> int:
     return sum(state == "LOST" != before for before, state in itertools.pairwise(states))
 
 
-def score(track: Track, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
+def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) -> dict[str, Any]:
     """All figures of one drive but coverage; metres, degrees, seconds; None where there is no pose.
 
-    Args:
-        track: answers of the localizer.
-        truth: (N, 4, 4) map <- body.
-        driven: (N,) metres.
-        events: name, first frame, and first frame after it.
+    Of the true poses (N, 4, 4) map <- body, (N,) metres ``driven``, and the first frame after each event.
     """
     error, known = errors(track, truth), track.tracking
     false = known & ~error.right
-    back = [recovery(error.right, driven, end) for _, _, end in events]
     return {
         "driven_m": float(driven[-1]),
         "right_percent": 100 * float(error.right.mean()),
@@ -119,7 +111,7 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[tuple[st
         "false_frames": int(false.sum()),
         "false_s": float(held(track.stamps)[false].sum()),
         "losses": losses(track.states),
-        "recoveries_m": back,
+        "recoveries_m": [recovery(error.right, driven, end) for end in events],
     }
 
 

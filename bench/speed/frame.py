@@ -1,24 +1,23 @@
 """Intake of a 64k-point frame and the descriptor of a keyframe, beside NumPy, with one thread on every side.
 
 Intake: transform, range filter (0.5 to 80 m) and one point per 0.3 m voxel, of 64 rings of 1024 beams in a street with
-2 cm of noise; beside the plain reference, and the fastest NumPy that we could write (voxel and index in one int64, one
-sort).
+2 cm of noise; beside the fastest NumPy that we could write (voxel and index in one int64, one sort).
 
-Describe: both channels that a map stores, 20 x 60 bins, of a full virtual local scan: what 20 keyframes 2 m apart see
-within 50 m, one point per 0.5 m voxel, 131,072 in the order of the keyframes. The baseline is the plain reference; its
-co-visibility serves us too, since one grid takes it less than a launch.
+Describe: both channels that a map stores, 20 x 60 bins, of a full virtual local scan: 20 keyframes 2 m apart, within
+50 m, one point per 0.5 m voxel, 131,072 in the order of the keyframes. The baseline is the plain reference.
 """
 
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from bench.harness.rows import REPEAT, Row, against, medians
-from coview_kernels import polar_bin, reference, transform_unique
+from coview_kernels import reference, transform_unique
 from coview_stream.config import DescriptorConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
@@ -71,16 +70,28 @@ def best_numpy(points: Floats32, T: Floats) -> Floats32:
     return np.asarray(moved[first])
 
 
-def _intake(repeat: int) -> Iterator[Row]:
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Take in a frame, then describe a keyframe."""
     points = frame()
-    ours = partial(transform_unique, points, STANDING, *LIMITS)
-    plain = partial(reference.transform_unique, points, STANDING, *LIMITS)
-    found = ours()[0]
-    if not (np.array_equal(found, plain()[0]) and np.array_equal(found, best_numpy(points, STANDING))):
+    ours: Callable[[], Any] = partial(transform_unique, points, STANDING, *LIMITS)
+    numpy: Callable[[], Any] = partial(best_numpy, points, STANDING)
+    if not np.array_equal(ours()[0], numpy()):
         raise AssertionError("ours and NumPy disagree")
-    taken, slow, best = medians(ours, plain, partial(best_numpy, points, STANDING), repeat=repeat)
+    taken, best = medians(ours, numpy, repeat=9 if asked.quick else REPEAT)
     yield against("intake, 64k points, beside the best NumPy", taken, best, "ms", 4.0)
-    yield against("intake, 64k points, beside the reference", taken, slow, "ms", None)
+
+    points, centre, config = _virtual_scan(), np.array([0.1, -0.2, -1.8]), DescriptorConfig()
+
+    def plain() -> list[Floats32]:
+        grid, _ = reference.polar_bin(points, centre, config.rings, config.sectors, config.radius)
+        highest = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
+        return [highest, reference.coview(*grid)]
+
+    ours = partial(describe, points, centre, config)
+    if not all(map(np.array_equal, ours().values(), plain())):
+        raise AssertionError("ours and NumPy disagree")
+    described, reference_ms = medians(ours, plain, repeat=5 if asked.quick else REPEAT)
+    yield against(f"describe, {_SCAN} points", described, reference_ms, "ms", 10.0)
 
 
 def _virtual_scan() -> Floats32:
@@ -95,32 +106,3 @@ def _virtual_scan() -> Floats32:
     unique = reference.transform_unique(np.concatenate(parts), np.eye(4), 0.5)[0]
     chosen = np.sort(rng.choice(len(unique), min(_SCAN, len(unique)), replace=False))
     return np.ascontiguousarray(unique[chosen])
-
-
-def _describe(repeat: int) -> Iterator[Row]:
-    """Ratios of the whole and of binning alone."""
-    points, centre, config = _virtual_scan(), np.array([0.1, -0.2, -1.8]), DescriptorConfig()
-    binned = points, centre, config.rings, config.sectors, config.radius
-
-    def plain() -> list[Floats32]:
-        grid, _ = reference.polar_bin(*binned)
-        highest = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
-        return [highest, reference.coview(*grid)]
-
-    if not all(map(np.array_equal, describe(points, centre, config).values(), plain())):
-        raise AssertionError("ours and NumPy disagree")
-    ours, numpy, bins, numpy_bins = medians(
-        partial(describe, points, centre, config),
-        plain,
-        partial(polar_bin, *binned),
-        partial(reference.polar_bin, *binned),
-        repeat=repeat,
-    )
-    yield against(f"describe, {_SCAN} points", ours, numpy, "ms", 10.0)
-    yield against(f"describe, {_SCAN} points, bins alone", bins, numpy_bins, "ms", None)
-
-
-def rows(asked: Namespace) -> Iterator[Row]:
-    """Take in a frame, then describe a keyframe."""
-    yield from _intake(9 if asked.quick else REPEAT)
-    yield from _describe(5 if asked.quick else REPEAT)

@@ -38,10 +38,8 @@ from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
-MOST_SLOPE, MOST_MS, MOST_QUERY_MS = 1.0, 30.0, 1000.0
-"""Targets: growth from a hundred thousand to a million stations, milliseconds of a vote in a prior's circle and of one
-that compares all of a million stations."""
-
+MOST_SLOPE = 1.0  # target: growth from a hundred thousand to a million stations
+MOST_MS, MOST_QUERY_MS = 30.0, 1000.0  # targets: of a vote in a prior's circle, and of one that compares a million
 RADIUS = 1000.0  # metres of the prior's circle; around the drive it holds 785,000 of the million stations
 APART = 10  # factor by which stations are moved apart: every 20 m, as of 20 x 20 km
 _BLOCK = 8192
@@ -96,11 +94,7 @@ def widened(stations: Floats32, count: int, block: float) -> Floats32:
 
 
 def voted(out: Path, radius: float | None = None, apart: int = 1) -> dict[str, Any]:
-    """Return the votes of the keyframes, and the memory of the process.
-
-    With a ``radius``, metres, they search a circle around the first keyframe. Where stations are moved ``apart`` by a
-    factor, ranks have no meaning.
-    """
+    """Return votes and memory; in a circle of ``radius`` metres, or with stations moved ``apart`` (no ranks then)."""
     bind_to_one_core()
     block, keyframes = pickle.loads((out / "queries.pkl").read_bytes())
     stations = np.load(out / "stations.npy")
@@ -176,10 +170,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 yield bounded(f"{wide}, in a circle of {RADIUS:g} m: p50", float(np.median(near["ms"])), "ms", MOST_MS)
     if not asked.quick:
         few, many = (results[size] for size in SIZES[-2:])
-        time_slope = float(np.log10(np.median(many["ms"]) / np.median(few["ms"])))
-        memory_slope = float(np.log10(many["megabytes"] / few["megabytes"]))
-        yield bounded("scale/slope of the time, 100000 to 1000000 stations", time_slope, "", MOST_SLOPE)
-        yield bounded("scale/slope of the memory, 100000 to 1000000 stations", memory_slope, "", MOST_SLOPE)
+        for name, key in (("time", "ms"), ("memory", "megabytes")):
+            slope = float(np.log10(np.median(many[key]) / np.median(few[key])))
+            yield bounded(f"scale/slope of the {name}, 100000 to 1000000 stations", slope, "", MOST_SLOPE)
 
 
 def _named(votes: dict[str, Any]) -> float:

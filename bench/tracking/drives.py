@@ -19,7 +19,7 @@ from bench.tracking.worlds import Recorded, World, in_gap
 from coview_stream import BaseMap, Localizer
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats, Ints
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.localization.result import Fix
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
@@ -27,21 +27,11 @@ from coview_stream.sim.sensors import FRAME_PERIOD
 
 SEGMENT = 100.0  # metres over which drift is measured
 EVENT_AT = 90.0  # metres
-CLEAR, CLOTH, DUST = 0, 1, 2
-"""Cover of the sensor: nothing; a cloth at 0.5 to 0.9 m; so much that only 20 returns of a frame are left."""
-
+CLEAR, CLOTH, DUST = 0, 1, 2  # cover of the sensor: nothing; a cloth at 0.5 to 0.9 m; only 20 returns are left
 _DUST_POINTS = 20
 _MIN_GAP = 20.0  # metres in the gap that count as an event
 _COVERED_S = 30.0
 _FIRST_STAMP = 1000.0
-
-
-class Event(NamedTuple):
-    """Event from the frame ``begin`` on; at the frame ``end`` it is over, and recovery begins."""
-
-    what: str
-    begin: int
-    end: int
 
 
 @dataclass(frozen=True)
@@ -54,7 +44,7 @@ class Drive:
     odometry: Floats  # (K, 4, 4) odom <- body
     driven: Floats  # (K,) metres on its own wheels up to each frame
     cover: Ints  # (K,) cover of the sensor
-    events: tuple[Event, ...] = ()
+    events: tuple[int, ...] = ()  # frames at which an event is over, and recovery begins
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -72,26 +62,22 @@ class Drive:
         arrays: dict[str, Any] = {name: each[rows] for name, each in vars(self).items() if name != "events"}
         return replace(self, **arrays | {"stamps": self.stamps[: len(rows)]})
 
-    def after(self, what: str, begin: int, end: int, **changes: Any) -> Drive:
-        """Return the drive on which that happened, with the arrays that it changed."""
-        return replace(self, **changes, events=(*self.events, Event(what, begin, end)))
+    def after(self, end: int, **changes: Any) -> Drive:
+        """Return the drive with an event that is over at the frame ``end``, and with the arrays that it changed."""
+        return replace(self, **changes, events=(*self.events, end))
 
 
 def start(truth: Floats, drift: float, seed: int) -> Drive:
     """Drive as recorded: (N, 4, 4) map <- body, with odometry that drifts by that share of the distance."""
-    count = len(truth)
-    stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(count, dtype=np.float64)
-    odometry = drifting(truth, drift, seed)
-    return Drive(np.arange(count), stamps, truth, odometry, driven(truth), np.zeros(count, dtype=np.int64))
+    frames = np.arange(len(truth))
+    stamps = _FIRST_STAMP + FRAME_PERIOD * frames.astype(np.float64)
+    return Drive(frames, stamps, truth, drifting(truth, drift, seed), driven(truth), np.zeros_like(frames))
 
 
-def drift_share(truth: Floats, odometry: Floats, over: float = SEGMENT) -> float:
-    """Mean over all stretches of ``over`` metres of how far odometry is off at their end, as a share of them.
-
-    Shorter drives: over their second half's length.
-    """
+def drift_share(truth: Floats, odometry: Floats) -> float:
+    """Mean over all stretches of 100 m (at most half of the drive) of odometry's error at their end, as a share."""
     way = driven(truth)
-    over = min(over, way[-1] / 2)
+    over = min(SEGMENT, way[-1] / 2)
     errors = []
     for first in range(0, int(np.searchsorted(way, way[-1] - over)), 10):
         last = int(min(np.searchsorted(way, way[first] + over), len(way) - 1))
@@ -101,10 +87,9 @@ def drift_share(truth: Floats, odometry: Floats, over: float = SEGMENT) -> float
 
 
 def drifting(truth: Floats, share: float, seed: int) -> Floats:
-    """Odometry (N, 4, 4) with the simulator's errors, all made larger or smaller alike so that it drifts by ``share``.
+    """Return odometry (N, 4, 4) with the simulator's errors, all scaled alike until it drifts by ``share``.
 
     Its scale is off by its sigma, not by a draw: with one near zero all of the drift would be a heading that trembles.
-    Seeds that are even drive too far, the others too short.
     """
     usual, factor = OdometryConfig(), share / 0.015
     for _ in range(5):
@@ -137,7 +122,7 @@ def kidnapped(drive: Drive, to: float = 250.0, until: float = 370.0) -> Drive:
     rows = np.r_[0:at, there : len(drive)]
     way = np.r_[drive.driven[:at], drive.driven[there:] - drive.driven[there] + drive.driven[at - 1]]
     odometry = rejoined(drive.odometry[rows], at, drive.odometry[at - 1])
-    return drive.picked(rows).after("kidnapped", at, at, odometry=odometry, driven=way)
+    return drive.picked(rows).after(at, odometry=odometry, driven=way)
 
 
 def carried(drive: Drive) -> Drive:
@@ -151,7 +136,7 @@ def carried(drive: Drive) -> Drive:
     way = drive.driven.copy()
     way[at:to] = way[at - 1]
     way[to:] -= drive.driven[to] - way[at - 1]
-    return drive.after("carried", at, to, odometry=odometry, driven=way)
+    return drive.after(to, odometry=odometry, driven=way)
 
 
 def covered(drive: Drive, cover: int) -> Drive:
@@ -160,15 +145,14 @@ def covered(drive: Drive, cover: int) -> Drive:
     end = min(begin + round(_COVERED_S / FRAME_PERIOD), len(drive) - 1)
     over = drive.cover.copy()
     over[begin:end] = cover
-    return drive.after("covered", begin, end, cover=over).until(float(drive.driven[end]) + 100.0)
+    return drive.after(end, cover=over).until(float(drive.driven[end]) + 100.0)
 
 
 def jumped(drive: Drive) -> Drive:
     """Let odometry jump between two frames: 3 m forward, 1 m to the left, and a turn of 15 degrees."""
     drive = drive.until(EVENT_AT + 120.0)
     at, step = drive.at(EVENT_AT), pose_from(rot_z(np.radians(15.0)), [3.0, 1.0, 0.0])
-    odometry = rejoined(drive.odometry, at, drive.odometry[at] @ step)
-    return drive.after("odometry jump", at, at, odometry=odometry)
+    return drive.after(at, odometry=rejoined(drive.odometry, at, drive.odometry[at] @ step))
 
 
 def slipped(drive: Drive) -> Drive:
@@ -177,8 +161,7 @@ def slipped(drive: Drive) -> Drive:
     for number, metres in enumerate(np.arange(30.0, 271.0, 30.0)):
         at, size, side = drive.at(float(metres)), 0.8 * (1 + number % 4), (-1.0) ** number
         step = pose_from(rot_z(np.radians(-2.5 * size * side)), [0.0, size * side, 0.0])
-        odometry = rejoined(drive.odometry, at, drive.odometry[at] @ step)
-        drive = drive.after(f"slip of {size:.1f} m", at, at, odometry=odometry)
+        drive = drive.after(at, odometry=rejoined(drive.odometry, at, drive.odometry[at] @ step))
     return drive
 
 
@@ -186,7 +169,7 @@ def restarted(drive: Drive) -> Drive:
     """Let odometry start again at its zero."""
     drive = drive.until(EVENT_AT + 120.0)
     at = drive.at(EVENT_AT)
-    return drive.after("odometry reset", at, at, odometry=rejoined(drive.odometry, at, np.eye(4)))
+    return drive.after(at, odometry=rejoined(drive.odometry, at, np.eye(4)))
 
 
 def scaled(drive: Drive) -> Drive:
@@ -198,22 +181,10 @@ def scaled(drive: Drive) -> Drive:
 def over_the_gap(drive: Drive) -> Drive:
     """Mark where the drive leads through the gap of the map (see :func:`bench.tracking.worlds.in_gap`)."""
     inside = np.r_[False, in_gap(drive.truth, drive.truth[:, :3, 3]), False].astype(int)
-    marked = drive
     for begin, end in zip(np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1), strict=True):
         if end < len(drive) and drive.driven[end] - drive.driven[begin] >= _MIN_GAP:
-            marked = marked.after("map gap", int(begin), int(end))
-    return marked.until(340.0)
-
-
-def seen(points: Points, cover: int, frame: int) -> Points:
-    """Return what is left of a frame under a cover: (K, 3), seeded by the frame's number."""
-    rng = np.random.default_rng([frame, 51])
-    if cover == DUST:
-        return points[np.sort(rng.choice(len(points), min(_DUST_POINTS, len(points)), replace=False))]
-    if cover == CLOTH:
-        near = rng.uniform(0.5, 0.9, len(points)) / np.linalg.norm(points, axis=1)
-        return np.asarray((points * near[:, None]).astype(np.float32))
-    return points
+            drive = drive.after(int(end))
+    return drive.until(340.0)
 
 
 SEEDS = 5000  # what reported seeds follow; this one itself, of ``--quick``, is in no table
@@ -229,15 +200,6 @@ class Scenario(NamedTuple):
     change: Callable[[Drive], Drive]
     drift: float
     variant: str = "plain"
-
-    @property
-    def plain(self) -> bool:
-        """Whether nothing happens."""
-        return self.name.startswith("plain/")
-
-    def drive(self, truth: Floats) -> Drive:
-        """Make it of the recorded truth (N, 4, 4)."""
-        return self.change(start(truth, self.drift, self.world.seed))
 
 
 _EVENTS: dict[str, tuple[Callable[[Drive], Drive], tuple[str, ...], float, str]] = {
@@ -272,12 +234,16 @@ def worlds(seeds: int = SEEDS) -> tuple[World, ...]:
     )
 
 
-def scenarios(seeds: int = SEEDS) -> tuple[Scenario, ...]:
-    """Plain drives through all worlds of the seeds that follow ``seeds``, and all events."""
-    every = worlds(seeds)
-    where = {"town": every[0], "campus": every[5], "forest": every[7]}
+def scenarios(seeds: int = SEEDS, quick: bool = False) -> tuple[Scenario, ...]:
+    """Plain drives through all worlds of the seeds that follow ``seeds``, and all events; ``quick``: a small town."""
+    if quick:
+        small = World("town", "vlp16", SEEDS, 160.0, 120.0, 2.0, 0.02)
+        kidnap = partial(kidnapped, to=115.0, until=120.0)
+        return Scenario("plain/quick", small, _WHOLE, small.drift), Scenario("kidnap/quick", small, kidnap, 0.01)
+    all_worlds = worlds(seeds)
+    where = {"town": all_worlds[0], "campus": all_worlds[5], "forest": all_worlds[7]}
     return (
-        *(Scenario(f"plain/{w.kind}-{w.sensor}-{w.seed}", w, _WHOLE, w.drift) for w in every),
+        *(Scenario(f"plain/{w.kind}-{w.sensor}-{w.seed}", w, _WHOLE, w.drift) for w in all_worlds),
         *(
             Scenario(f"{event}/{place}", where[place], change, drift, variant)
             for event, (change, places, drift, variant) in _EVENTS.items()
@@ -286,20 +252,16 @@ def scenarios(seeds: int = SEEDS) -> tuple[Scenario, ...]:
     )
 
 
-_EASY = World("town", "vlp16", SEEDS, 160.0, 120.0, 2.0, 0.02)
-
-QUICK = (
-    Scenario("plain/quick", _EASY, _WHOLE, _EASY.drift),
-    Scenario("kidnap/quick", _EASY, partial(kidnapped, to=115.0, until=120.0), 0.01),
-)
-"""A smoke test: one small town, two minutes of driving; says little about the targets."""
-
-
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
     """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
     localizer, fixes = Localizer(BaseMap.load(site)), list[Fix | None]()
     for frame, cover, odometry, stamp in zip(drive.frames, drive.cover, drive.odometry, drive.stamps, strict=True):
-        cloud = seen(recorded.read(int(frame)), int(cover), int(frame))
+        cloud, rng = recorded.read(int(frame)), np.random.default_rng([frame, 51])
+        if cover == DUST:
+            cloud = cloud[np.sort(rng.choice(len(cloud), min(_DUST_POINTS, len(cloud)), replace=False))]
+        if cover == CLOTH:
+            near = rng.uniform(0.5, 0.9, len(cloud)) / np.linalg.norm(cloud, axis=1)
+            cloud = (cloud * near[:, None]).astype(np.float32)
         try:
             fixes.append(localizer.step(cloud, odometry, float(stamp)))
         except (CloudError, RunError):

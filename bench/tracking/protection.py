@@ -1,14 +1,14 @@
 """Protection levels, on kinds of sites other than those that the errors' tail is fitted on.
 
-Plain drives with odometry that drifts by 0.5 to 5 %. The tail of the errors is fitted on campuses and sparse forests
-(``fitted``), where the covariance is the most optimistic; the levels as the product has them are judged on towns,
-villages, industry and dense forests (``reported``), every other block of these on a map in which 30 % of the buildings
-and all cars, poles and trees are others. One pose per ten metres counts. Worlds and answers stay in ``--work``.
+Plain drives with odometry that drifts by 0.5 to 5 %. The tail is fitted on campuses and sparse forests (``fitted``),
+where the covariance is the most optimistic; the product's levels are judged on other kinds (``reported``), every other
+block on a map in which 30 % of the buildings and all cars, poles and trees are others. One pose per ten metres counts.
 """
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,18 +26,10 @@ from bench.tracking.worlds import World, map_of, open_world
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, RISK, TAILS, axes_of
 
-EVERY = 10.0
-"""Metres of driving of which one pose counts."""
-
-ALERT = (ALERT_METRES, ALERT_DEGREES)
-
-TO_ALERT = (2.0, 2.0)
-"""Seconds, and metres driven, after which a pose beyond the alert limit has to have been withdrawn."""
-
+EVERY = 10.0  # metres of driving of which one pose counts
+TO_ALERT = (2.0, 2.0)  # seconds, and metres driven, after which a pose beyond the alert limit is withdrawn
 PRODUCT = tuple(TAILS.values())  # tails of the product
-
 Tails = Sequence[tuple[float, float]]
-
 _HEAVIEST, _LIGHTEST = 2.5, 200.0  # degrees of freedom of a tail: a finite variance; as good as a Gaussian
 
 
@@ -64,19 +56,15 @@ class Sample(NamedTuple):
         sample = cls(errors, np.ones_like(errors), spread[:, :, 0], spread[:, :, 1])
         return sample._replace(doubt=track.levels[rows] / sample.level(PRODUCT))
 
-    @classmethod
-    def joined(cls, parts: Sequence[Sample]) -> Sample:
-        """Put those of several drives together."""
-        return cls(*(np.concatenate([np.empty((0, 2)), *(part[k] for part in parts)]) for k in range(len(cls._fields))))
-
     def to_json(self) -> dict[str, list[list[float]]]:
         """Return the arrays as lists."""
         return {name: values.tolist() for name, values in self._asdict().items()}
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Sample:
-        """Undo :meth:`to_json`."""
-        return cls(**{name: np.array(values, dtype=np.float64).reshape(-1, 2) for name, values in data.items()})
+    def joined(cls, drives: Sequence[Mapping[str, Any]]) -> Sample:
+        """Put those of several drives together, each as of :meth:`to_json`."""
+        parts = [[np.reshape(drive[name], (-1, 2)) for drive in drives] for name in cls._fields]
+        return cls(*(np.concatenate([np.empty((0, 2)), *part]) for part in parts))
 
     def level(self, tails: Tails) -> Floats:
         """(N, 2) metres and degrees that tails of the errors give: factor and degrees of freedom of each."""
@@ -122,7 +110,7 @@ class Beyond(NamedTuple):
 
 def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[Beyond]:
     """Return the times that poses were given beyond the alert limit; (N,) metres ``driven`` at each frame."""
-    beyond = track.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
+    beyond = track.tracking & ((error.metres > ALERT_METRES) | (error.degrees > ALERT_DEGREES))
     edges = np.diff(np.r_[False, beyond, False].astype(int))
     out = []
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
@@ -169,60 +157,47 @@ class Family(NamedTuple):
 FAMILIES = {
     "fitted": Family(("campus", "sparse-forest"), 5301, False),
     "reported": Family(("town", "village", "industrial", "forest"), 5201, True),
-}
+}  # the verdict is on the last one
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the worlds."""
     parser.add_argument("--worlds", type=int, default=WORLDS, metavar="N", help=f"of each family ({WORLDS})")
-    parser.add_argument("--family", choices=tuple(FAMILIES), help="this one alone")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per drive, then the tails that fit, and the verdict on the reported ones."""
-    count = 2 if asked.quick else asked.worlds
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in FAMILIES}
-    for name in [asked.family] if asked.family else FAMILIES:
-        for world, variant in FAMILIES[name].worlds(count):
-            drive = measure(folder(), world, variant)
-            found[name].append(drive)
-            worst = float(np.max(Sample.from_json(drive["sample"]).error[:, 0], initial=0.0))
-            about = {"family": name, **drive}
+    for name, family in FAMILIES.items():
+        drives = []
+        for world, variant in family.worlds(min(2, asked.worlds) if asked.quick else asked.worlds):
+            drives.append(measure(folder(), world, variant))
+            worst = max((metres for metres, _ in drives[-1]["sample"]["error"]), default=0.0)
+            about = {"family": name, **drives[-1]}
             yield informs(f"protection/{world.name.removeprefix('tracking-')}, {variant}: worst", worst, "m", about)
-    for name, some in found.items():
-        if some:
-            sample = Sample.joined([Sample.from_json(each["sample"]) for each in some])
-            fits = [tail(sample, part) for part in (0, 1)]
-            said = "; ".join(f"{factor:.2f}, {freedom:.1f}" for factor, freedom in fits)
-            yield judged(f"protection/tail that fits {name}: factor, freedom; m, deg", said, "", None)
-    if some := found["reported"]:
-        sample = Sample.joined([Sample.from_json(each["sample"]) for each in some])
-        metres = sum(each["driven_m"] for each in some)
-        for part, unit in enumerate(("m", "degrees")):
-            hits, of = sample.above(PRODUCT)[part], len(sample.error)
-            said = f"{hits} of {of}: below {100 * upper(hits, of):.2f} %"
-            holds = hits <= RISK * of
-            yield judged(f"protection/error > level, {unit}", said, f"<= {100 * RISK:g} %", holds, hits / max(of, 1))
-        count = sum(each["misleading"] for each in some)
-        yield judged("protection/beyond the alert limit", f"{count} in {metres / 1000:.1f} km", "0", not count, count)
+        sample = Sample.joined([drive["sample"] for drive in drives])
+        fits = "; ".join("{:.2f}, {:.1f}".format(*tail(sample, part)) for part in (0, 1))
+        yield judged(f"protection/tail that fits {name}: factor, freedom; m, deg", fits, "", None)
+    of, kilometres = len(sample.error), sum(drive["driven_m"] for drive in drives) / 1000
+    for hits, unit in zip(sample.above(PRODUCT), ("m", "degrees"), strict=True):
+        text, holds = f"{hits} of {of}: below {100 * upper(hits, of):.2f} %", hits <= RISK * of
+        yield judged(f"protection/error > level, {unit}", text, f"<= {100 * RISK:g} %", holds, hits / max(of, 1))
+    count = sum(drive["misleading"] for drive in drives)
+    yield judged("protection/beyond the alert limit", f"{count} in {kilometres:.1f} km", "0", not count, count)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Levels by kind of site and by family."""
-    measured = [row.details for row in rows if "family" in row.details]
-    groups: dict[str, list[Sample]] = {}
-    by_family: dict[str, list[Sample]] = {}
-    for each in measured:
-        sample, map_of_it = Sample.from_json(each["sample"]), ", 30 % changed" if each["variant"] == "changed" else ""
-        groups.setdefault(f"{each['family']}: {each['kind']}{map_of_it}", []).append(sample)
-        by_family.setdefault(each["family"], []).append(sample)
-    joined = {f"{name}, all": Sample.joined(some) for name, some in by_family.items()}
-    out = {name: Sample.joined(some) for name, some in sorted(groups.items())} | joined
-    return {"": level_table(out)}
+    kinds, families = defaultdict(list), defaultdict(list)
+    for drive in (row.details for row in rows if "family" in row.details):
+        changed = ", 30 % changed" if drive["variant"] == "changed" else ""
+        kinds[f"{drive['family']}: {drive['kind']}{changed}"].append(drive["sample"])
+        families[f"{drive['family']}, all"].append(drive["sample"])
+    groups = dict(sorted(kinds.items())) | families
+    return {"": level_table({name: Sample.joined(some) for name, some in groups.items()})}
 
 
 def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
-    """Return the sample of a plain drive, as lists, with what it was; kept until the code changes."""
+    """Return the sample of a plain drive, as lists; kept until the code changes."""
     bench = fingerprint("bench/tracking/drives.py", "bench/tracking/worlds.py", "bench/accuracy/scores.py")
     spec = {"code": fingerprint(*_MEASURED), "bench": bench, "world": repr(world), "variant": variant}
 

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from bench.accuracy.scores import Errors, Track, errors, score
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import NOTHING, Row, informs, judged, listed, number, table
-from bench.tracking.drives import QUICK, SEEDS, Scenario, follow, scenarios
+from bench.tracking.drives import SEEDS, Scenario, follow, scenarios, start
 from bench.tracking.protection import TO_ALERT, beyond_alert_limit
 from bench.tracking.worlds import map_of, open_world
 from coview_stream.errors import InputError
@@ -37,7 +37,6 @@ COLUMNS = (
     ("max m", "max_m", 2), ("rmse deg", "rmse_deg", 2), ("false", "false_frames", 0), ("lost", "losses", 0),
     ("back m", "back_m", None),
 )  # fmt: skip
-"""Of the table of drives."""
 
 FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
 PARTS = ("first minute", "later")
@@ -125,19 +124,17 @@ def honest(part: dict[str, Any]) -> bool:
 
 def coverage_table(parts: dict[str, dict[str, Any]]) -> str:
     """Lay out shares in per cent, marked where out of their band."""
-    columns = (*PARTS, "all")
-    lines = []
+
+    def percent(inside: Sequence[float] | None) -> str:
+        return NOTHING if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
+
+    columns, lines = (*PARTS, "all"), []
     for name in AXES:
         entries = [parts[part][name] for part in columns]
-        marks = ["" if entry["inside"] is None or honest(entry) else " !" for entry in entries]
-        cells = [_percent(entry["inside"]) + mark for entry, mark in zip(entries, marks, strict=True)]
-        lines.append([name, _percent(NOMINAL), *cells])
+        cells = [percent(of["inside"]) + " !" * (of["inside"] is not None and not honest(of)) for of in entries]
+        lines.append([name, percent(NOMINAL), *cells])
     lines.append(["poses", "", *(str(parts[part]["yaw"]["frames"]) for part in columns)])
     return table(["coverage, %", "promised", *columns], lines)
-
-
-def _percent(inside: Sequence[float] | None) -> str:
-    return NOTHING if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
 
 
 Figures = dict[str, Any]
@@ -151,10 +148,10 @@ def options(parser: ArgumentParser) -> None:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per drive with all its figures, then the targets."""
-    every = QUICK if asked.quick else scenarios(asked.seeds)
-    chosen = [each for each in every if not asked.names or any(name in each.name for name in asked.names)]
+    known = scenarios(asked.seeds, asked.quick)
+    chosen = [scenario for scenario in known if any(name in scenario.name for name in asked.names or ("",))]
     if not chosen:
-        raise InputError(f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}")
+        raise InputError(f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in known)}")
     drives, parts = [], []
     for scenario in chosen:
         figures, squared = measure(folder(), scenario)
@@ -185,13 +182,13 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
 
     def work() -> dict[str, Any]:
         recorded = open_world(folder, scenario.world)
-        drive = scenario.drive(recorded.truth)
+        drive = scenario.change(start(recorded.truth, scenario.drift, scenario.world.seed))
         track = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
         error = errors(track, drive.truth)
         parts, beyond = spread(track, error), beyond_alert_limit(track, error, drive.driven)
         about = {
             "name": scenario.name,
-            "plain": scenario.plain,
+            "plain": scenario.name.startswith("plain/"),
             "misleading": sum(each.misleading for each in beyond),
             "beyond": len(beyond),
             "alert_s": max((each.seconds for each in beyond), default=None),

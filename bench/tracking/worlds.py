@@ -28,12 +28,8 @@ from coview_stream.report.evaluation import driven
 from coview_stream.sim import KINDS, SimulationConfig
 from coview_stream.sim.scenes import Scene, build_scene
 
-STEP = 0.004  # metres; what frames are rounded to
-
-GAP = (120.0, 220.0)  # metres of the drive between which the map of a gap holds nothing near the robot
-GAP_RADIUS = 40.0
-"""... within so many metres."""
-
+STEP = 0.004  # metres, to which frames are rounded
+GAP, GAP_RADIUS = (120.0, 220.0), 40.0  # metres of the drive between which a gap's map holds nothing so near
 CHANGED = 0.3  # share of the buildings, cars, poles and trees that are others in the changed map
 _TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
 _SELF = "bench/tracking/worlds.py"
@@ -57,7 +53,7 @@ class World(NamedTuple):
 
     @property
     def config(self) -> SimulationConfig:
-        """What the simulator is asked for."""
+        """The simulator's settings."""
         scene = "forest" if self.kind == "sparse-forest" else self.kind
         return SimulationConfig(scene, self.sensor, self.seed, self.size, self.length, speed=self.speed)
 

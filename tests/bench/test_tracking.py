@@ -147,7 +147,7 @@ def test_one_pose_counts_of_each_ten_metres_with_its_reported_level():
     assert len(sample.error) == 4
     np.testing.assert_allclose(sample.doubt, 1.2)
     np.testing.assert_allclose(sample.level(PRODUCT), [[level.metres, level.degrees]] * 4)
-    np.testing.assert_array_equal(Sample.from_json(sample.to_json()).trace, sample.trace)
+    np.testing.assert_array_equal(Sample.joined([sample.to_json()]).trace, sample.trace)
 
 
 @pytest.mark.parametrize(("factor", "freedom"), [(1.0, 4.0), (0.7, 3.0), (1.5, 12.0)])
