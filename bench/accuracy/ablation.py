@@ -7,10 +7,8 @@ done stays in ``--work``.
 
 from __future__ import annotations
 
-import sys
-import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -44,8 +42,7 @@ WINDOW = 5  # keyframes that vote together in the coarse measure
 
 _DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
 
-NEAR, ALIGNED = 3.0, float(np.radians(9.0))
-"""A place is right within this, metres and radians: one and a half blocks, one and a half shifts."""
+NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a half blocks and shifts
 
 
 @dataclass(frozen=True)
@@ -67,14 +64,29 @@ class Seen:
     T_map_odom: Pose  # (4, 4) the truth, map frame relative to the map's origin
 
 
-@dataclass
-class Places:
-    """Right places: of keyframes alone, and of windows of :data:`WINDOW` keyframes."""
+class Search:
+    """One variant's votes, and how often they name the right place: of the newest keyframe alone, of the last few."""
 
-    keyframes: int = 0
-    top1: int = 0
-    windows: int = 0
-    coarse: int = 0
+    def __init__(self, variant: Variant, base_map: BaseMap) -> None:
+        self.variant = variant
+        self.right = {"keyframes": 0, "top1": 0, "windows": 0, "coarse": 0}
+        grid, config = base_map.station_grid, ConsensusConfig()
+        self._alone = Consensus(grid, replace(config, window=1))
+        self._window: Consensus | SmallestDistance = (
+            SmallestDistance(grid.stations, WINDOW)
+            if variant.modes.single
+            else Consensus(grid, replace(config, window=WINDOW))
+        )
+
+    def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
+        """Add a keyframe's distances and judge the places."""
+        add_vote(self._alone, centre, volumes)
+        add_vote(self._window, centre, volumes)
+        self.right["keyframes"] += 1
+        self.right["top1"] += right(self._alone.hypotheses()[0].T_map_odom, seen)
+        if len(self._window) == WINDOW:
+            self.right["windows"] += 1
+            self.right["coarse"] += right(self._window.hypotheses()[0].T_map_odom, seen)
 
 
 class Bank:
@@ -116,38 +128,11 @@ def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> I
             yield Seen(scan, keyframe.position.copy(), ground, T_map_body @ inverse(T_odom_body))
 
 
-class _Search:
-    """One variant's votes: of the newest keyframe alone, and of the last few together."""
-
-    def __init__(self, variant: Variant, base_map: BaseMap) -> None:
-        self.variant, self.places = variant, Places()
-        grid, config = base_map.station_grid, ConsensusConfig()
-        self._alone = Consensus(grid, replace(config, window=1))
-        self._window: Consensus | SmallestDistance = (
-            SmallestDistance(grid.stations, WINDOW)
-            if variant.modes.single
-            else Consensus(grid, replace(config, window=WINDOW))
-        )
-
-    def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
-        add_vote(self._alone, centre, volumes)
-        add_vote(self._window, centre, volumes)
-        self.places.keyframes += 1
-        self.places.top1 += right(self._alone.hypotheses()[0].T_map_odom, seen)
-        if len(self._window) == WINDOW:
-            self.places.windows += 1
-            self.places.coarse += right(self._window.hypotheses()[0].T_map_odom, seen)
-
-
-def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places]:
-    """How often each variant names the right place along a world's run."""
-    searches = [_Search(variant, bank.built) for variant in variants]
-
-    @cache
-    def described(descriptor: DescriptorConfig, modes: Modes) -> BaseMap:
-        return bank.map(descriptor, modes)
-
-    for seen in keyframes_of(world, bank.built.origin, variants[0].descriptor):
+def places(world: Path, bank: Bank) -> dict[str, dict[str, int]]:
+    """Count how often each variant names the right place along a world's run."""
+    searches = [Search(variant, bank.built) for variant in VARIANTS]
+    described = cache(bank.map)
+    for seen in keyframes_of(world, bank.built.origin, VARIANTS[0].descriptor):
         known: dict[tuple[DescriptorConfig, Modes], Floats32] = {}
         for search in searches:
             descriptor, modes = search.variant.descriptor, replace(search.variant.modes, single=False)
@@ -163,7 +148,7 @@ def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places
                     known[one, modes] = modes.distances(base_map, query)[name]
                 volumes[name] = known[one, modes]
             search.vote(seen, centre, volumes)
-    return {search.variant.name: search.places for search in searches}
+    return {search.variant.name: search.right for search in searches}
 
 
 def right(T_map_odom: Pose, seen: Seen) -> bool:
@@ -209,30 +194,15 @@ def world_of(seed: int) -> SimulationConfig:
     return SimulationConfig(KINDS[seed % 4], LIDARS[seed % 3], seed, size, _LENGTH, changed=changed)
 
 
-def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Measured:
-    """Measure the named variants in one world: the search alone, then the whole localizer on the world's run."""
-    world, variants = folder / world_name(config), [v for v in VARIANTS if v.name in names]
-    bank = Bank(map_of(folder, config))
-    found, out = places(world, variants, bank), Measured()
-    for variant in variants:
+def ablate(below: Path, config: SimulationConfig) -> Measured:
+    """Measure all variants in one world: the search alone, then the whole localizer on the world's run."""
+    world, bank = below / world_name(config), Bank(map_of(below, config))
+    search, out = places(world, bank), Measured()
+    for variant in VARIANTS:
         with variant.modes.localizer():
             located = locate(bank.map(variant.descriptor, variant.modes), open_run(world / "run"))
-        out[variant.name] = asdict(found[variant.name]) | evaluated(located, world)
+        out[variant.name] = search[variant.name] | evaluated(located, world)
     return out
-
-
-def measure(
-    folder: Path, config: SimulationConfig, names: Sequence[str], call: Callable[..., Any] = isolated
-) -> Measured:
-    """Measures of the variants in one world, each in a process of its own."""
-    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy")}
-    spec = {"world": config.to_dict(), "variants": list(names), **code}
-
-    def make() -> Measured:
-        call(prepare, folder, config)
-        return dict(call(ablate, folder, config, names))
-
-    return remembered(folder / "results" / f"ablation-{world_name(config)}.json", spec, make)
 
 
 def total(name: str, got: Sequence[dict[str, Any]]) -> Row:
@@ -262,12 +232,14 @@ def options(parser: ArgumentParser) -> None:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per variant."""
-    names, measured = [variant.name for variant in VARIANTS], {}
+    measured = {}
     for seed in dict.fromkeys(asked.seeds[:1] if asked.quick else asked.seeds):
-        begin, config = time.perf_counter(), world_of(seed)
-        measured[seed] = measure(folder(), config, names)
-        print(f"{world_name(config)}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
-    for name in names:
+        config = world_of(seed)
+        isolated(prepare, folder(), config)
+        spec = {"world": config.to_dict(), "code": fingerprint(), "bench": fingerprint("bench/accuracy")}
+        file = folder() / "results" / f"ablation-{world_name(config)}.json"
+        measured[seed] = remembered(file, spec, partial(isolated, ablate, folder(), config))
+    for name in (variant.name for variant in VARIANTS):
         row = total(name, [world[name] for world in measured.values()])
         row.details["seeds"] = list(measured)
         yield row

@@ -1,9 +1,7 @@
 """Errors, runs localised and false fixes in held-out worlds, clean and with dirt.
 
-Localizes a run in each held-out world; then runs on the map of another world of the same kind, where the only right
-answer is no pose. Then the same drives clean, with each kind of dirt, and with all of it: drives and truth are the
-same, and so are the maps but for faults of the survey and change since. One process per run, one at a time; results
-stay in ``--work``, so an interrupted benchmark resumes.
+Localizes a run in each held-out world, then runs on the map of another world of the same kind, where the only right
+answer is no pose; then the same drives clean, with each kind of dirt, and with all of it. Results stay in ``--work``.
 """
 
 from __future__ import annotations
@@ -40,8 +38,7 @@ MOST_TRANSLATION, MOST_ROTATION, MOST_FIRST_FIX, MOST_MEGABYTES = 0.08, 0.3, 10.
 """Targets: metres, degrees, metres driven, MB."""
 
 CLEAN = "none"
-DIRTS = (CLEAN, *KINDS_OF_DIRT, REAL)
-"""No dirt, each kind with its default strength, all of them."""
+DIRTS = (CLEAN, *KINDS_OF_DIRT, REAL)  # no dirt, each kind with its default strength, all of them
 
 DIRTY_WORLDS = (
     SimulationConfig("campus", "os64", seed=2401, length=160.0, speed=8.0),
@@ -198,7 +195,6 @@ def total(kind: str, runs: Sequence[Run]) -> Row:
 def options(parser: ArgumentParser) -> None:
     """Add the part that is measured, and the dirt."""
     parser.add_argument("--only", choices=("worlds", "dirt"), help="one of the two parts")
-    parser.add_argument("--kinds", nargs="+", default=list(DIRTS), choices=DIRTS, metavar="DIRT", help="of dirt (all)")
     drives = range(1, len(DIRTY_WORLDS) + 1)
     parser.add_argument("--drives", type=int, default=drives[-1], choices=drives, help="so many of the dirty drives")
 
@@ -214,7 +210,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         yield from verdicts(runs)
     if asked.only != "worlds":
         false = 0
-        for kind in asked.kinds:
+        for kind in DIRTS:
             worlds = DIRTY_WORLDS[: 1 if asked.quick else asked.drives]
             row = total(kind, [dirty_run(folder(), world, kind) for world in worlds])
             false += row.details["false_frames"]

@@ -54,21 +54,13 @@ _RINGS, _KEPT = 64, 16  # of elevation
 
 @dataclass(frozen=True)
 class Variant:
-    """A run under a condition.
+    """A run under a condition."""
 
-    Attributes:
-        frames: (N,) the frames of the original.
-        stamps: (N,) seconds, increasing.
-        odometry: (N, 4, 4) odometry <- body, metres.
-        truth: (N, 4, 4) map <- body, of the same body.
-        changes: of each cloud (K, 3) in the body frame, metres, in this order.
-    """
-
-    frames: Indices
-    stamps: Floats
-    odometry: Poses
-    truth: Poses
-    changes: tuple[Callable[[Points], Points], ...] = ()
+    frames: Indices  # (N,) of the original
+    stamps: Floats  # (N,) seconds, increasing
+    odometry: Poses  # (N, 4, 4) odometry <- body, metres
+    truth: Poses  # (N, 4, 4) map <- body, of the same body
+    changes: tuple[Callable[[Points], Points], ...] = ()  # of clouds (K, 3) in the body frame, metres, in this order
 
     def cloud(self, points: Points) -> Points:
         """Return a frame's cloud (K, 3), metres, after all changes."""
@@ -80,7 +72,7 @@ class Variant:
         """Return it with one more change of the clouds."""
         return replace(self, changes=(*self.changes, change))
 
-    def chosen(self, of: Indices) -> Variant:
+    def chosen(self, of: slice) -> Variant:
         """Return it with some of its frames, in that order."""
         odometry, truth = self.odometry[of], self.truth[of]
         return replace(self, frames=self.frames[of], stamps=self.stamps[of], odometry=odometry, truth=truth)
@@ -132,14 +124,13 @@ def rings(points: Points) -> Points:
 
 
 def _back(run: Variant, rng: np.random.Generator) -> Variant:
-    stamps = run.stamps[0] + run.stamps[-1] - run.stamps
-    return replace(run, stamps=stamps).chosen(np.arange(len(run.frames))[::-1])
+    return replace(run, stamps=run.stamps[0] + run.stamps[-1] - run.stamps).chosen(slice(None, None, -1))
 
 
 def _turned(run: Variant, rng: np.random.Generator) -> Variant:
     turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    turned = run.changed(lambda points: points * np.array([-1.0, -1.0, 1.0], dtype=np.float32))
-    return replace(turned, odometry=run.odometry @ turn, truth=run.truth @ turn)
+    run = run.changed(lambda points: points @ turn[:3, :3].astype(np.float32))
+    return replace(run, odometry=run.odometry @ turn, truth=run.truth @ turn)
 
 
 _CONDITIONS: dict[str, tuple[int, Callable[..., Variant]]] = {
@@ -150,7 +141,7 @@ _CONDITIONS: dict[str, tuple[int, Callable[..., Variant]]] = {
     "drift": (0, lambda run, rng: _odometry(run, rng, float(rng.choice([-1.0, 1.0])) * 5.0, 0.5)),
     "beams16": (0, lambda run, rng: run.changed(rings)),
     "near30": (0, lambda run, rng: run.changed(lambda points: points[np.linalg.norm(points, axis=1) < 30.0])),
-    "sparse3": (0, lambda run, rng: run.chosen(np.arange(0, len(run.frames), 3))),
+    "sparse3": (0, lambda run, rng: run.chosen(slice(None, None, 3))),
     "back": (0, _back),
     "rev180": (0, _turned),
 }
@@ -166,33 +157,19 @@ CONDITIONS = (
 LEAST_SHARE = 85.0  # per cent of the unspoilt run's poses
 MOST_METRES, MOST_DEGREES = 0.3, 1.0  # of every first fix
 _ASKED = ("pitch", "roll", "odo", "drift")  # conditions that LEAST_SHARE is asked of
-_SPOILING = ("bench/accuracy/conditions.py",)
 _AIRBORNE = ("coview_stream/sim/airborne.py", "coview_stream/clouds")
 _NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 
-@dataclass(frozen=True)
 class RealSet:
     """One set on disk: ``base.laz``, ``run/``, ``truth.tum`` (map <- body, a pose for each frame)."""
 
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """Name of its directory."""
-        return self.folder.name
-
-    @property
-    def survey(self) -> Path:
-        """Point cloud that maps are built of."""
-        return self.folder / "base.laz"
-
-    def checked(self) -> RealSet:
-        """Return itself; InputError names a missing file."""
-        for path in (self.survey, self.folder / "run", self.folder / "truth.tum"):
+    def __init__(self, folder: Path) -> None:
+        """Raise InputError for a missing file."""
+        self.folder, self.name, self.survey = folder, folder.name, folder / "base.laz"
+        for path in (self.survey, folder / "run", folder / "truth.tum"):
             if not path.exists():
                 raise InputError(f"{path}: not there; a set has base.laz, run/ and truth.tum (--data, --sets)")
-        return self
 
     def airborne(self, density: float) -> tuple[Path, dict[str, Any]]:
         """Return the airborne-like cloud of so many pulses per m2, made unless it is there, and its share of walls."""
@@ -228,7 +205,7 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
     """Localize a set under a condition on a map with the command, unless the result is there; return its scores."""
     place = condition.replace(":", "_")
     run, out = below / "runs" / real.name / place / "run", below / "located" / site.stem / place
-    spec = {"set": real.name, "condition": condition, "bench": fingerprint(*_SPOILING)}
+    spec = {"set": real.name, "condition": condition, "bench": fingerprint("bench/accuracy/conditions.py")}
     remembered(run.parent / "spoilt.json", spec, lambda: real.spoil(condition, run.parent))
 
     def make() -> dict[str, Any]:
@@ -251,20 +228,12 @@ def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[
         nearest = int(np.abs(stamps - stamp).argmin())
         if abs(stamps[nearest] - stamp) < MAX_STAMP_GAP:
             poses[nearest] = T
-    none, count = np.full((len(stamps), 6, 6), np.nan), len(stamps)
-    states = np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
-    track = Track(stamps, states, poses, none, np.full((count, 2), np.nan))
+    count, states = len(stamps), np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
+    track = Track(stamps, states, poses, np.full((count, 6, 6), np.nan), np.full((count, 2), np.nan))
     error, known = errors(track, true), track.tracking
-    first = int(known.argmax()) if known.any() else None
-    kept = ("first_fix_m", "rmse_m", "rmse_deg", "max_m", "max_deg", "false_frames")
-    figures = score(track, true, driven(true), ())
-    return {
-        "frames": count,
-        "posed": int(known.sum()),
-        "first_m": None if first is None else float(error.metres[first]),
-        "first_deg": None if first is None else float(error.degrees[first]),
-        **{key: figures[key] for key in kept},
-    }
+    first = [float(values[known.argmax()]) if known.any() else None for values in (error.metres, error.degrees)]
+    about = {"frames": count, "posed": int(known.sum()), "first_m": first[0], "first_deg": first[1]}
+    return about | score(track, true, driven(true), ())
 
 
 def options(parser: ArgumentParser) -> None:
@@ -280,7 +249,7 @@ def options(parser: ArgumentParser) -> None:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per set, map and condition, then the targets."""
-    sets = [RealSet(asked.data / name).checked() for name in (asked.sets[-1:] if asked.quick else asked.sets)]
+    sets = [RealSet(asked.data / name) for name in (asked.sets[-1:] if asked.quick else asked.sets)]
     conditions = list(dict.fromkeys(("base", *(asked.conditions[:2] if asked.quick else asked.conditions))))
     below, results = folder() / "conditions", []
     for real in sets:
