@@ -117,6 +117,7 @@ def test_odometry_in_utm_that_turns_is_corrected(world_map, world_drive, world_f
 def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, world_drive):
     localizer = Localizer(world_map)
     _, fix = follow(localizer, world_drive.clouds, world_drive.T_odom_body, world_drive.T_map_body)
+    assert fix.calibration.describe() == []  # this sensor and this odometry are right
     localizer.hint_calibration(Calibration(pitch=0.1))
     assert localizer.fix().calibration == fix.calibration
 
@@ -138,7 +139,7 @@ def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
     assert localizer.calibration.pitch == 0.0
 
 
-def test_what_is_known_better_here_stays_group_by_group():
+def test_better_known_values_stay_group_by_group():
     estimator = CalibrationEstimator()
     estimator.learn(Calibration(pitch=0.03, scale=0.0, sigma_tilt=np.radians(0.1), sigma_scale=0.05))
     estimator.learn(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001).doubted())
@@ -146,7 +147,7 @@ def test_what_is_known_better_here_stays_group_by_group():
     assert 0.008 < estimator.calibration.scale < 0.03
 
 
-def test_what_a_leader_supposed_ends_with_it():
+def test_supposition_of_a_leader_ends_with_it():
     estimator = CalibrationEstimator()
     before = estimator.calibration
     T = np.eye(4)
