@@ -223,8 +223,3 @@ def test_gtsam_tangent_is_the_body_tangent():
 def test_boxplus_and_boxminus_are_inverse(angle):
     step = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, 2.0, -3.0])
     np.testing.assert_allclose(boxminus(boxplus(T, step), T), step, atol=1e-9)
-
-
-def test_adjoint_moves_increment_to_the_other_side():
-    xi = np.array([0.1, -0.05, 0.2, 0.5, 0.3, -0.4])
-    np.testing.assert_allclose(T @ exp_of(xi), exp_of(adjoint(T) @ xi) @ T, atol=1e-6)

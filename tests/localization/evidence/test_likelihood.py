@@ -123,14 +123,6 @@ def test_place_at_the_shares_of_chance_gains_nothing(number):
     assert found[1] < found[0]
 
 
-def test_what_is_worth_a_lot_in_one_site_is_worth_nothing_in_another():
-    """In a yard of equal boxes any place explains as much."""
-    yard = Background(np.array([0.55, 0.2, 0.05, 0.2]), PASSED, (1.5, 1.5), (30.0, 12.0))
-    half = np.array([0.55, 0.2, 0.05, 0.2])
-    assert ratio([half])[0] > 5.0
-    assert ratio([half], background=yard)[0] < 1.0
-
-
 def test_what_the_map_does_not_cover_adds_nothing():
     assert ratio([GOOD], passed=0.0, covered=0.0, covered_ground=0.0)[0] == pytest.approx(0.0, abs=1e-6)
     covered = np.array([0.25, 0.5, 0.75, 1.0])

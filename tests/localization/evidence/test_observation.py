@@ -52,20 +52,6 @@ def test_shares_are_shares(world_map, scan, truth):
             assert (seen.shares[:, Share.GROUND] <= seen.shares[:, Share.COVERED_GROUND]).all()
 
 
-def test_right_place_explains_nearly_all(world_map, scan, truth):
-    seen = scan.many.look_up(world_map.field, truth, Move.NEAR)
-    (row,) = seen.shares
-    assert row[Share.NEAR] > 0.9
-    assert row[Share.ON] > 0.5
-    assert row[Share.COVERED] > 0.9
-    assert row[Share.GROUND] > 0.8 * row[Share.COVERED_GROUND]
-    assert row[Share.PASSED] < 0.02
-    assert seen.scores[0] > 0.8
-    others = scan.many.look_up(world_map.field, beside(truth), Move.NONE).shares
-    assert np.median(others[:, Share.NEAR]) < 0.6
-    assert others[:, Share.PASSED].mean() > 2 * row[Share.PASSED]
-
-
 @pytest.mark.parametrize("away", [300.0, 5e4])
 def test_nothing_is_covered_off_the_map(world_map, scan, truth, away):
     for move in Move:

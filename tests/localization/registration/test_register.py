@@ -104,22 +104,6 @@ def test_empty_local_map_gives_no_registration(target, scan):
     assert register(few, TRUTH, target, CONFIG, (1.0,)) is None
 
 
-def test_prior_decides_unobserved_directions():
-    """On a bare plane heading and place are free: alone they stay, a prior pulls them."""
-    flat = local_map(*parts(plane([-15, -15, 0], [30, 0, 0], [0, 30, 0])))
-    scan = source_of(flat.points[::7], np.eye(4))
-    start = exp_se3(np.array([0.01, -0.01, 0.05, 0.4, -0.3, 0.2]))
-    mean = np.eye(4)
-    centre = np.zeros(3)
-    sigma = np.diag(np.array([0.05, 0.05, 0.01, 0.1, 0.1, 0.5]) ** -2)
-    alone = register(scan, start, flat, CONFIG, (0.8, 0.4), centre=centre)
-    pulled = register(scan, start, flat, CONFIG, (0.8, 0.4), Prior(mean, sigma), centre)
-    assert abs(alone.T_map_source[2, 3]) < 0.01
-    assert np.hypot(*(alone.T_map_source[:2, 3] - start[:2, 3])) < 0.05
-    assert np.linalg.norm(pulled.T_map_source[:3, 3]) < 0.01
-    assert rotation_angle(pulled.T_map_source) < 1e-3
-
-
 def test_weak_prior_does_not_outweigh_the_map(target, scan):
     wrong = TRUTH @ exp_se3(np.array([0, 0, 0.02, 0.3, 0.3, 0]))
     weak = Prior(wrong, np.diag(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]) ** -2))

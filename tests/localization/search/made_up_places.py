@@ -46,7 +46,6 @@ RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)
 REQUEST = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING, 5.5, (2, 3))
 HERE = pose_from(rot_z(-0.8), [3.0, 9.0, 0.5])  # map <- odometry
-NOBODY = Hypothesis(HERE, None, None, 0.0)  # named by no vote
 
 
 def moved(forward=0.0, degrees=0.0):

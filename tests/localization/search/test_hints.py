@@ -12,16 +12,14 @@ from trackers import follow, garbage
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
-from coview_stream.config import AcceptanceConfig
 from coview_stream.errors import ConfigError, InputError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of, yaw_of
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search import hints
-from coview_stream.localization.search.hints import FROM_THERE, HintSchedule, PlaceGuess, PoseHints
+from coview_stream.localization.search.hints import HintSchedule, PlaceGuess, PoseHints
 from coview_stream.localization.search.scoring import PlaceScorer
 from coview_stream.localization.state import State
 
-RULE = AcceptanceConfig()
 NEAR = pose_from(rot_z(np.radians(2.0)), [0.6, -0.5, 0.1])  # what a parked robot's last pose may be off by
 BESIDE = pose_from(rot_z(2.0), [9.0, -14.0, 0.0])  # another place of the map
 
@@ -61,20 +59,6 @@ def test_correct_hint_is_judged_like_what_votes_find(world_map, world_drive, wor
     fixes = follow(localizer, world_drive, 4)
     assert first_fix(fixes) == first_fix(world_fixes)
     assert [f.evidence.state for f in fixes] == [f.evidence.state for f in world_fixes[:4]]
-
-
-def test_correct_hint_without_votes_for_it_gives_a_pose(world_map, world_drive):
-    localizer = misled(Localizer(world_map), world_drive)
-    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
-    fixes = follow(localizer, world_drive, 3)
-    posed = first_fix(fixes)
-    assert posed is not None
-    for fix in fixes[: posed + 1]:
-        assert fix.evidence.reason.endswith(FROM_THERE)
-        assert (fix.evidence.station, fix.evidence.shift) == (None, None)
-    metres, degrees = pose_error(fixes[posed].T_map_body, world_drive.T_map_body[posed])
-    assert metres < 0.1
-    assert degrees < 0.3
 
 
 def test_hint_is_given_in_map_source_coordinates(world_map, world_drive):
@@ -122,14 +106,6 @@ def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, 
         assert fix.evidence.station == usual.evidence.station
         if fix.T_map_body is not None:
             np.testing.assert_allclose(fix.T_map_body, usual.T_map_body, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [(12, -4), (-14, 9)])
-def test_wrong_hint_is_not_accepted_without_other_candidates(world_map, world_drive, share):
-    localizer = voteless(Localizer(world_map))
-    localizer.hint_pose(pose_from(rot_z(0.4), [*share, small_world.SENSOR_HEIGHT]))
-    assert first_fix(follow(localizer, world_drive, 8)) is None
 
 
 @pytest.mark.slow
@@ -247,18 +223,6 @@ def test_continuous_odometry_is_the_only_hint_after_loss(world_map, world_drive)
     assert degrees < 0.5
 
 
-@pytest.mark.slow
-def test_jumped_odometry_hint_is_not_accepted_after_loss(world_map, world_drive):
-    localizer, k = lost(world_map, world_drive)
-    jump = pose_from(rot_z(0.7), [12.0, -5.0, 0.0])
-    for fix, truth in zip(
-        [localizer.step(world_drive.clouds[n], jump @ world_drive.T_odom_body[n], 0.5 * n) for n in range(k, 10)],
-        world_drive.T_map_body[k:],
-        strict=True,
-    ):
-        assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
-
-
 def test_odometry_frame_hint_is_kept_across_anchors():
     rng = np.random.default_rng(3)
     T_map_odom, T_odom_body = (exp_se3(rng.uniform(-1, 1, 6) * [0, 0, 3, 50, 50, 3]) for _ in range(2))
@@ -329,17 +293,6 @@ def test_followed_hint_is_one_place_and_waits_for_votes(world_map, world_drive, 
 # ---- acceptance
 
 
-def test_hint_waits_for_places_that_votes_name(world_map, world_drive):
-    """Whatever fits at the hint may fit elsewhere as well: without a rival there is nothing to compare it with."""
-    localizer = Localizer(world_map)
-    votes = name_instead(localizer.search, lambda found: found[1:] if len(votes) > 2 else [])
-    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
-    fixes = follow(localizer, world_drive, 3)
-    assert [fix.state for fix in fixes] == [State.AMBIGUOUS, State.AMBIGUOUS, State.TRACKING]
-    assert fixes[0].T_map_body is None
-    assert fixes[2].evidence.confidence > 1.0 - RULE.risk
-
-
 def test_poses_to_try_begin_at_the_guess_and_cover_its_surroundings():
     guess = PlaceGuess(10.0, 20.0, 0.5, distance=6.0, angle=np.radians(26))
     poses = guess.poses()
@@ -363,14 +316,6 @@ def test_guess_without_heading_tries_them_all():
 def test_impossible_guesses_are_refused(fields):
     with pytest.raises(ConfigError):
         PlaceGuess(**{"x": 1.0, "y": 2.0, **fields})
-
-
-def test_transforms_put_the_robot_where_it_is_guessed():
-    T_odom_body, origin = pose_from(rot_z(0.7), [3.0, -2.0, 1.0]), np.array([100.0, 200.0, 5.0])
-    guess = PlaceGuess(112.0, 205.0, -0.4)
-    T_map_body = guess.transforms(origin, T_odom_body)[0] @ T_odom_body
-    np.testing.assert_allclose(T_map_body[:2, 3], [12.0, 5.0])
-    assert yaw_of(T_map_body) == pytest.approx(-0.4)
 
 
 @pytest.mark.slow

@@ -98,37 +98,19 @@ def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_driv
 
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
-def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad):
+@pytest.mark.parametrize("part", ["prior", "registration"])
+def test_singular_prior_or_registration_is_rejected(world_map, world_drive, scan, bad, part, monkeypatch):
     truth = world_drive.T_map_body[4]
-    found = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
-    assert_no_hold(found, truth)
-    assert found.verdict.evidence is None
-
-
-@pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
-def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
-    truth, whole = world_drive.T_map_body[4], register
-    monkeypatch.setattr(map_matching, "register", lambda *given: whole(*given)._replace(information=bad))
-    found = matched(world_map, scan, Estimate(truth, TIGHT))
-    assert_no_hold(found, truth)
-    assert found.verdict.evidence is not None  # it is as good as ever, and does not help
-
-
-def assert_no_hold(found, truth):
+    if part == "prior":
+        found = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
+    else:
+        monkeypatch.setattr(map_matching, "register", lambda *given: register(*given)._replace(information=bad))
+        found = matched(world_map, scan, Estimate(truth, TIGHT))
+    assert (found.verdict.evidence is None) == (part == "prior")  # a registration's is as good as ever
     assert found.verdict.cause is RejectionReason.FITNESS
     assert found.verdict.reason.startswith("registration failed: ")
     assert found.verdict.innovation is None
     np.testing.assert_array_equal(found.T_map_body, truth)
-
-
-def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
-    truth = world_drive.T_map_body[4]
-    edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
-    belief = Estimate(boxplus(truth, edge), TIGHT)
-    target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
-    scales = CONFIG.registration.track
-    found = MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, belief)
-    assert found.verdict.cause is RejectionReason.OFF_MAP
 
 
 # ---- held against what lies metres beside

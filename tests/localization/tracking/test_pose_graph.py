@@ -99,19 +99,6 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
 # ---- a gap, a new start, refusals
 
 
-def test_restart_carries_nothing_over(graph):
-    way, elsewhere = drive(30, seed=10), pose_from(np.eye(3), [-50.0, 0.0, 0.0])
-    run(graph, way)
-    graph.start(elsewhere, REGISTRATION)
-    assert len(graph) == 1
-    graph.move(STEP, ODOMETRY)
-    fresh = PoseGraph(graph.config)
-    fresh.start(elsewhere, REGISTRATION)
-    fresh.move(STEP, ODOMETRY)
-    for a, b in zip(graph.estimate, fresh.estimate, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_empty_graph_raises(graph):
     def ask():
         return graph.estimate

@@ -150,18 +150,6 @@ def yard(seed=0, noise=0.02):
     return transform(np.linalg.inv(T_MAP_ODOM), some).astype(np.float32)
 
 
-def shares(target, T, count=5):
-    return [share_on_map(yard(seed), HERE, T, target) for seed in range(count)]
-
-
-def test_share_on_map_is_one_at_the_true_pose_and_falls_with_displacement(target):
-    assert min(shares(target, T_MAP_ODOM)) > 0.98
-    off = [np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0])))) for x in (0.0, 0.6, 5.3)]
-    assert off[0] > 1.2 * off[1]
-    assert off[1] > off[2]
-    assert off[2] < 0.5
-
-
 def test_ground_and_far_points_are_ignored(target):
     """Both are as one likes; the points between are where the map has them."""
     frame = yard()

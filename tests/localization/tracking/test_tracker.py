@@ -149,20 +149,6 @@ def test_buildings_that_are_gone_are_no_reason_to_doubt_the_place_where_others_s
     assert 1.0 <= doubts[0] < 1.05 < doubts[-1]  # it widens the protection level
 
 
-@pytest.mark.parametrize("seen", [0, 20, 90])
-def test_nearly_empty_frame_is_blind_despite_earlier_frames(world_map, world_drive, seen):
-    """Older frames make a scan denser; they do not say where the robot is now."""
-    ride = ride_of(world_map, world_drive)
-    truth = world_drive.T_map_body
-    assert ride.update(world_drive.clouds[4], truth[4]).verified
-    verdict = refused(ride, world_drive.clouds[5][:seen], truth[5])
-    assert verdict.cause is RejectionReason.BLIND
-    assert verdict.evidence is None
-    assert verdict.innovation is None
-    assert verdict.score == 0.0
-    assert ride.update(world_drive.clouds[5], truth[5]).verified
-
-
 def test_off_map_frame_is_not_compared(world_map, world_drive):
     far = pose_from(np.eye(3), [5000.0, 0.0, 1.7])
     ride = Ride.begin(world_map, None, world_drive.clouds[4], far)

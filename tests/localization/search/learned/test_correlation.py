@@ -23,15 +23,6 @@ def features(rng, *shape, smooth=1.0):
     return (values / np.linalg.norm(values, axis=0)).astype(np.float32)
 
 
-def seen_at(known, row, col, yaw, size):
-    """Query cut out of a map's features (C, H, W), its middle at (row, col), which may lie between cells."""
-    at = np.arange(size) - (size - 1) / 2
-    y, x = np.meshgrid(at, at, indexing="ij")
-    c, s = np.cos(yaw), np.sin(yaw)
-    where = [row + s * x + c * y, col + c * x - s * y]
-    return np.stack([ndimage.map_coordinates(channel, where, order=1) for channel in known]).astype(np.float32)
-
-
 def scores_of(query, weight, index, yaws, blocks=None):
     """Scores (K, H, W) of a query (C, h, h) and its weights, which are multiplied already."""
     return correlate(rotate_images(np.concatenate([query, weight[None]]), np.asarray(yaws)), index, False, blocks)
@@ -104,43 +95,6 @@ def test_correlation_equals_direct_sums(max_bytes, opposite):
     np.testing.assert_allclose(ours[scored], expected[scored], atol=1e-4)
 
 
-@pytest.mark.parametrize(("row", "col", "k"), [(30, 41, 0), (52, 20, 5), (9, 9, 8), (70, 118, 3)])
-def test_planted_place_is_found_with_its_heading(row, col, k):
-    rng = np.random.default_rng(2)
-    known = features(rng, 8, 80, 130)
-    query = seen_at(known, row, col, YAWS[k], 32)
-    query += rng.normal(0, 0.2, query.shape).astype(np.float32)
-    weight = disk(32)
-    scores = scores_of(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
-    assert np.unravel_index(scores.argmax(), scores.shape) == (k, row, col)
-
-
-def test_correlation_on_half_precision_map_smaller_than_query():
-    rng = np.random.default_rng(3)
-    known = features(rng, 8, 28, 26).astype(np.float16)
-    query = seen_at(known.astype(np.float32), 15, 12, YAWS[2], 32)
-    weight = disk(32)
-    scores = scores_of(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
-    assert np.unravel_index(scores.argmax(), scores.shape) == (2, 15, 12)
-
-
-def test_map_edge_does_not_bias_scores():
-    """A true place scores the same inside and where a third of the query hangs over; half over is not scored."""
-    rng = np.random.default_rng(4)
-    known = features(rng, 8, 100, 100)
-    weight = disk(32)
-    coarse = FeatureIndex(known, (0, 0))
-    inside, edge = (
-        scores_of(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col] for col in (50, 5)
-    )
-    assert edge == pytest.approx(inside, rel=0.05)
-    query = seen_at(known, 50, 5, 0.0, 32) * weight
-    scores = scores_of(query, weight, coarse, [0.0])[0]
-    assert np.isneginf(scores[50, 0])  # 54 % lie on the map
-    assert np.isneginf(scores[0, 0])
-    assert np.isfinite(scores[5:95, 16:84]).all()
-
-
 def centre_of(coarse, row, col):
     """x and y (..., 2) of the centres of cells, metres; between cells where the numbers are not whole."""
     return (np.stack([col, row], axis=-1) + 0.5) * coarse.cell + coarse.corner
@@ -163,26 +117,6 @@ def test_requested_blocks_score_as_in_full_correlation():
     assert scored.sum() < np.isfinite(whole).sum()
     np.testing.assert_allclose(part[scored], whole[scored], atol=1e-6)
     assert np.isneginf(scores_of(query, weight, coarse, YAWS[:3], coarse.blocks_near([(0, 5000)], 9.0))).all()
-
-
-def test_each_block_covers_only_its_own_cells():
-    coarse = FeatureIndex(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
-    answered = np.zeros((70, 130), int)
-    for block in range(len(coarse)):
-        answered[coarse.cells_of(block)] += 1
-        rows, cols = coarse.cells_of(block)
-        middle = centre_of(coarse, (rows.start + rows.stop - 1) / 2, (cols.start + cols.stop - 1) / 2)
-        assert coarse.blocks_near([middle], 0.5).tolist() == [block]
-    assert (answered == 1).all()
-
-
-def test_rotation_is_counter_clockwise():
-    image = np.zeros((1, 32, 32), np.float32)
-    image[0, 15:17, 24:26] = 1.0  # 9 cells along x from the middle
-    for yaw, (row, col) in ((0.0, (16, 25)), (np.pi / 2, (25, 16)), (np.pi, (16, 7))):
-        seen = rotate_images(image, np.array([yaw]))[:, :, 0, 0]
-        assert seen.shape == (33, 33)
-        assert np.unravel_index(seen.argmax(), seen.shape) == (row, col)
 
 
 def test_downsampled_cells_are_weighted_means():

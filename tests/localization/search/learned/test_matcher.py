@@ -198,14 +198,6 @@ def test_candidates_lie_within_the_area_that_is_searched(planted, stations, dens
         assert (np.hypot(*(stations[named[0], :2] - (-77.0, -43.0))) < 2.0) == (area.x < 0.0)
 
 
-def test_only_small_maps_are_prepared_for_full_search(planted, stations):
-    large = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0))
-    small = FeatureMatcher(planted.features, stations, LearnedConfig())
-    for known, prepared in ((large, {"rasters"}), (small, {"rasters", "_feature_blocks"})):
-        known.prepare()
-        assert {"rasters", "_feature_blocks"} & set(vars(known)) == prepared
-
-
 def at(xy, yaw, centre, z=0.0):
     """``T_map_odom`` of a robot at ``centre`` in its odometry."""
     return pose_from(rot_z(yaw), [*xy, z]) @ pose_from(np.eye(3), -centre)
