@@ -327,12 +327,7 @@ print("alive")
 """
 
 
-def said(program):
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
-    return done.returncode, done.stdout.strip(), done.stderr
-
-
 @pytest.mark.slow
 def test_no_input_aborts_the_process(kiss):
-    code, out, error = said(HOSTILE)
-    assert (code, out) == (0, "alive"), error
+    done = subprocess.run([sys.executable, "-c", HOSTILE], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "alive"), done.stderr

@@ -34,9 +34,6 @@ def chance_places(rng, count, structure=CHANCE, passed=PASSED, number=NUMBER, ke
     return rows.reshape(count, keyframes, len(Share))
 
 
-# ---- chance places that are not drawn as the model has it
-
-
 def two_kinds(rng, count, share, rich=(0.45, 0.2, 0.1, 0.25), poor=(0.05, 0.05, 0.05, 0.85), keyframes=1):
     """Observations (P, W, 7): a share of the places lies among buildings and explains much, the others hardly any."""
     among = rng.random(count) < share

@@ -118,9 +118,6 @@ def test_ground_parameters_follow_the_chance_places(rng, level):
     assert a / (a + b) == pytest.approx(level, abs=0.06)
 
 
-# ---- several keyframes
-
-
 def test_keyframes_that_see_something_else_each_leave_less_of_the_scatter(rng):
     left = left_in_mean(chance_places(rng, 500, keyframes=4))
     assert ((left > 0.2) & (left < 0.5)).all()  # a quarter, but for how uncertain it is

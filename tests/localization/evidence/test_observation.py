@@ -35,9 +35,6 @@ def beside(truth, count=60):
     return truth + np.column_stack([rng.uniform(-12, 12, (count, 2)), np.zeros(count), rng.uniform(-3, 3, count)])
 
 
-# ---- shares
-
-
 def test_shares_are_shares(world_map, scan, truth):
     for part in (scan.few, scan.many):
         for move in Move:
@@ -131,9 +128,6 @@ def test_scans_from_one_place_see_the_surroundings_of_one_and_those_from_afar_of
     assert surroundings([scan, other, other]) == pytest.approx(2.0, abs=0.1)
 
 
-# ---- evidence
-
-
 @pytest.fixture(scope="module")
 def evidence(world_map, world_drive):
     """Evidence for the third frame at a pose off by ``dx, dy, degrees``, as a function."""
@@ -162,9 +156,6 @@ def test_little_structure_scores_zero(world_map, scan):
     sparse = ObservedScan.of(bare, np.empty((0, 3), np.float32), scan.T_odom_body).evidence(world_map.field, ODOM)
     assert sparse.ground > 0.8
     assert sparse.near == sparse.covered == sparse.score == 0.0
-
-
-# ---- rays
 
 
 def fan(distance, repeat=1):

@@ -100,6 +100,23 @@ def test_point_to_point_system_matches_its_residuals():
     np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
 
 
+def test_pairs_and_prior_fuse_as_two_gaussians():
+    """From either mean the step leads to the one product of both."""
+    rng = np.random.default_rng(4)
+    A, B = (m @ m.T + 50 * np.eye(6) for m in 10 * rng.standard_normal((2, 6, 6)))
+    gap = np.array([1e-6, -2e-6, 3e-6, 0.003, -0.002, 0.005])  # small: turns add up to first order only
+    measured = gicp.retract(TILTED, gap, PIVOT)
+    prior = Prior(TILTED, B)
+    wanted = np.linalg.solve(A + B, A @ gap)
+    for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
+        step, information = gicp.fused_step(A, gradient, begin, PIVOT, prior)
+        np.testing.assert_array_equal(information, A + B)
+        found = gicp.retract(begin, step, PIVOT)
+        away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
+        np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
+        np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
+
+
 # ---- registrations
 
 

@@ -71,9 +71,6 @@ def test_sample_is_spread_over_the_map(world_map):
     assert len(sample(world_map, 1)) == 1
 
 
-# ---- virtual scan
-
-
 def seen(base_map, eye, changed=0.0):
     scan = virtual_scan(base_map, np.asarray(eye, dtype=np.float64), changed, LocalizerConfig().registration)
     assert scan is not None

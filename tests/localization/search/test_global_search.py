@@ -63,18 +63,12 @@ def off(T_map_odom):
     return np.linalg.norm((T_map_odom - T_MAP_ODOM)[:3, 3])
 
 
-# ---- what counts against a pose
-
-
 @pytest.mark.parametrize("share", SHARES)
 def test_every_evidence_share_but_the_surveyed_one_lowers_the_score(share):
     perfect = Evidence(1.0, 1.0, 1.0, 1.0, 1.0)
     assert perfect.score == replace(perfect, inside=0.1).score == 1.0
     assert replace(perfect, **{share: 0.25}).score == pytest.approx(0.5)
     assert replace(perfect, **{share: 0.0}).score == 0.0
-
-
-# ---- what is accepted
 
 
 def test_risk_alone_decides_what_is_accepted(never_sure, search, world_drive):
@@ -142,9 +136,6 @@ def test_place_whose_registration_leads_elsewhere_is_not_accepted(search, world_
     assert result.evidence.score > 0.8  # as the field has it
 
 
-# ---- what is kept
-
-
 def test_good_place_is_observed_again_without_votes(never_sure, world_drive):
     frames = run_of(world_drive, 3)
     first = never_sure.update(next(frames))
@@ -195,9 +186,6 @@ def test_result_carries_all_distinct_places_that_were_scored(search, world_drive
     yaw = np.arctan2(rivals.T_map_odom[:, 1, 0], rivals.T_map_odom[:, 0, 0])
     turn = np.abs((yaw[:, None] - yaw[None] + np.pi) % (2 * np.pi) - np.pi)
     assert ((gap >= 2.0) | (turn >= np.radians(5.0)) | np.eye(len(rivals), dtype=bool)).all()
-
-
-# ---- gravity
 
 
 def with_leaning_odometry(world_map, world_drive, gravity_sigma, max_tilt):

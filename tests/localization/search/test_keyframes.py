@@ -138,17 +138,6 @@ def test_keyframes_are_levelled_by_the_newest_calibration():
     assert len(leaning.recent(1)) == pytest.approx(len(straight.recent(1)), rel=0.1)
 
 
-def test_standing_robot_begins_its_search_anew_once_at_most():
-    """However the calibration goes back and forth: from the same position nothing new is seen."""
-    buffer = KeyframeBuffer(CONFIG)
-    anew = [
-        keyframe.begins_anew
-        for k in range(20)
-        if (keyframe := buffer.add(RawScan(cloud(0), at(0.0), Calibration(roll=0.1 * (k % 2))), float(k)))
-    ]
-    assert anew == [False, True]
-
-
 T_LOCAL = pose_from(ODOM_FAR[:3, :3], np.zeros(3))
 
 

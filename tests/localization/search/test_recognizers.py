@@ -67,9 +67,6 @@ def right(fixes, drive):
     return bool(posed) and all(metres < 0.3 and degrees < 1.0 for metres, degrees in errors)
 
 
-# ---- which are asked
-
-
 def test_auto_uses_both_recognizers_on_map_with_features(world_map, learned_map):
     both, coview_only = search_of(learned_map), search_of(world_map)
     assert both.coview is not None
@@ -97,9 +94,6 @@ def test_learned_recognizer_refuses_map_without_features(world_map):
 def test_each_recognizer_has_its_own_limit_of_hypotheses(learned_map):
     assert search_of(learned_map, peaks=2).learned.consensus.config.peaks == 2
     assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == LocalizerConfig().consensus.peaks
-
-
-# ---- what they name
 
 
 def test_learned_recognizer_alone_localizes(learned_map, world_drive):

@@ -12,13 +12,11 @@ from bench.accuracy.paper import TableVote
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import DescriptorConfig
-from coview_stream.descriptors.coview import describe
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import Circle, pose_from
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search import retrieval
-from coview_stream.localization.search.consensus import yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, PoseHints
 from coview_stream.localization.search.recognizers import SearchIndex
@@ -121,26 +119,6 @@ def test_candidates_are_the_best_headings_of_the_best_stations(stations, query):
     assert (best <= scores[station, (shift + 1) % S]).all()
     assert (best < scores[station, shift - 1]).all()
     assert best[0] == scores.min()
-
-
-@pytest.mark.parametrize("turn", [0, 1, 5, 11])
-def test_robot_turned_left_is_found_at_its_heading(turn):
-    """Eq. 9: shift n means that the robot's x axis points at yaw -2 pi n / S in the map."""
-    rng = np.random.default_rng(12)
-    config = DescriptorConfig(radius=20.0, rings=R, sectors=S, channels=("scan_context",))
-    places = [
-        np.column_stack([rng.uniform(-20, 20, (60, 2)), rng.uniform(0.5, 9, 60)]).astype(np.float32) for _ in range(12)
-    ]
-    there = Stations()
-    there.full = {"scan_context": np.stack([describe(p, np.zeros(3), config)["scan_context"] for p in places])}
-    yaw = 2 * np.pi * turn / S
-    c, s = np.cos(yaw), np.sin(yaw)
-    seen = places[8].astype(np.float64) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # map -> body: inverse turn
-    query = describe(seen.astype(np.float32), np.zeros(3), config)["scan_context"]
-    volume = exact_distances(there.full["scan_context"], query)
-    station, shift = np.unravel_index(volume.argmin(), volume.shape)
-    assert station == 8
-    assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)
 
 
 @pytest.fixture

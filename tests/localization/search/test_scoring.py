@@ -60,9 +60,6 @@ def is_right(place, scan, metres=0.4):
     return np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < np.radians(1.5)
 
 
-# ---- one keyframe
-
-
 def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan):
     near = [
         hypothesis(off(0.3, 0.2, 1.0, scan), station=None),
@@ -127,9 +124,6 @@ def test_scan_without_structure_or_hypotheses_is_found_nowhere(scorer, scan, wor
     found = scored(scorer, [hypothesis(ODOM)], flat)
     assert found.rivals.scores.tolist() == [0.0]
     assert found.error > 1e-2
-
-
-# ---- several keyframes
 
 
 def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map, world_drive):

@@ -113,9 +113,6 @@ def test_singular_prior_or_registration_is_rejected(world_map, world_drive, scan
     np.testing.assert_array_equal(found.T_map_body, truth)
 
 
-# ---- held against what lies metres beside
-
-
 def held(world_map, scan, belief):
     """The matches from a belief that may be metres off, the first with it as it is."""
     matcher = MapMatcher(world_map, CONFIG)

@@ -33,6 +33,7 @@ from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.tracker import Tracker
 
 RULE = AcceptanceConfig()
+WIDE = LocalizerConfig(tracking=TrackingConfig(window=20.0, min_points=30_000))  # all scans so far are one
 
 
 # ---- one that is believed
@@ -178,8 +179,7 @@ def test_pose_tilted_beyond_limit_is_rejected(world_map, world_drive, limit):
 
 def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
     """Though the window would reach back over all of it."""
-    wide = TrackingConfig(window=20.0, min_points=30_000)
-    ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    ride = ride_of(world_map, slow_drive, WIDE, 0)
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     for k in range(1, 4):
         assert ride.update(clouds[k], truth[k]).verified
@@ -193,13 +193,12 @@ def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
 
 
 def test_newest_only_uses_the_newest_frame(world_map, slow_drive):
-    wide = TrackingConfig(window=20.0, min_points=30_000)
-    ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    ride = ride_of(world_map, slow_drive, WIDE, 0)
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     for seed in range(3):
         ride.see(garbage(seed), truth[1])
     assert ride.update(clouds[1], truth[1], newest_only=True).score > 0.9
-    again = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    again = ride_of(world_map, slow_drive, WIDE, 0)
     for seed in range(3):
         again.see(garbage(seed), truth[1])
     assert again.update(clouds[1], truth[1]).score < 0.8
@@ -358,14 +357,13 @@ def test_repeated_registrations_while_standing_do_not_shrink_covariance(world_ma
 
 def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_drive):
     """It may have been carried meanwhile: the frames before the last look are of another place."""
-    wide = LocalizerConfig(tracking=TrackingConfig(window=20.0, min_points=30_000))
-    ride = on_the_way(world_map, slow_drive, wide, 4)
+    ride = on_the_way(world_map, slow_drive, WIDE, 4)
     for k in (1, 2):
         ride.see(garbage(k), slow_drive.T_map_body[4])
     verdict = ride.update(garbage(3), slow_drive.T_map_body[4], standing_still=True)
     assert not verdict.verified
     assert verdict.ratio < -5.0
-    moving = on_the_way(world_map, slow_drive, wide, 4)
+    moving = on_the_way(world_map, slow_drive, WIDE, 4)
     for k in (1, 2):
         moving.see(garbage(k), slow_drive.T_map_body[4])
     assert moving.update(garbage(3), slow_drive.T_map_body[4]).score > verdict.score

@@ -10,9 +10,7 @@ from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.localization.registration.register import swap_rotation_translation
 from coview_stream.localization.tracking.motion import ScanBuffer
-from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 SETTINGS = TrackingConfig()
 NOTHING = np.zeros((20, 3), np.float32)
@@ -36,9 +34,6 @@ def straight(step, count=200):
 
 def turning(angles):
     return [pose_from(rot_z(angle), np.zeros(3)) for angle in angles]
-
-
-# ---- when it is due
 
 
 def test_no_registration_is_needed_while_standing(world_map):
@@ -99,9 +94,6 @@ def test_no_registration_is_needed_right_after_an_update_or_a_rejection(world_ma
     assert ride.tracker.needs_registration()
 
 
-# ---- from what
-
-
 def scan_buffer(points, frames, step, **settings):
     """A buffer of frames ``step`` metres apart, each of so many points at its own number."""
     buffer = ScanBuffer(TrackingConfig(**settings), CalibrationEstimator())
@@ -128,9 +120,6 @@ def test_scan_buffer_window_adapts_to_point_count(points, metres, first):
 def test_scan_buffer_drops_old_frames():
     """A robot that never gets its points together, on a robot that runs for weeks."""
     assert len(scan_buffer(10, 300, 0.01, min_points=10**6).window()) <= 400
-
-
-# ---- how unsure
 
 
 def test_update_before_start_raises(world_map, world_drive):
@@ -177,16 +166,3 @@ def test_late_fix_has_larger_covariance(world_map):
         sigmas.append(np.diag(tracker.predicted_covariance()))
     expected = tracker.odometry.drift.variances(3.0, 0.0)
     np.testing.assert_allclose(sigmas[1] - sigmas[0], expected, rtol=0.01)
-
-
-def test_reported_covariance_is_translation_first_with_shared_error(started, world_map):
-    tracker, covariance = started
-    predicted = covariance(pose_from(rot_z(0.3), [2.0, 1.0, 0.0]))
-    reported = tracker.reported_covariance()
-    shared = SharedErrorModel(tracker.config.registration).covariance  # nothing has been registered yet
-    np.testing.assert_allclose(reported, swap_rotation_translation(predicted + shared))
-    assert reported[0, 0] == pytest.approx(predicted[3, 3] + shared[3, 3])
-    assert reported[0, 5] == pytest.approx(predicted[3, 2])
-
-
-# ---- what it learns of odometry

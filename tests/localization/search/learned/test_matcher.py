@@ -284,16 +284,6 @@ def test_station_has_the_cells_of_its_block(planted, block, cell):
             assert cells.size[k, number] == len(inside)
 
 
-def test_four_metre_blocks_find_a_place_anywhere_inside(planted):
-    axis = np.arange(2.0, TILES * TILE, 4.0)
-    xy = np.stack(np.meshgrid(axis + LOW[0] * TILE, axis + LOW[1] * TILE), axis=-1).reshape(-1, 2)
-    places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
-    known = FeatureMatcher(planted.features, places, LearnedConfig(), block=4.0)
-    for place in ((21.0, 33.0), (23.0, 33.0), (21.0, 35.0), (23.0, 35.0)):
-        stations, _ = known.vote(planted.seen(place, 0.0, np.zeros(3))).candidates()
-        np.testing.assert_allclose(places[stations[0], :2], (22.0, 34.0))
-
-
 HERE, THERE, SHIFT = (5.0, -7.0), (-15.0, 11.0), 7
 
 
