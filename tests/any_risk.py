@@ -8,7 +8,6 @@ from coview_stream.config import AcceptanceConfig
 
 
 def with_risk(risk: float) -> AcceptanceConfig:
-    """The usual rule with any risk."""
     rule = AcceptanceConfig()
     object.__setattr__(rule, "risk", risk)
     return rule

@@ -23,7 +23,6 @@ class BadLink:
         assert self._conn.recv() == "ready"
 
     def mode(self, name: str) -> None:
-        """Go over to a mode."""
         self._conn.send(name)
 
     def __enter__(self) -> BadLink:

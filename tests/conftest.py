@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import small_world
+from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
@@ -122,9 +123,7 @@ def elsewhere():
 @pytest.fixture(scope="session")
 def world_fixes(world_map, world_drive):
     """What a localizer says of the drive, frame by frame."""
-    localizer = Localizer(world_map)
-    pairs = zip(world_drive.clouds, world_drive.T_odom_body, strict=True)
-    return [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+    return follow(Localizer(world_map), world_drive)
 
 
 @pytest.fixture(scope="session")

@@ -34,14 +34,8 @@ class Truth(Told):
         self.truth = list(T_map_body)
 
     def register(self, points, guess):
-        first = self.truth[0]
-        answer = super().register(points, guess) if not self.guesses else None
-        if answer is not None:
-            self.start = answer
-        else:
-            self.frames.append(points)
-            self.guesses.append(guess)
-        return self.start @ inverse(first) @ self.truth[len(self.guesses) - 1]
+        super().register(points, guess)
+        return self.guesses[0] @ inverse(self.truth[0]) @ self.truth[len(self.guesses) - 1]
 
 
 def frame(scene, tilt=(0.0, 0.0)):

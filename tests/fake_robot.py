@@ -123,7 +123,6 @@ class Robot:
         self.session.on_odometry(odometry(seconds, **place), self.now)
 
     def saw(self, seconds, now=None, **fields):
-        """Send a cloud of a sensor time."""
         self.now = 1000.0 + seconds if now is None else now
         self.session.on_cloud(cloud(seconds, **fields), self.now)
 
@@ -163,12 +162,10 @@ def numbered(sequence, seconds):
 
 
 def reason(robot):
-    """What people are told."""
     return robot.session.state()[1]
 
 
 def state(robot):
-    """What a session knows."""
     return robot.session.state()[0]
 
 

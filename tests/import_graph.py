@@ -68,7 +68,6 @@ BELOW_ALL = ("version", "errors")
 
 
 def modules() -> dict[str, Path]:
-    """Return the package's modules by dotted name."""
     return {
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
         for path in PACKAGE.rglob("*.py")

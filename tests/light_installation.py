@@ -57,7 +57,6 @@ LACKING = (
 
 
 def run(folder: Path, map_path: Path, arguments: list[str], block: bool) -> subprocess.CompletedProcess[str]:
-    """Run a command in a process of its own."""
     words = [str(map_path) if word == "MAP" else word for word in arguments]
     start = f"BLOCKED = {set(EXTRA_OF)!r}{BLOCK}" if block else "import sys"
     script = f"{start}\nfrom coview_stream.cli import main\nsys.exit(main(sys.argv[1:]))"
@@ -89,7 +88,6 @@ def check_commands(folder: Path, map_path: Path, block: bool) -> None:
 
 
 def write_inputs(folder: Path) -> None:
-    """Write a cloud, a run of one frame and a trajectory."""
     cloud = np.random.default_rng(1).uniform(-20, 20, (2000, 3)).astype(np.float32)
     np.save(folder / "cloud.npy", cloud)
     (folder / "run" / "frames").mkdir(parents=True)
@@ -118,7 +116,6 @@ def check_client() -> None:
 
 
 def lacks(extra: str, act: Callable[[], object]) -> None:
-    """Assert that something asks for an extra."""
     try:
         act()
     except DependencyError as error:

@@ -125,7 +125,6 @@ class Drive:
 
 
 def record(scene: list[Box], T_odom_map: np.ndarray = ODOM_FAR, frames: int = FRAMES) -> Drive:
-    """Scan every frame of the drive."""
     truth = drive(frames)
     clouds = [scan(scene, T, seed) for seed, T in enumerate(truth)]
     return Drive(clouds, [T_odom_map @ T for T in truth], truth)
@@ -163,7 +162,6 @@ def in_map(drive: Drive, count: int) -> np.ndarray:
 
 
 def write_run(folder: Path, drive: Drive, frames: int = FRAMES) -> Path:
-    """Write a run directory of the public layout."""
     (folder / "frames").mkdir(parents=True)
     for k in range(frames):
         write_cloud(folder / "frames" / f"{k:06d}.ply", drive.clouds[k])

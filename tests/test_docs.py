@@ -122,7 +122,6 @@ def unknown_names(text):
 
 @cache
 def docstrings(path):
-    """Docstrings and comments of a module."""
     text = path.read_text(encoding="utf-8")
     strings = [
         node.value.value

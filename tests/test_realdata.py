@@ -9,10 +9,14 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from nightly import nightly
+from scipy.spatial import cKDTree
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
+from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.report.evaluation import evaluate
 
@@ -53,6 +57,16 @@ def test_real_run_is_localized(located):
     assert verdict.translation.mean < 0.08
     assert verdict.rotation.mean < 0.3
     assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("located", ["riverside_a"], indirect=True)
+def test_map_of_a_site_in_utm_coordinates_lies_where_its_survey_does(located):
+    _, _, folder, out = located
+    base_map, survey = BaseMap.load(out / "site.coview"), read_cloud(folder / "base.laz")
+    distance, _ = cKDTree(survey.map_points()).query(base_map.world_points())
+    assert np.quantile(distance, 0.99) < 0.22  # half the diagonal of a voxel of 0.25 m
+    assert np.abs(base_map.points).max() < 2000.0
 
 
 @pytest.mark.slow

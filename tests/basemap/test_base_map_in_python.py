@@ -12,9 +12,7 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.sources import sources_of
 from coview_stream.errors import CloudError, ConfigError, CoViewWarning, DependencyError, MapError
-
-SMALL = {"radius": 15.0, "rings": 6, "sectors": 12}
-UTM = np.array([512_345.6, 5_403_210.9, 287.4])
+from tests.basemap.test_build import SMALL, UTM
 
 
 @pytest.fixture(scope="module")

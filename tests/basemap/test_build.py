@@ -18,14 +18,10 @@ SMALL = {"radius": 15.0, "rings": 6, "sectors": 12}
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
 
-def corner_of_the_world(map_points):
-    """20 x 20 m of the small world."""
-    return map_points[(np.abs(map_points[:, :2] + 5.0) < 10.0).all(axis=1)]
-
-
 @pytest.fixture(scope="module")
 def cut(map_points):
-    return corner_of_the_world(map_points)
+    """20 x 20 m of the small world."""
+    return map_points[(np.abs(map_points[:, :2] + 5.0) < 10.0).all(axis=1)]
 
 
 @pytest.fixture(scope="module")

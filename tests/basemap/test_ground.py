@@ -15,6 +15,7 @@ from coview_stream.basemap.stations import find_stations
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rasters import filled
 
+Scene = tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]
 METHODS = [
     pytest.param("cloth", marks=pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")),
     "morphological",
@@ -33,7 +34,7 @@ def _hills(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+def scene() -> Scene:
     """Rolling ground without returns below two houses; trees over ground; a few echoes from below."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(-50, 50, (60_000, 2))
@@ -52,9 +53,7 @@ def scene() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_ground_mask_of_hills_houses_and_trees(
-    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], method: str
-) -> None:
+def test_ground_mask_of_hills_houses_and_trees(scene: Scene, method: str) -> None:
     points, truth = scene
     mask = ground_mask(points, method)
     assert mask.shape == (len(points),)
@@ -64,11 +63,7 @@ def test_ground_mask_of_hills_houses_and_trees(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_ground_filter_prints_nothing_and_leaves_no_files(
-    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
-    method: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    scene: Scene, method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     sys.stdout.write("before\n")
@@ -79,7 +74,7 @@ def test_ground_filter_prints_nothing_and_leaves_no_files(
 
 
 def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
-    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], monkeypatch: pytest.MonkeyPatch
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = scene[0]
     expected = ground_mask(points, "morphological")
@@ -91,9 +86,7 @@ def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
 
 
 @pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")
-def test_cloth_filter_is_the_default_where_available(
-    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
-) -> None:
+def test_cloth_filter_is_the_default_where_available(scene: Scene) -> None:
     points = scene[0]
     assert ground_filter(points) == "cloth"
     assert ground_filter(points[points[:, 0] ** 2 < 4.0]) == "morphological"

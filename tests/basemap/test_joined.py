@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import small_world
 from small_world import pose_error
+from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import check_arrays
@@ -39,18 +40,13 @@ def both(world_map, upper):
     return join_maps({"ground": world_map, "upper": upper})
 
 
-def follow(base_map, drive):
-    localizer = Localizer(base_map)
-    return [localizer.step(c, T, 0.5 * k) for k, (c, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True))]
-
-
 def test_robot_is_found_on_its_map_and_its_pose_is_in_that_maps_frame(both, world_drive):
     parts = MapParts.of(both.parameters)
     for name, drive, zero in (
         ("ground", world_drive, np.zeros(3)),
         ("upper", small_world.record(small_world.boxes(seed=77)), FAR),
     ):
-        fixes = follow(both, drive)
+        fixes = follow(Localizer(both), drive)
         posed = [k for k, fix in enumerate(fixes) if fix.T_map_body is not None]
         assert posed, name
         for k in posed:
@@ -63,7 +59,7 @@ def test_robot_is_found_on_its_map_and_its_pose_is_in_that_maps_frame(both, worl
 
 
 def test_robot_that_fits_two_maps_alike_is_on_neither(world_map, world_drive):
-    fixes = follow(join_maps({"first": world_map, "second": world_map}), world_drive)
+    fixes = follow(Localizer(join_maps({"first": world_map, "second": world_map})), world_drive)
     assert all(fix.T_map_body is None for fix in fixes)
     assert State.AMBIGUOUS in {fix.state for fix in fixes}
 

@@ -17,19 +17,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, Trust, VerifyKey, file_identity, make_keys, read_verify_key
 from coview_stream.errors import DependencyError, InputError, MapError
 from coview_stream.stream.node.engines import open_engine
-
-PARAMETERS = {"config": {"block": 2.0}, "crs": 'PROJCS["Zürich"]', "sources": {"a.laz": "00ff"}}
-SECTIONS = ("points", "tile_index", "normals")
-
-
-def arrays(seed=0):
-    rng = np.random.default_rng(seed)
-    return {
-        "points": rng.normal(size=(40, 3)).astype(np.float32),
-        "tile_index": np.arange(8).reshape(2, 4),
-        "normals": rng.integers(-127, 128, (40, 3)).astype(np.int8),
-        "empty": np.empty((0, 3), np.float32),
-    }
+from tests.basemap.test_file_format import PARAMETERS, arrays
 
 
 @pytest.fixture(scope="module")

@@ -32,15 +32,6 @@ def test_raster_cells_hold_max_height_and_voxel_count():
     assert raster.top[2, 2] == 0.0
 
 
-def test_raster_counts_voxels_not_points():
-    points = np.random.default_rng(0).uniform(-10, 10, (3000, 3)).astype(np.float32)
-    corner = aligned_corner(points, 2.0, 0.5)
-    one = rasterise(points, corner, 0.5, 0.5)
-    two = rasterise(np.concatenate([points, points]), corner, 0.5, 0.5)
-    np.testing.assert_array_equal(one.count, two.count)
-    np.testing.assert_array_equal(one.top, two.top)
-
-
 @pytest.mark.parametrize("low", [-7.3, -6.0, 0.0, 3.999, 1001.2])
 @pytest.mark.parametrize(("block", "cell"), [(2.0, 0.5), (1.0, 0.5), (3.0, 0.5)])
 def test_station_centres_are_cell_centres_of_an_aligned_raster(low, block, cell):
@@ -154,14 +145,6 @@ def test_raster_descriptor_bins_are_close_to_exact_bins(both, channel, share, di
     assert (1 - cosine).mean() < distance
 
 
-def test_every_station_matches_itself_best(both):
-    """The map's descriptors pick their own station out of the exact ones, and the other way round."""
-    found, exact = (a.reshape(len(a), -1) for a in both["scan_context"])
-    score = found @ exact.T / np.linalg.norm(found, axis=1)[:, None] / np.linalg.norm(exact, axis=1)
-    np.testing.assert_array_equal(score.argmax(axis=0), np.arange(len(found)))
-    np.testing.assert_array_equal(score.argmax(axis=1), np.arange(len(found)))
-
-
 BLOCK = 2.0
 
 
@@ -171,19 +154,9 @@ def stations_of(side=6, z=0.0):
     return np.column_stack([x.ravel(), y.ravel(), np.full(side * side, z)]).astype(np.float32)
 
 
-@pytest.mark.parametrize("step", [[3, 0], [0, 3], [-4, 0], [0, -5], [2, -1], [-50, 0], [0, 1000], [0, 0], [1, -6]])
-def test_stations_a_step_apart_are_found_and_none_beyond_the_edges(step):
-    stations = stations_of()
-    goal = stations + np.array([*np.array(step) * BLOCK, 0.0])
-    found = StationGrid(stations, BLOCK).at(goal)
-    for m in range(len(stations)):
-        there = np.flatnonzero(np.abs(stations[:, :2] - goal[m, :2]).max(axis=1) < 0.1)
-        assert found[m] == (there[0] if len(there) else -1)
-
-
 def test_a_cell_reaches_to_its_edges_and_belongs_to_one_station():
     grid = StationGrid(stations_of()[::5], BLOCK)
-    places = np.random.default_rng(0).uniform(-9, 14, (500, 3))
+    places = np.concatenate([np.random.default_rng(0).uniform(-9, 14, (500, 3)), [[-100, 0, 0], [0, 2000, 0]]])
     for position, found in zip(places, grid.at(places), strict=True):
         near = np.flatnonzero((np.abs(grid.stations[:, :2] - position[:2]) < 0.5 * BLOCK).all(axis=1))
         assert found == (near[0] if len(near) else -1)

@@ -35,7 +35,6 @@ class Handler(SimpleHTTPRequestHandler):
         """Say nothing."""
 
     def do_GET(self) -> None:
-        """Answer with the file, or the part that is asked for."""
         if type(self).busy:
             type(self).busy -= 1
             self.send_error(503)
@@ -62,7 +61,6 @@ def points() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def site(points: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a COPC file of them."""
     path = tmp_path_factory.mktemp("copc") / "site.copc.laz"
     assert write_copc(path, points) > 10
     return path
@@ -70,24 +68,23 @@ def site(points: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextlib.contextmanager
 def served_folder(folder: Path) -> Iterator[str]:
-    """Serve a folder, and yield its address."""
     Handler.ranges, Handler.sent, Handler.busy = True, [], 0
     served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
     threading.Thread(target=served.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{served.server_address[1]}"
-    served.shutdown()
-    served.server_close()
+    try:
+        yield f"http://127.0.0.1:{served.server_address[1]}"
+    finally:
+        served.shutdown()
+        served.server_close()
 
 
 @pytest.fixture
 def server(site: Path) -> Iterator[str]:
-    """Return the address of a server of its folder."""
     with served_folder(site.parent) as address:
         yield address
 
 
 def inside(points: np.ndarray) -> np.ndarray:
-    """Return the points in the window."""
     return points[((points[:, :2] >= WINDOW.low) & (points[:, :2] <= WINDOW.high)).all(axis=1)]
 
 

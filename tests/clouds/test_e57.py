@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 
 import numpy as np
 import pytest
@@ -55,6 +56,6 @@ def test_changed_bytes_cost_an_error_or_points(two_scans, seed):
 
 
 def test_missing_library_is_named_with_its_extra(two_scans, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pye57", None)
+    monkeypatch.setitem(sys.modules, "pye57", None)
     with pytest.raises(DependencyError, match="pye57"):
         read_cloud(two_scans)

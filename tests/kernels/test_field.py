@@ -51,6 +51,11 @@ def scan_at(points: np.ndarray, pose: np.ndarray, rng: np.random.Generator) -> F
     return FieldScan(*seen)
 
 
+def plan_of(scan: FieldScan, levels: int, coarse: bool) -> Plan:
+    few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
+    return Plan(scan.structure, scan.low, scan.free, *few, levels, coarse)
+
+
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     rng = np.random.default_rng(11)
@@ -87,14 +92,9 @@ def test_kernel_agrees_with_its_numpy_twin(scene: Scene):
     field, scan, pose, others = scene
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
-    few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
-    for move, levels, coarse in (
-        (kernels.Move.NONE, 0, False),
-        (kernels.Move.FAR, 2, True),
-        (kernels.Move.NEAR, 2, False),
-    ):
-        plan = Plan(scan.structure, scan.low, scan.free, *few, levels, coarse)
-        poses, counts = reference.field_scores(field.layers, plan, starts - corner)
+    Move = kernels.Move
+    for move, levels, coarse in ((Move.NONE, 0, False), (Move.FAR, 2, True), (Move.NEAR, 2, False)):
+        poses, counts = reference.field_scores(field.layers, plan_of(scan, levels, coarse), starts - corner)
         found = kernels.field_scores(field, scan, starts, move)
         # a point on a cell's edge may round to either side; a few of a thousand do
         same = (np.abs(found.pose - poses - corner) < 0.02).all(axis=1)
@@ -200,12 +200,9 @@ def test_tiles_beyond_what_32_bits_count_are_looked_up(scene: Scene, tmp_path: P
         sparse[name] = made
     large = layers._replace(table=number.astype(np.int32), **sparse)
     assert large.bits.size > 2**31
-    structure, low, free = scan.structure, scan.low, scan.free
-    few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
-    plan = Plan(structure, low, free, *few, 2, True)
     corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
     starts = np.vstack([others, pose]) - corner
     found = field_module._native if kernels.backend() != "numpy" else reference.field_scores
-    both = (kernels.submit(found, each, plan, starts.copy()) for each in (layers, large))
+    both = (kernels.submit(found, each, plan_of(scan, 2, True), starts.copy()) for each in (layers, large))
     for one, other in zip(*both, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -56,17 +56,13 @@ def test_what_a_window_brought_into_memory_is_released(tmp_path, windows):
     assert resident_bytes() - before < 12 << 20
 
 
-def test_rows_are_copied_in_the_order_asked_for(windowed, tmp_path):
+def test_rows_are_copied_in_the_order_asked_for_and_missing_ones_refused(windowed, tmp_path):
     array = stored(np.arange(50_000, dtype=np.int32).reshape(-1, 5), tmp_path / "a.npy")
     rows = np.random.default_rng(3).integers(0, len(array), 700)
     for given in (array, np.array(array)):
         np.testing.assert_array_equal(take_rows(given, rows), array[rows])
     assert take_rows(array, rows[:0]).shape == (0, 5)
     assert take_rows(array[:0], rows[:0]).shape == (0, 5)
-
-
-def test_rows_that_are_not_there_are_refused(windowed, tmp_path):
-    array = stored(np.arange(50_000, dtype=np.int32).reshape(-1, 5), tmp_path / "a.npy")
     for given in (array, np.array(array)):
         with pytest.raises(IndexError):
             take_rows(given, np.array([3, len(array)]))

@@ -102,16 +102,6 @@ def test_polar_index_rotates_with_the_cloud(seed):
     np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
 
 
-@pytest.mark.slow
-def test_polar_bin_of_two_million_points():
-    points = np.random.default_rng(2).normal(0, 20, (2_000_000, 3)).astype(np.float32)
-    points[::500, 1] = np.inf
-    grid, dropped = polar_bin(points, (1.0, 2.0, -1.5), 20, 60, 50.0)
-    expected, expected_dropped = reference.polar_bin(points, np.array([1.0, 2.0, -1.5]), 20, 60, 50.0)
-    assert_same(grid, expected)
-    assert dropped == expected_dropped == 4000
-
-
 @st.composite
 def rasters(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))

@@ -78,13 +78,6 @@ def test_empty_query_has_distance_one_everywhere():
     np.testing.assert_array_equal(all_shift_distance(np.zeros((4, 6)), spectra, 6), np.ones((3, 6)))
 
 
-def test_column_spectra_of_many_candidates():
-    desc = np.random.default_rng(4).normal(size=(2500, 2, 5)).astype(np.float32)
-    spectra = column_spectra(desc)
-    expected = np.fft.rfft(unit_columns(desc), axis=-1).transpose(2, 0, 1)
-    np.testing.assert_allclose(spectra, expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("rings", [3, 5000])
 def test_all_shift_distance_of_many_candidates(rings):
     rng = np.random.default_rng(8)

@@ -9,7 +9,7 @@ import pytest
 
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.report.evaluation import driven, evaluate, frame_errors
+from coview_stream.report.evaluation import evaluate, frame_errors
 
 STAMPS = 1000.0 + 0.1 * np.arange(20)
 
@@ -120,10 +120,6 @@ def test_error_at_the_odometry_origin_contains_the_lever_arm():
     estimated = pose_from(np.eye(3), [100.0, 1.5, 2.0])
     verdict = evaluate(straight_truth(), straight_truth(), (estimated, true))
     assert verdict.origin_t_m == pytest.approx(2.5)
-
-
-def test_driven_distance():
-    assert driven(straight_truth()[1])[-1] == pytest.approx(38.0)
 
 
 def test_empty_truth_is_refused():

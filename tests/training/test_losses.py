@@ -30,10 +30,9 @@ def scene(seed: int) -> tuple[tuple, tuple, object, object]:
         grid = torch.stack([c * x - s * y + px, s * x + c * y + py], -1) / (PIECE / 2)
         looks.append(torch.nn.functional.grid_sample(maps[owner][None], grid[None], align_corners=False)[0])
     local = torch.stack(looks)
-    sigma_q, sigma_p = torch.ones(4, 1, QUERY, QUERY), torch.ones(2, 1, PIECE, PIECE)
-    place_q = torch.nn.functional.avg_pool2d(local, 4)
-    place_p = torch.nn.functional.avg_pool2d(maps, 4)
-    return (local, sigma_q, place_q), (maps, sigma_p, place_p), piece_of, poses
+    pooled = torch.nn.functional.avg_pool2d
+    query, piece = ((each, ones, pooled(each, 4)) for each, ones in zip((local, maps), SEEN, strict=True))
+    return query, piece, piece_of, poses
 
 
 @pytest.mark.parametrize("error", [(6.0, 0.0, 0.0), (0.0, -6.0, 0.0), (0.0, 0.0, 0.5)])

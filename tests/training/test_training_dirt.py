@@ -14,11 +14,9 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import TRAINED_DIRT, DriveDirt, trained_sensor
 from coview_stream.training.train import SMOKE, train_session
 from coview_stream.training.worlds import draw_world, submaps
+from tests.training.test_submaps import TINY as FOREST
 
-TINY = Recipe(
-    built=0.0, size=(80.0, 80.0), slope=(0.0, 5.0), stems=(150.0, 200.0), rays=6000, pulses=(3.0, 3.0),
-    travel=(3.0, 5.0), understory=(0.0, 0.0), submaps=2, sensors=("os64",),
-)  # fmt: skip
+TINY = replace(FOREST, submaps=2, sensors=("os64",))
 SEED = 19_513
 
 

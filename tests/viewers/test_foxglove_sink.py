@@ -1,4 +1,4 @@
-"""What Foxglove shows: a recording is read back, and a client of the server sees the same topics."""
+"""The view in Foxglove: a recording is read back, and a client of the server sees the same topics."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from coview_stream.basemap.summary import MapView
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
+from coview_stream.viewers.foxglove_sink import FoxgloveSink
 from coview_stream.viewers.scene import Scan
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not there; pip install 'coview-stream[foxglove]'")
@@ -30,14 +31,8 @@ def shown(sink):
     sink.scan(Scan("r1", 6_000_000_000, POINTS, T))
 
 
-def opened():
-    from coview_stream.viewers.foxglove_sink import FoxgloveSink
-
-    return FoxgloveSink()
-
-
 def test_recording_holds_every_topic_in_schemas_of_foxglove(tmp_path):
-    sink = opened()
+    sink = FoxgloveSink()
     sink.record(tmp_path / "a.mcap")
     shown(sink)
     sink.close()
@@ -59,7 +54,7 @@ def test_recording_holds_every_topic_in_schemas_of_foxglove(tmp_path):
 
 
 def test_recording_of_nothing_is_not_left_behind(tmp_path):
-    sink = opened()
+    sink = FoxgloveSink()
     sink.record(tmp_path / "a.mcap")
     sink.close()
     assert not (tmp_path / "a.mcap").exists()
@@ -68,19 +63,19 @@ def test_recording_of_nothing_is_not_left_behind(tmp_path):
 def test_recording_does_not_overwrite_and_names_what_is_wrong(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"mine")
     with pytest.raises(InputError, match=r"a\.mcap: is there already"):
-        opened().record(tmp_path / "a.mcap")
+        FoxgloveSink().record(tmp_path / "a.mcap")
     with pytest.raises(InputError, match="cannot be written"):
-        opened().record(tmp_path / "none" / "a.mcap")
+        FoxgloveSink().record(tmp_path / "none" / "a.mcap")
 
 
 def test_server_listens_where_it_is_told_and_says_where_it_cannot():
-    sink = opened()
+    sink = FoxgloveSink()
     port = sink.serve("127.0.0.1", 0)
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=5):
             pass
         shown(sink)
         with pytest.raises(ConfigError, match=f"--foxglove 127.0.0.1:{port}"):
-            opened().serve("127.0.0.1", port)
+            FoxgloveSink().serve("127.0.0.1", port)
     finally:
         sink.close()

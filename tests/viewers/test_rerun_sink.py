@@ -1,4 +1,4 @@
-"""What rerun shows: a file without a viewer, and one line where there is no display."""
+"""The view in rerun: a file without a viewer, and one line where there is no display."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import sys
 import pytest
 
 from coview_stream.errors import ConfigError, InputError
+from coview_stream.viewers.rerun_sink import RerunSink
 from tests.viewers.test_foxglove_sink import shown
 
 pytest.importorskip("rerun", reason="rerun-sdk is not there; pip install 'coview-stream[viz]'")
 
 
 def test_file_holds_map_robot_and_hypotheses(tmp_path):
-    from coview_stream.viewers.rerun_sink import RerunSink
-
     sink = RerunSink(tmp_path / "a.rrd")
     shown(sink)
     sink.close()
@@ -27,8 +26,6 @@ def test_file_holds_map_robot_and_hypotheses(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a viewer needs no variable")
 def test_no_display_is_one_line(monkeypatch):
-    from coview_stream.viewers.rerun_sink import RerunSink
-
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ConfigError, match="no display here; write a file with --record"):
@@ -36,7 +33,5 @@ def test_no_display_is_one_line(monkeypatch):
 
 
 def test_file_in_no_directory_is_told(tmp_path):
-    from coview_stream.viewers.rerun_sink import RerunSink
-
     with pytest.raises(InputError, match="no such directory"):
         RerunSink(tmp_path / "none" / "a.rrd")

@@ -27,8 +27,6 @@ VIEW = MapView(np.zeros(3), np.ones((4, 3), dtype=np.float32), np.ones(4, dtype=
 
 
 class Kept(Sink):
-    """Keeps what it is given."""
-
     def __init__(self):
         self.seen = []
         self.closed = False

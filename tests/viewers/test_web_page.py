@@ -1,4 +1,4 @@
-"""The server of the web page: what it gives, whom it refuses, and that it waits for nobody."""
+"""The server of the web page: its files and events, refusals, and that it waits for no client."""
 
 from __future__ import annotations
 
@@ -72,19 +72,17 @@ def test_nothing_in_the_page_comes_from_elsewhere():
         assert [url for url in found if url != "http://www.w3.org/2000/svg"] == [], file.name
 
 
-@pytest.mark.parametrize("path", ["/../web_page.py", "/%2e%2e/web_page.py", "/map/", "/map/ab", "/nothing", "//etc"])
-def test_what_is_not_there_is_not_found(served, path):
-    assert get(served, path)[0].status == 404
-
-
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
-def test_nothing_can_be_sent(served, method):
-    assert get(served, "/", method=method)[0].status == 501
-
-
-@pytest.mark.parametrize("path", ["/", "/events", "/map/ab"])
-def test_a_name_of_a_stranger_is_refused(served, path):
-    assert get(served, path, host="evil.example:8642")[0].status == 421
+@pytest.mark.parametrize(
+    ("request_of", "paths", "status"),
+    [
+        ({}, ["/../web_page.py", "/%2e%2e/web_page.py", "/map/", "/map/ab", "/nothing", "//etc"], 404),
+        *(({"method": method}, ["/"], 501) for method in ("POST", "PUT", "DELETE", "OPTIONS")),
+        ({"host": "evil.example:8642"}, ["/", "/events", "/map/ab"], 421),
+    ],
+)
+def test_unknown_paths_methods_and_hosts_are_refused(served, request_of, paths, status):
+    for path in paths:
+        assert get(served, path, **request_of)[0].status == status, path
 
 
 def test_hosts_are_known_by_address_by_localhost_and_by_their_own_name():

@@ -124,9 +124,7 @@ def test_few_maps_are_kept(sink):
     assert list(sink.maps) == list("cdef")
 
 
-def test_what_a_page_has_not_taken_is_replaced_by_newer():
-    hub = WebHub()
-    page = hub.open_page()
+def test_what_a_page_has_not_taken_is_replaced_by_newer(hub, page):
     for k in range(10_000):
         hub.publish("pose", "r1", {"k": k})
         hub.publish("pose", "r2", {"k": -k})
@@ -134,25 +132,21 @@ def test_what_a_page_has_not_taken_is_replaced_by_newer():
     assert page.take(0.0) == b""
 
 
-def test_a_new_page_is_told_what_is_kept():
-    hub = WebHub()
+def test_a_new_page_is_told_what_is_kept(hub):
     hub.tell_first(lambda: [encode_event("trail", {"points": []})])
     hub.publish("status", "r1", {"state": "LOST"})
     hub.publish("scan", "r1", {}, keep=False)
     assert events(hub.open_page().take(0.0)) == [("trail", {"points": []}), ("status", {"state": "LOST"})]
 
 
-def test_names_from_the_network_fill_no_memory():
-    hub = WebHub()
-    page = hub.open_page()
+def test_names_from_the_network_fill_no_memory(hub, page):
     for k in range(20_000):
         hub.publish("pose", f"r{k}", {})
     assert len(events(page.take(0.0))) == 4000
     assert len(events(hub.open_page().take(0.0))) == 4000
 
 
-def test_pages_are_limited_and_come_free():
-    hub = WebHub()
+def test_pages_are_limited_and_come_free(hub):
     pages = [hub.open_page() for _ in range(MAX_PAGES)]
     assert hub.open_page() is None
     hub.close_page(pages[0])

@@ -9,6 +9,7 @@ from coview_stream.clouds.files import read_cloud, write_cloud
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.viewers.foxglove_sink import record_world
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not there; pip install 'coview-stream[foxglove]'")
 ORIGIN = np.array([412_000.0, 5_318_000.0, 240.0])
@@ -17,7 +18,7 @@ T_MAP_ODOM = pose_from(rot_z(2.0), np.add(ORIGIN, (5.0, 6.0, 0.0)))
 
 
 def world(folder):
-    """What ``simulate`` writes, with three frames, and odometry without drift."""
+    """A world as ``simulate`` writes it, with three frames, and odometry without drift."""
     (folder / "run" / "frames").mkdir(parents=True)
     rng = np.random.default_rng(3)
     points = rng.uniform(-20.0, 20.0, (4000, 3))
@@ -31,8 +32,6 @@ def world(folder):
 
 
 def test_recording_holds_survey_truth_scans_and_odometry_at_their_stamps(tmp_path):
-    from coview_stream.viewers.foxglove_sink import record_world
-
     assert record_world(world(tmp_path / "world"), tmp_path / "a.mcap") == 3
     reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
@@ -56,8 +55,6 @@ def test_recording_holds_survey_truth_scans_and_odometry_at_their_stamps(tmp_pat
 
 
 def test_recording_of_a_world_does_not_overwrite(tmp_path):
-    from coview_stream.viewers.foxglove_sink import record_world
-
     (tmp_path / "a.mcap").write_bytes(b"mine")
     with pytest.raises(InputError, match="is there already"):
         record_world(world(tmp_path / "world"), tmp_path / "a.mcap")

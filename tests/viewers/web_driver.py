@@ -47,7 +47,6 @@ class Browser:
         self._call("POST", f"{self.session}/url", {"url": url})
 
     def run(self, script, *arguments):
-        """Return what a script returns."""
         return self._call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
 
     def complaints(self):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from trackers import follow
 
+from coview_stream import Localizer
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site.convert import CUBE, lighten, one_of_each_cube
 from coview_stream.basemap.site.manifest import Manifest
@@ -49,12 +51,8 @@ def test_light_copy_is_a_site_of_fewer_points_with_the_same_cells(site, cache, t
 
 
 def test_robot_is_found_on_a_light_copy(site, cache, tmp_path, world_drive):
-    from coview_stream import Localizer
-
     lighten(site, tmp_path / "light")
-    localizer = Localizer(BaseMap.load(tmp_path / "light"))
-    steps = zip(world_drive.clouds, world_drive.T_odom_body, range(8), strict=False)
-    fixes = [localizer.step(cloud, T, 0.5 * k) for cloud, T, k in steps]
+    fixes = follow(Localizer(BaseMap.load(tmp_path / "light")), world_drive, 8)
     found = [(fix, T) for fix, T in zip(fixes, world_drive.T_map_body, strict=False) if fix.T_map_body is not None]
     assert found
     for fix, T in found:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import threading
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
@@ -19,6 +16,7 @@ from coview_stream.basemap.site.manifest import FILE, Around, Manifest, part_fil
 from coview_stream.basemap.site.store import TileStore, layer_path
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
+from tests.clouds.test_cloud_fetch import served_folder
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache", "no_pauses")]
 
@@ -172,29 +170,16 @@ def test_only_tiles_around_a_place_are_fetched(site):
         read_part(site / FILE)
 
 
-def test_site_of_a_web_server(site, tmp_path, capsys):
-    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
-    threading.Thread(target=served.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{served.server_address[1]}"
-    try:
+def test_site_of_a_web_server(site, capsys):
+    with served_folder(site) as address:
         assert Manifest.load(Mirror(WebSource(address + "/")).open()) == Manifest.load(site)
         assert main(["info", address, "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["fetched from"] == address
-    finally:
-        served.shutdown()
-        served.server_close()
     assert main(["info", address]) == 0
     said = capsys.readouterr()
     assert "cannot be reached" in said.err
     assert "not reached now" in said.out
     assert main(["info", address + "/elsewhere"]) == 2
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    """A web server that says nothing."""
-
-    def log_message(self, *_):
-        """Say nothing."""
 
 
 def test_site_of_an_object_store(site):

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from nightly import nightly
+from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import file_identity
@@ -44,8 +45,6 @@ def site(halves, tmp_path_factory):
 
 
 class Interrupted(Executor):
-    """Breaks off after some tiles."""
-
     def __init__(self, after):
         self.after = after
 
@@ -118,8 +117,6 @@ def test_source_that_cannot_be_read_is_named_and_left_out_if_that_is_wanted(halv
 
 
 class Failing(Executor):
-    """Breaks one tile."""
-
     def run(self, function, items):
         for number, result in super().run(function, items):
             broken = function is tile_build.build_tile and items[number].key == (0, 0)
@@ -159,9 +156,7 @@ def test_site_is_as_good_a_map_as_one_file(site, world_map, world_drive, cache):
         np.testing.assert_allclose(ours.min(axis=0)[:2], theirs.min(axis=0)[:2], atol=step)
         np.testing.assert_allclose(ours.max(axis=0)[:2], theirs.max(axis=0)[:2], atol=step)
     assert base_map.descriptors("coview").shape == (len(base_map), 20, 60)  # made when they are asked for
-    localizer = Localizer(base_map)
-    for k, (points, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
-        fix = localizer.step(points, T, 0.1 * k)
+    fix = follow(Localizer(base_map), world_drive)[-1]
     assert fix.state.name == "TRACKING"
     error = fix.T_map_body[:3, 3] - FAR - world_drive.T_map_body[-1][:3, 3]
     assert np.linalg.norm(error) < 0.1

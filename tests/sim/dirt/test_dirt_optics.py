@@ -94,12 +94,8 @@ def test_dust_trails_behind_the_robot():
     assert up[1][:, 2].max() < 2 * dust.size[2] - 1.5 + 0.2
 
 
-def sign_before_a_wall():
-    return yard(placed(box(1, 60, 12), 30.5, 0), poles=[(15.0, 0.0, 0.0, 0.7)])
-
-
 def test_signs_bloom():
-    scene = sign_before_a_wall()
+    scene = yard(placed(box(1, 60, 12), 30.5, 0), poles=[(15.0, 0.0, 0.0, 0.7)])
     plain, blooming = scanned(scene, Dirt(dust=Dust(gusts=0.0))), scanned(scene, Dirt(reflectors=Reflectors(bloom=1.0)))
 
     def halo(points):

@@ -107,7 +107,6 @@ def village():
 
 
 def rises(state, footprints):
-    """Heights above their ground of what stands in the middle of footprints."""
     origins = np.array([[f.x, f.y, f.ground + 80.0] for f in footprints], np.float32)
     down = np.tile(np.array([[0, 0, -1]], np.float32), (len(origins), 1))
     return 80.0 - Caster(state).trace(origins, down, RNG(0), 1.0).distance
@@ -137,9 +136,6 @@ def test_years_grow_trees_and_move_cars(village):
     cars = [{tuple(row) for row in parts.cars} for parts in (before, after)]
     assert cars[0]
     assert not cars[0] & cars[1]
-
-
-def test_no_years_change_no_building(village):
     _, fate = aged(village, Years(0.0), RNG(0))
     assert len(fate.gone) == len(fate.new) == len(fate.rebuilt) == 0
 
