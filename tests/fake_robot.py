@@ -126,6 +126,11 @@ class Robot:
         self.now = 1000.0 + seconds if now is None else now
         self.session.on_cloud(cloud(seconds, **fields), self.now)
 
+    def job_for(self, seconds, **fields):
+        """Send a cloud of a sensor time; return the job that waits for the engine then."""
+        self.saw(seconds, **fields)
+        return self.session.take_job("track")
+
     def drive(self, begin, end, rate=20.0, **place):
         """Odometry at a steady rate from ``begin`` up to and including ``end``."""
         for k in range(round((end - begin) * rate) + 1):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
+
 import pytest
 
 from coview_stream.cli import main
+from coview_stream.clouds.python_child import python_command, python_environment
 
 
 @pytest.fixture
@@ -21,3 +25,18 @@ def refused(capsys):
         return captured.err
 
     return run
+
+
+@pytest.fixture
+def start():
+    """Start a command as a process, which is killed when the test ends."""
+    with contextlib.ExitStack() as stack:
+
+        def run(*words):
+            command, pipe = python_command("coview_stream", *map(str, words)), subprocess.PIPE
+            process = subprocess.Popen(command, env=python_environment(), stdout=pipe, stderr=pipe, text=True)
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            return process
+
+        yield run

@@ -21,11 +21,9 @@ def few_places(monkeypatch):
 
 
 def made_up(base_map, drive, wrong=False):
-    count = len(drive)
-    zeros = np.zeros(count)
-    station = np.arange(count)
+    count, station = len(drive), np.arange(len(drive))
+    zeros, wrongs = np.zeros(count), np.full(count, wrong)
     position = base_map.stations[station].astype(np.float64)
-    wrongs = np.full(count, wrong)
     return module.Ambiguity(
         station, position, np.array(drive), wrongs, zeros, zeros, zeros, wrongs, 1e-4, 0.3
     )  # fmt: skip

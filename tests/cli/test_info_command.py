@@ -10,12 +10,13 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 
 
-def test_info_prints_map_facts(world_file, capsys):
+def test_info_prints_map_facts_and_draws_the_map(world_file, tmp_path, capsys):
     base_map = BaseMap.load(world_file)
-    assert main(["info", str(world_file)]) == 0
+    assert main(["info", str(world_file), "--plot", str(tmp_path / "map.png")]) == 0
     out = capsys.readouterr().out
     for fact in (f"{len(base_map)}", f"{len(base_map.points)}", base_map.sha256, "site.ply", "radius = 30.0"):
         assert fact in out
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_info_prints_json(world_file, capsys):
@@ -28,11 +29,6 @@ def test_info_prints_json(world_file, capsys):
     assert facts["from"][0] == pytest.approx(-34.0, abs=0.3)
     assert facts["to"][0] == pytest.approx(34.0, abs=0.5)
     assert facts["sources"].keys() == {"site.ply"}
-
-
-def test_info_writes_a_picture(world_file, tmp_path):
-    assert main(["info", str(world_file), "--plot", str(tmp_path / "map.png")]) == 0
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("content", [None, b"", b"nonsense" * 20, "flipped", "half"])

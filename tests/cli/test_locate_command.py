@@ -125,20 +125,19 @@ def test_run_of_damaged_frames_is_refused(world_file, world_run, tmp_path, refus
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("text", ["here", "1", "1,2,3,4", "nan,2"])
-def test_initial_place_that_is_none_is_refused(world_file, world_run, tmp_path, refused, text):
-    refused("locate", world_file, world_run, "-o", tmp_path / "out", f"--initial={text}")
-
-
-@pytest.mark.parametrize("words", [["--within=200"], ["--initial=1,2", "--within=3"], ["--initial=1,2", "--within=x"]])
-def test_circle_that_is_none_is_refused(world_file, world_run, tmp_path, refused, words):
-    assert "--within" in refused("locate", world_file, world_run, "-o", tmp_path / "out", *words)
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        *(([f"--initial={text}"], "--initial") for text in ("here", "1", "1,2,3,4", "nan,2")),
+        (["--initial=9000,9000"], "no ground within 5 m"),
+        (["--within=200"], "--within"),
+        (["--initial=1,2", "--within=3"], "--within"),
+        (["--initial=1,2", "--within=x"], "--within"),
+    ],
+)
+def test_bad_initial_place_or_circle_is_refused(world_file, world_run, tmp_path, refused, words, message):
+    assert message in refused("locate", world_file, world_run, "-o", tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
-
-
-def test_initial_place_beside_the_map_is_refused(world_file, world_run, tmp_path, refused):
-    said = refused("locate", world_file, world_run, "-o", tmp_path / "out", "--initial=9000,9000")
-    assert "no ground within 5 m" in said
 
 
 def test_initial_places_of_robots_are_named():

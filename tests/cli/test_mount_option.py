@@ -65,8 +65,7 @@ def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():
         robot = Robot(NodeConfig(mount=mount))
         for k in range(12):
             robot.moved(0.05 * k, x=0.5 * k, yaw=0.05 * k)
-        robot.saw(0.5, points=seen, times=times, codec="foxglove")
-        job = robot.session.take_job("track")
+        job = robot.job_for(0.5, points=seen, times=times, codec="foxglove")
         return deskew(job.points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
 
     body = deskewed(points, Mount())

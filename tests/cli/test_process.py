@@ -123,27 +123,16 @@ def test_hangup_wakes_the_wait_and_does_not_end_it():
     assert signal.set_wakeup_fd(wakeup) == -1
 
 
-def record(message, *args, error=None):
-    info = None
-    if error is not None:
-        try:
-            raise error
-        except type(error):
-            info = sys.exc_info()
-    return logging.LogRecord("coview_stream.node", logging.WARNING, __file__, 1, message, args, info)
-
-
-def test_record_is_one_line_of_json():
-    line = JsonFormatter().format(record('r1: %s\n(second "line" é)', "LOST"))
+@pytest.mark.parametrize("error", [None, ValueError("wrong")])
+def test_record_is_one_line_of_json_with_its_exception(error):
+    info = None if error is None else (ValueError, error, None)
+    text, arguments = 'r1: %s\n(second "line" é)', ("LOST",)
+    record = logging.LogRecord("coview_stream.node", logging.WARNING, __file__, 1, text, arguments, info)
+    line = JsonFormatter().format(record)
     assert "\n" not in line
-    read = json.loads(line)
-    assert read["message"] == 'r1: LOST\n(second "line" é)'
-    assert (read["level"], read["logger"]) == ("WARNING", "coview_stream.node")
-    assert read["time"].endswith("+00:00")
-    assert "exception" not in read
-
-
-def test_exception_is_part_of_the_line():
-    line = JsonFormatter().format(record("failed", error=ValueError("what was wrong")))
-    assert "\n" not in line
-    assert "ValueError: what was wrong" in json.loads(line)["exception"]
+    fields = json.loads(line)
+    assert fields["message"] == 'r1: LOST\n(second "line" é)'
+    assert (fields["level"], fields["logger"]) == ("WARNING", "coview_stream.node")
+    assert fields["time"].endswith("+00:00")
+    assert ("exception" in fields) == (error is not None)
+    assert error is None or "ValueError: wrong" in fields["exception"]

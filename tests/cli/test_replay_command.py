@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -43,6 +40,10 @@ class Node:
         self.transport.subscribe(cloud, lambda s: self.sent.append(decode_cloud(s, hint=hint)), "all")
         self.transport.subscribe(odometry, lambda s: self.sent.append(decode_odometry(s, hint=hint)), "all")
 
+    def replay(self, run, *options):
+        """Replay a run to this node; return the exit code."""
+        return main(["replay", str(run), "--robot", "r1", "--connect", self.endpoint, *options])
+
     def clouds(self):
         return [m for m in self.sent if hasattr(m, "points")]
 
@@ -60,8 +61,7 @@ def node():
 @pytest.mark.slow
 def test_replayed_run_arrives_complete(node, run_folder, capsys):
     node.subscribe()
-    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint]
-    assert main([*command, "--rate", "20", "--odometry-rate", "60"]) == 0
+    assert node.replay(run_folder, "--rate", "20", "--odometry-rate", "60") == 0
     until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 16)
     assert sorted(m.stamp_ns for m in node.clouds()) == [(20 + k) * 10**9 for k in range(6)]
     assert [m.stamp_ns for m in node.odometry()] == sorted({m.stamp_ns for m in node.odometry()})
@@ -77,41 +77,36 @@ def test_replay_of_clouds_without_odometry(node, run_folder, tmp_path, capsys):
     bare = tmp_path / "run"
     shutil.copytree(run_folder / "frames", bare / "frames")
     node.subscribe()
-    command = ["--robot", "r1", "--connect", node.endpoint, "--rate", "50", "--odometry", "none"]
-    assert main(["replay", str(bare), *command]) == 0
+    assert node.replay(bare, "--rate", "50", "--odometry", "none") == 0
     until(lambda: len(node.clouds()) == 6)
     assert sorted(m.stamp_ns for m in node.clouds()) == [k * 10**8 for k in range(6)]
     captured = capsys.readouterr()
     assert "and 0 odometry samples sent" in captured.out
     assert captured.err == f"{bare}: no times.txt; frames are taken for 0.1 s apart\n"
-    assert main(["replay", str(run_folder), *command]) == 0
+    assert node.replay(run_folder, "--rate", "50", "--odometry", "none") == 0
     until(lambda: len(node.clouds()) == 12)
     assert max(m.stamp_ns for m in node.clouds()) == 25 * 10**9
     assert node.odometry() == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoding", ["xyzi", "foxglove", "cdr"])
-def test_replay_in_other_encodings(node, run_folder, encoding, capsys):
-    node.subscribe()
-    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
-    assert main([*command, "--encoding", encoding, "--odometry-encoding", "cdr"]) == 0
+@pytest.mark.parametrize(
+    ("options", "keys"),
+    [
+        (["--encoding", "foxglove", "--odometry-encoding", "cdr"], ()),
+        (["--preset", "ros2dds"], ("r1/points", "r1/odom", "cdr")),
+    ],
+)
+def test_replay_in_other_encodings_and_to_other_keys(node, run_folder, options, keys):
+    node.subscribe(*keys)
+    assert node.replay(run_folder, "--rate", "50", *options) == 0
     until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
     assert all(m.points.shape == (500, 3) for m in node.clouds())
 
 
 @pytest.mark.slow
-def test_replay_with_ros2dds_preset(node, run_folder, capsys):
-    node.subscribe("r1/points", "r1/odom", "cdr")
-    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
-    assert main([*command, "--preset", "ros2dds"]) == 0
-    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
-
-
-@pytest.mark.slow
 def test_replay_without_subscriber_exits_with_one(node, run_folder, capsys):
-    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "100"]
-    assert main([*command, "--wait", "0.1"]) == 1
+    assert node.replay(run_folder, "--rate", "100", "--wait", "0.1") == 1
     captured = capsys.readouterr()
     assert "nothing subscribes to coview/r1/in/cloud" in captured.err
     assert "6 frames" in captured.out
@@ -122,8 +117,7 @@ def test_replay_without_subscriber_exits_with_one(node, run_folder, capsys):
 @pytest.mark.slow
 def test_replay_with_late_subscriber_exits_with_zero(node, run_folder, capsys):
     node.transport.subscribe("coview/r1/in/odom", lambda _: node.sent or node.subscribe(), "newest")
-    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "20"]
-    assert main([*command, "--wait", "0"]) == 0
+    assert node.replay(run_folder, "--rate", "20", "--wait", "0") == 0
     captured = capsys.readouterr()
     assert "nothing subscribes" in captured.err
     assert "nothing subscribed" not in captured.out
@@ -131,23 +125,13 @@ def test_replay_with_late_subscriber_exits_with_zero(node, run_folder, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_replay_loop_cleanly(node, run_folder, number):
+def test_signal_ends_replay_loop_cleanly(node, run_folder, start, number):
     node.subscribe()
-    command = [sys.executable, "-m", "coview_stream", "replay", str(run_folder), "--robot", "r1"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    process = subprocess.Popen(
-        [*command, "--connect", node.endpoint, "--loop", "--rate", "50", "--odometry-rate", "200"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=environment,
-        text=True,
-    )
-    try:
-        until(lambda: len(node.clouds()) > 8, 30)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=20)
-    finally:
-        process.kill()
+    pace = ("--loop", "--rate", "50", "--odometry-rate", "200")
+    process = start("replay", run_folder, "--robot", "r1", "--connect", node.endpoint, *pace)
+    until(lambda: len(node.clouds()) > 8, 30)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=20)
     assert process.returncode == 0
     assert "ended early" in out
     assert err == ""

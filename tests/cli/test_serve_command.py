@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
+from types import SimpleNamespace
 
 import pytest
 from sockets import free_endpoint, until
 
-from coview_stream.basemap.basemap import BaseMap
-from coview_stream.cli import main
 from coview_stream.cli import serve as command
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node import serve
@@ -26,51 +22,30 @@ PROMISED = 2.0
 SLACK = 2.0  # for the processes of a busy machine
 
 
-def serving(*args):
-    paths = os.pathsep.join(p for p in sys.path if p)
-    return subprocess.Popen(
-        [sys.executable, "-m", "coview_stream", "serve", *map(str, args)],
-        env=os.environ | {"PYTHONPATH": paths},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def ends(process):
-    """Exit code and what it said, after SIGTERM."""
+def end(process):
+    """Send SIGTERM; the process ends well, and in time."""
     process.send_signal(signal.SIGTERM)
-    try:
-        code = process.wait(PROMISED + SLACK)
-    finally:
-        process.kill()
-    return code, process.stderr.read()
-
-
-def heard(process, text):
-    return next((line for line in process.stderr if text in line), None)
+    assert process.wait(PROMISED + SLACK) == 0
+    assert "Traceback" not in process.stderr.read()
 
 
 @pytest.mark.slow
-def test_signal_ends_serve(world_file):
-    endpoint = free_endpoint()
-    process = serving(world_file, "--robot", "r1", "--listen", endpoint, "--humble", "--max-speed", "20")
-    assert heard(process, "ready")
-    code, said = ends(process)
-    assert code == 0
-    assert "Traceback" not in said
+def test_signal_ends_serve(world_file, start):
+    listen = ("--listen", free_endpoint())
+    process = start("serve", world_file, "--robot", "r1", *listen, "--humble", "--max-speed", "20")
+    assert any("ready" in line for line in process.stderr)
+    end(process)
 
 
 @pytest.mark.slow
-def test_signal_ends_serve_waiting_for_silent_host(world_file):
+def test_signal_ends_serve_waiting_for_silent_host(world_file, start):
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
         endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
-        process = serving(world_file, "--robot", "r1", "--connect", endpoint, "--listen", free_endpoint())
+        process = start("serve", world_file, "--robot", "r1", "--connect", endpoint, "--listen", free_endpoint())
         silent.accept()
-        code, said = ends(process)
-    assert code == 0
-    assert "Traceback" not in said
+        end(process)
 
 
 def test_cancelled_opening_stops_engines(world_file):
@@ -82,26 +57,11 @@ def test_cancelled_opening_stops_engines(world_file):
     until(lambda: not [t for t in threading.enumerate() if t.name.startswith(ours)])
 
 
-class Stop:
-    """Asked to stop from the start, or never."""
-
-    def __init__(self, requested):
-        self.requested = requested
-
-    def now(self):
-        return 0.0
-
-    def wait(self, seconds):
-        return self.requested
-
-
 def test_node_that_does_not_close_is_abandoned(monkeypatch):
-    class Stuck:
-        def close(self, patience):
-            return False
-
-    monkeypatch.setattr(serve, "open_node", lambda *_: Stuck())
-    assert command._serve(None, Stop(True)) is False
+    stuck = SimpleNamespace(close=lambda patience: False)
+    monkeypatch.setattr(serve, "open_node", lambda *_: stuck)
+    stop = SimpleNamespace(requested=True, wait=lambda seconds: True, now=lambda: 0.0)
+    assert command._serve(None, stop) is False
 
 
 @pytest.mark.parametrize(
@@ -132,11 +92,10 @@ def test_serve_odometry_kiss_icp_names_missing_library(tmp_path, monkeypatch, wo
     assert "pip install 'coview-stream[kiss-icp]'" in refused(*command, "--odometry", "kiss-icp")
 
 
-def test_unreadable_map_is_refused(tmp_path, capsys):
+def test_unreadable_map_is_refused(tmp_path, refused):
     path = tmp_path / "broken.coview"
     path.write_bytes(b"no map")
-    assert main(["serve", str(path), "--robot", "r1", "--listen", free_endpoint()]) == 2
-    assert "broken.coview" in capsys.readouterr().err
+    assert "broken.coview" in refused("serve", path, "--robot", "r1", "--listen", free_endpoint())
 
 
 def test_max_payload_reaches_the_transport(monkeypatch, world_file):
@@ -146,7 +105,6 @@ def test_max_payload_reaches_the_transport(monkeypatch, world_file):
     monkeypatch.setattr(zenoh_transport, "open_transport", open_transport)
     keys = [robot_keys("native", "coview", "r1")]
     options = serve.ServeOptions(world_file, keys, node=serve.NodeConfig(max_payload=1234))
-    assert BaseMap.load(world_file).sha256
     with pytest.raises(ConfigError, match="1234"):
         serve.open_node(options)
 

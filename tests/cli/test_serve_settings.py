@@ -77,6 +77,11 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robot = "a"\n[node]\npose_rte = 3\n', "[node]: unknown key 'pose_rte'; did you mean 'pose_rate'?"),
         ('robot = "a"\n[localizer.keyframe]\ndistance = -1\n', "distance is -1"),
         ("[node]\n", "--robot is missing"),
+        ('robot = "a"\n[localizer]\nsensor_leans = false\n', "sensor_leans cannot be set here"),
+        ('robot = "a"\n[node.mount]\nroll = 3\n', "mount cannot be set here: set it above"),
+        ('robot = "a"\n[lidar_odometry]\nnonsense = 3\n', "unknown key 'nonsense'"),
+        ("max_outage = 4\n[node]\nmax_outage = 3\n", "max_outage and [node] max_outage: set one of them"),
+        ("risk = 1e-3\n[localizer.acceptance]\nrisk = 1e-5\n", "risk and [localizer.acceptance] risk: set one of them"),
     ],
 )
 def test_mistakes_are_named(text, message, world_file, tmp_path):
@@ -148,23 +153,3 @@ def test_options_given_replace_the_file_and_leave_the_rest(world_file, tmp_path,
     path.write_text(text)
     state = [str(tmp_path) if word == "STATE" else word for word in given]
     assert read(options_of(world_file, "--robot", "r1", "--config", path, *state)) == wanted
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[localizer]\nsensor_leans = false\n", "sensor_leans cannot be set here"),
-        ("[node.mount]\nroll = 3\n", "mount cannot be set here: set it above"),
-        ("[lidar_odometry]\nnonsense = 3\n", "unknown key 'nonsense'"),
-        ("max_outage = 4\n[node]\nmax_outage = 3\n", r"max_outage and \[node\] max_outage: set one of them"),
-        (
-            "risk = 1e-3\n[localizer.acceptance]\nrisk = 1e-5\n",
-            r"risk and \[localizer.acceptance\] risk: set one of them",
-        ),
-    ],
-)
-def test_settings_that_something_else_decides_are_refused(world_file, tmp_path, text, message):
-    path = tmp_path / "node.toml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=message):
-        options_of(world_file, "--robot", "r1", "--no-state", "--config", path)

@@ -61,15 +61,11 @@ def test_build_signs_and_info_tells(map_cloud_file, site, capsys):
     assert json.loads(capsys.readouterr().out)["signature"] == "none"
 
 
-def test_build_with_a_wrong_key_reads_no_cloud(site, capsys):
-    target = site / "none.coview"
-    assert (
-        main(["build", str(site / "not-even-looked-for.ply"), "-o", str(target), "--sign", str(site / "ours.pub")]) == 2
-    )
-    assert "holds no private key" in capsys.readouterr().err
+def test_build_with_a_wrong_key_reads_no_cloud(site, refused):
+    target, key = site / "none.coview", site / "ours.pub"
+    assert "holds no private key" in refused("build", site / "not-even-looked-for.ply", "-o", target, "--sign", key)
     assert not target.exists()
 
 
-def test_keygen_overwrites_nothing(site, capsys):
-    assert main(["keygen", str(site / "ours")]) == 2
-    assert "exists" in capsys.readouterr().err
+def test_keygen_overwrites_nothing(site, refused):
+    assert "exists" in refused("keygen", site / "ours")

@@ -7,7 +7,6 @@ import io
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 
@@ -29,32 +28,26 @@ STATUS = {"state": "TRACKING", "reason": "fine", "counters": {"dropped": 3}}
 class Node:
     """Publishes poses and statuses of some robots, twenty times a second, until closed."""
 
-    def __init__(self, robots=("r1", "r2"), pose_format=None, preset="native", extra=()):
+    def __init__(self, robots=("r1", "r2"), preset="native", extra=()):
         self.endpoint = free_endpoint()
         self.transport = open_transport(listen=[self.endpoint])
         self._ended = threading.Event()
-        self._extra = [(self.transport.publisher(key, "data"), message) for key, message in extra]
-        self._robots = []
+        self._messages = [(self.transport.publisher(key, "data"), message) for key, message in extra]
         for robot in robots:
             keys = robot_keys(preset, "coview", robot)
             pose = PoseMessage(7, robot, "TRACKING", T, np.eye(6), 0.9, "ab", 0.1)
-            self._robots.append(
-                (
-                    self.transport.publisher(keys.pose, "realtime"),
-                    encode_pose(pose, pose_format or keys.pose_format),
-                    self.transport.publisher(keys.status, "data"),
-                    Encoded(json.dumps({"robot": robot, **STATUS}).encode(), "application/json"),
-                )
-            )
+            status = Encoded(json.dumps({"robot": robot, **STATUS}).encode(), "application/json")
+            for key, urgency, encoded in (
+                (keys.pose, "realtime", encode_pose(pose, keys.pose_format)),
+                (keys.status, "data", status),
+            ):
+                self._messages.append((self.transport.publisher(key, urgency), encoded))
         self._thread = threading.Thread(target=self._publish)
         self._thread.start()
 
     def _publish(self):
         while not self._ended.wait(0.05):
-            for pose_out, pose, status_out, status in self._robots:
-                pose_out.put(pose)
-                status_out.put(status)
-            for publisher, message in self._extra:
+            for publisher, message in self._messages:
                 publisher.put(message)
 
     def close(self):
@@ -135,22 +128,14 @@ def test_watch_redraws_terminal_in_place(node, monkeypatch):
         assert max(map(len, lines)) < 60
 
 
-@pytest.mark.parametrize("name", ["cdr", "foxglove"])
-def test_watch_reads_poses_in_other_formats(name):
-    with contextlib.closing(Node(pose_format=name)) as node:
-        out, _ = watch(node.endpoint, "--json", "--robot", "r1", "r2", out=Screen(12))
-    records = [json.loads(line) for line in out.splitlines()]
-    poses = [r for r in records if r["key"].endswith("pose")]
-    assert {r["robot"] for r in poses} == {"r1", "r2"}
-    assert poses[0]["position"] == pytest.approx([12.34, -5.0, 1.7])
-    assert poses[0]["confidence"] is None
-
-
 def test_watch_reads_poses_of_a_preset():
     with contextlib.closing(Node(("r1",), preset="ros2dds")) as node:
         out, _ = watch(node.endpoint, "--json", "--robot", "r1", "--preset", "ros2dds", out=Screen(6))
-    keys = {json.loads(line)["key"] for line in out.splitlines()}
-    assert keys == {"r1/coview/pose", "coview/r1/out/status"}
+    records = {record["key"]: record for record in map(json.loads, out.splitlines())}
+    assert records.keys() == {"r1/coview/pose", "coview/r1/out/status"}
+    pose = records["r1/coview/pose"]
+    assert (pose["robot"], pose["confidence"]) == ("r1", None)
+    assert pose["position"] == pytest.approx([12.34, -5.0, 1.7])
 
 
 def test_undecodable_messages_are_reported_once_per_key():
@@ -172,40 +157,23 @@ def test_watch_explains_missing_messages():
     assert node.endpoint in err
 
 
-def process(endpoint, *options):
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.Popen(
-        [sys.executable, "-m", "coview_stream", "watch", "--connect", endpoint, *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=environment,
-        text=True,
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_watch(node, number):
-    running = process(node.endpoint, "--json")
-    try:
-        assert json.loads(running.stdout.readline())["key"].startswith("coview/r")
-        running.send_signal(number)
-        _, err = running.communicate(timeout=20)
-    finally:
-        running.kill()
+def test_signals_end_watch(node, start, number):
+    running = start("watch", "--connect", node.endpoint, "--json")
+    assert json.loads(running.stdout.readline())["key"].startswith("coview/r")
+    running.send_signal(number)
+    _, err = running.communicate(timeout=20)
     assert (running.returncode, err) == (0, "")
 
 
 @pytest.mark.slow
-def test_closed_pipe_prints_no_traceback(node):
-    running = process(node.endpoint, "--json")
-    try:
-        running.stdout.readline()
-        running.stdout.close()
-        assert running.wait(timeout=20) == 141
-        assert running.stderr.read() == ""
-    finally:
-        running.kill()
+def test_closed_pipe_prints_no_traceback(node, start):
+    running = start("watch", "--connect", node.endpoint, "--json")
+    running.stdout.readline()
+    running.stdout.close()
+    assert running.wait(timeout=20) == 141
+    assert running.stderr.read() == ""
 
 
 def test_watch_ends_after_seconds_option(node, capsys):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from codec_bytes import POINTS, STAMP, TURN, XYZ, cdr_cloud, cdr_odometry, envelope, pb_cloud, pb_transform
+from codec_bytes import POINTS, STAMP, XYZ, cdr_cloud
 
 from coview_stream import messages as codecs
 from coview_stream.errors import ConfigError, EncodingError, MessageError
@@ -136,16 +136,6 @@ def test_option_or_hint_of_wrong_channel_is_refused(where, name):
         codecs.encode_pose(None, "xyz")
 
 
-def test_samples_are_decoded_through_dispatch():
-    rows = POINTS.tobytes()
-    stamp = STAMP.to_bytes(8, "little")
-    assert len(codecs.decode_cloud(Sample(RMW, cdr_cloud(rows, XYZ, 12, 2))).points) == 2
-    assert len(codecs.decode_cloud(Sample(KEELSON, envelope(pb_cloud(rows, XYZ, 12)))).points) == 2
-    assert len(codecs.decode_cloud(Sample(NATIVE, rows, "", stamp), option="xyz").points) == 2
-    assert codecs.decode_odometry(Sample("tf", pb_transform()), hint="foxglove").stamp_ns == STAMP
-    assert codecs.decode_odometry(Sample("odom", cdr_odometry(quaternion=TURN))).stamp_ns == STAMP
-
-
 def test_an_rmw_attachment_gives_stamp_and_sequence():
     attachment = (41).to_bytes(8, "little") + STAMP.to_bytes(8, "little") + b"\x10" + bytes(16)
     raw = Sample(NATIVE, POINTS.tobytes(), "application/octet-stream;layout=xyz", attachment)
@@ -162,7 +152,3 @@ def test_oversized_payload_raises_its_own_error_naming_the_key():
         codecs.decode_cloud(Sample(NATIVE, bytes(codecs.MAX_PAYLOAD + 1)))
     assert issubclass(OversizedError, MessageError)
     assert not issubclass(OversizedError, EncodingError)
-
-
-def test_prepare_takes_any_codec_names():
-    codecs.prepare(*codecs.CLOUD_CODECS, *codecs.POSE_CODECS)

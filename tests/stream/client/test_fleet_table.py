@@ -26,8 +26,12 @@ STATUS = {
 }
 
 
-def test_tracking_robot_shows_its_pose():
-    fleet = FleetTable()
+@pytest.fixture
+def fleet():
+    return FleetTable()
+
+
+def test_tracking_robot_shows_its_pose(fleet):
     fleet.add_status("r1", STATUS, 9.0)
     for k in range(60):
         fleet.add_pose(POSE, 10.0 + 0.1 * k)
@@ -39,8 +43,7 @@ def test_tracking_robot_shows_its_pose():
     ]
 
 
-def test_reason_stands_whole_below_its_robot_on_a_terminal():
-    fleet = FleetTable()
+def test_reason_stands_whole_below_its_robot_on_a_terminal(fleet):
     reason = (
         "the right place would be told by more of what stands around, and so far " + 8 * "there is too little of it "
     )
@@ -55,8 +58,7 @@ def test_reason_stands_whole_below_its_robot_on_a_terminal():
         assert all(line.startswith("    ") for line in below)
 
 
-def test_what_the_node_says_of_the_sensor_stands_behind_the_reason():
-    fleet = FleetTable()
+def test_what_the_node_says_of_the_sensor_stands_behind_the_reason(fleet):
     says = "sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"
     fleet.add_status("r1", {**STATUS, "calibration": {"says": [says, "b\x1b[2J"]}}, 9.0)
     assert fleet.table(9.1)[1].endswith(f"all well; {says}; b [2J")
@@ -65,8 +67,7 @@ def test_what_the_node_says_of_the_sensor_stands_behind_the_reason():
         assert fleet.table(9.1)[1].endswith("all well")
 
 
-def test_stale_pose_is_hidden():
-    fleet = FleetTable()
+def test_stale_pose_is_hidden(fleet):
     fleet.add_pose(POSE, 10.0)
     assert "412000.12" in fleet.table(10.0 + STALE - 0.1)[1]
     fleet.add_status("r1", {"state": "LOST"}, 10.0 + STALE)
@@ -75,8 +76,7 @@ def test_stale_pose_is_hidden():
     assert line.split()[:3] == ["r1", "LOST", "-"]
 
 
-def test_lost_robot_shows_no_pose():
-    fleet = FleetTable()
+def test_lost_robot_shows_no_pose(fleet):
     fleet.add_pose(POSE, 10.0)
     fleet.add_status("r1", {"state": "LOST"}, 10.1)
     assert "412000.12" not in fleet.table(10.2)[1]
@@ -84,8 +84,7 @@ def test_lost_robot_shows_no_pose():
     assert "412000.12" in fleet.table(10.4)[1]
 
 
-def test_silent_robot_is_marked():
-    fleet = FleetTable()
+def test_silent_robot_is_marked(fleet):
     fleet.add_status("r1", STATUS, 10.0)
     assert "TRACKING" in fleet.table(10.0 + SILENT)[1]
     assert "silent 7 s" in fleet.table(17.2)[1]
@@ -100,14 +99,12 @@ def test_silent_robot_is_marked():
         {"reason": {"deep": [1]}},
     ],
 )
-def test_any_status_is_printable(status):
-    fleet = FleetTable()
+def test_any_status_is_printable(fleet, status):
     fleet.add_status("r1", status, 1.0)
     assert fleet.table(1.5)[1].startswith("r1 ")
 
 
-def test_robots_are_sorted_and_network_text_is_escaped():
-    fleet = FleetTable()
+def test_robots_are_sorted_and_network_text_is_escaped(fleet):
     fleet.add_status("zoe", {"state": "\x1b[2JSEARCHING\n", "reason": "a\tb"}, 1.0)
     fleet.add_status("ada", {}, 1.0)
     lines = fleet.table(1.0, header=False)
@@ -116,8 +113,7 @@ def test_robots_are_sorted_and_network_text_is_escaped():
     assert all(line.isprintable() for line in lines)
 
 
-def test_a_pose_without_confidence_shows_none():
-    fleet = FleetTable()
+def test_a_pose_without_confidence_shows_none(fleet):
     message = decode_pose(Sample("k", encode_pose(POSE, "foxglove").payload), hint="foxglove")
     fleet.add_pose(PoseMessage(**{**vars(message), "robot": "r1"}), 1.0)
     assert fleet.table(1.1)[1].split()[-4:] == ["0.0", "-", "-/-", "-"]
@@ -135,8 +131,7 @@ def test_a_pose_without_confidence_shows_none():
         (-1e300, "  -  "),
     ],
 )
-def test_probability_of_a_wrong_place_is_said_as_one_in_so_many(confidence, cell):
-    fleet = FleetTable()
+def test_probability_of_a_wrong_place_is_said_as_one_in_so_many(fleet, confidence, cell):
     fleet.add_pose(replace(POSE, confidence=confidence), 1.0)
     title, line = fleet.table(1.1)
     assert cell in line
@@ -168,8 +163,7 @@ def test_status_that_is_not_json_is_refused(payload):
         read_status(Sample("coview/r1/out/status", payload))
 
 
-def test_another_node_that_serves_the_robot_is_told():
-    fleet = FleetTable()
+def test_another_node_that_serves_the_robot_is_told(fleet):
     fleet.add_status("r1", STATUS, 8.0)
     fleet.add_status("r1", STATUS | {"node": {"id": "abc", "host": "one"}}, 9.0)
     assert "node" not in fleet.table(9.1)[1]

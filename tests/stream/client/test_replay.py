@@ -17,7 +17,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z, yaw_of
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
-from coview_stream.stream.client.replay import ReplayConfig, frame_times, odometry_spacing, replay, schedule
+from coview_stream.stream.client.replay import ReplayConfig, odometry_spacing, replay
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -218,11 +218,6 @@ def test_read_ahead_error_reaches_the_caller(run):
 def test_bad_replay_config_is_refused(options, text):
     with pytest.raises(ConfigError, match=text):
         ReplayConfig(**options)
-
-
-def test_schedule_without_loop_ends(run):
-    assert [sample.frame for sample in schedule(run, ReplayConfig())] == [0, 1, 2, 3]
-    assert frame_times(run, ReplayConfig(rate=10.0)) == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
 def test_odometry_spacing(run, run_folder):

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +52,29 @@ def site(built, tmp_path, monkeypatch, no_pauses):
 @pytest.fixture
 def endpoint():
     return free_endpoint()
+
+
+@contextmanager
+def followed(mirrors, *more):
+    """Open the mirrors and follow their sites; yields the follower, and a list that grows by one for each change."""
+    for mirror in mirrors:
+        mirror.open()
+    changes, stopping = [], threading.Event()
+    follower = MapFollower(mirrors, lambda: changes.append(1), *more, period=0.05)
+    thread = threading.Thread(target=follower.run, args=(stopping,))
+    thread.start()
+    try:
+        yield follower, changes
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def change(site):
+    """Take the first tile out of a site; return the others."""
+    whole = Manifest.load(site)
+    replace(whole, tiles=whole.tiles[1:]).save(site)
+    return whole.tiles[1:]
 
 
 @pytest.fixture
@@ -110,89 +135,53 @@ def test_answer_that_is_too_large_is_not_read(server, source, site):
         source.layer(layer.sha256, 10)
 
 
-def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, site):
+def test_change_of_the_site_is_followed_and_an_outage_is_reported(server, source, site):
     mirror = Mirror(source)
-    mirror.open()
-    calls, stopping = [], threading.Event()
-    follower = MapFollower([mirror], lambda: calls.append(1), period=0.05)
-    thread = threading.Thread(target=follower.run, args=(stopping,))
-    thread.start()
-    try:
-        whole = Manifest.load(site)
-        replace(whole, tiles=whole.tiles[1:]).save(site)
-        until(lambda: calls)
-        assert Manifest.load(mirror.directory).tiles == whole.tiles[1:]
+    with followed([mirror]) as (follower, changes):
+        tiles = change(site)
+        until(lambda: changes)
+        assert Manifest.load(mirror.directory).tiles == tiles
         (site / "manifest.json").write_text("{}")  # the server goes on with the one before
         until(lambda: follower.last["result"] == "current")
         server.close()
         until(lambda: follower.last["result"] == "unreachable")
         assert "no map server answers" in follower.last["error"]
-        assert len(calls) == 1
-    finally:
-        stopping.set()
-        thread.join()
+        assert len(changes) == 1
 
 
 def test_change_that_is_not_taken_over_is_asked_for_again(site):
-    mirror = Mirror(Directory(site))
-    mirror.open()
-    outcomes, calls, stopping = ["loading"], [], threading.Event()
-    follower = MapFollower([mirror], lambda: calls.append(1), lambda: outcomes[-1], period=0.05)
-    thread = threading.Thread(target=follower.run, args=(stopping,))
-    thread.start()
-    try:
-        whole = Manifest.load(site)
-        replace(whole, tiles=whole.tiles[1:]).save(site)
-        assert not stopping.wait(0.3)
-        assert not calls  # a change is being taken over
+    outcomes = ["loading"]
+    with followed([Mirror(Directory(site))], lambda: outcomes[-1]) as (_, changes):
+        change(site)
+        time.sleep(0.3)
+        assert not changes  # the node is still loading one
         outcomes.append("refused")
-        until(lambda: len(calls) > 2)
+        until(lambda: len(changes) > 2)
         outcomes.append("changed")
-        assert not stopping.wait(0.3)
-        made = len(calls)
-        assert not stopping.wait(0.5)
-        assert len(calls) == made
-    finally:
-        stopping.set()
-        thread.join()
+        time.sleep(0.3)
+        count = len(changes)
+        time.sleep(0.5)
+        assert len(changes) == count
 
 
 def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
     other = shutil.copytree(site, tmp_path / "other")
     gone = Directory(site)
     mirrors = [Mirror(gone), Mirror(Directory(other))]
-    for mirror in mirrors:
-        mirror.open()
-    calls, stopping = [], threading.Event()
-    follower = MapFollower(mirrors, lambda: calls.append(1), period=0.05)
-    thread = threading.Thread(target=follower.run, args=(stopping,))
-    gone.gone = True
-    thread.start()
-    try:
+    with followed(mirrors) as (follower, changes):
+        gone.gone = True
         until(lambda: follower.last["result"] == "unreachable")
-        whole = Manifest.load(other)
-        replace(whole, tiles=whole.tiles[1:]).save(other)
-        until(lambda: calls)
+        change(other)
+        until(lambda: changes)
         assert mirrors[0].offline == "yard: nobody answers"
-    finally:
-        stopping.set()
-        thread.join()
 
 
 def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):
     mirror = Mirror(Directory(site), None, Around(512_000.0, 5_120_000.0, 30.0))
-    mirror.open()
-    calls, stopping = [], threading.Event()
-    thread = threading.Thread(target=MapFollower([mirror], lambda: calls.append(1), period=0.05).run, args=(stopping,))
-    thread.start()
-    try:
-        whole = Manifest.load(site)
-        replace(whole, tiles=whole.tiles[1:]).save(site)
-        until(lambda: calls)
-        assert read_part(mirror.map_path)[1] == {(tile.column, tile.row) for tile in whole.tiles[1:]}
-    finally:
-        stopping.set()
-        thread.join()
+    with followed([mirror]) as (_, changes):
+        tiles = change(site)
+        until(lambda: changes)
+        assert read_part(mirror.map_path)[1] == {(tile.column, tile.row) for tile in tiles}
 
 
 def test_working_file_of_a_part_is_made_by_another_process(site):

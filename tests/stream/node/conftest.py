@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import pytest
-from fake_node import Site
+from fake_node import declared
 from fake_robot import Robot
 
 
 @pytest.fixture
 def site():
-    made = Site("r1")
-    made.node.declare()
-    return made
+    return declared("r1")
 
 
 @pytest.fixture
 def pair():
-    made = Site("r1", "r2")
-    made.node.declare()
-    return made
+    return declared("r1", "r2")
 
 
 @pytest.fixture

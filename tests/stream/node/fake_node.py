@@ -110,3 +110,10 @@ class Site:
     def status(self, name):
         self.node.reporter.publish(time.monotonic())
         return self.statuses(name)[-1]
+
+
+def declared(*names, **more):
+    """A site whose node is on the network."""
+    site = Site(*names, **more)
+    site.node.declare()
+    return site

@@ -69,24 +69,16 @@ def ticks(rate, times):
     return [now for now in times if rate.take_tick(now)]
 
 
-def test_first_tick_is_immediate_then_periodic():
-    rate = Rate(4.0, 100.0)
-    assert ticks(rate, [100.0, 100.1, 100.25, 100.3, 100.5, 100.74, 100.75]) == [100.0, 100.25, 100.5, 100.75]
-
-
-def test_late_ticks_do_not_delay_later_ones():
-    rate = Rate(4.0, 0.0)
-    # each 0.2 s late: due times stay multiples of a period
-    assert ticks(rate, [0.2, 0.45, 0.7, 0.95]) == [0.2, 0.45, 0.7, 0.95]
-    assert rate.due == pytest.approx(1.0)
-
-
-def test_no_catching_up_after_a_long_pause():
-    rate = Rate(4.0, 0.0)
-    assert rate.take_tick(0.0)
-    assert ticks(rate, [60.0, 60.01, 60.1, 60.24, 60.25]) == [60.0, 60.25]
-    assert rate.remaining(60.3) == pytest.approx(0.2)
-    assert rate.remaining(65.0) == 0.0
+@pytest.mark.parametrize(
+    ("times", "taken"),
+    [
+        ([0.0, 0.1, 0.25, 0.3, 0.5, 0.74, 0.75], [0.0, 0.25, 0.5, 0.75]),  # the first at once
+        ([0.2, 0.45, 0.7, 0.95, 1.0], [0.2, 0.45, 0.7, 0.95, 1.0]),  # due at multiples of the period
+        ([0.0, 60.0, 60.01, 60.1, 60.24, 60.25], [0.0, 60.0, 60.25]),  # nothing is made up for after a pause
+    ],
+)
+def test_ticks_are_periodic(times, taken):
+    assert ticks(Rate(4.0, 0.0), times) == taken
 
 
 def test_slack_catches_up_late_ticks():
@@ -98,3 +90,4 @@ def test_slack_catches_up_late_ticks():
     assert rate.take_tick(0.2)  # later than the slack: go on from here
     assert not rate.take_tick(0.2)
     assert rate.remaining(0.2) == pytest.approx(0.01)
+    assert rate.remaining(0.3) == 0.0

@@ -67,8 +67,9 @@ def engine():
     """Make engine processes, and close them at the end."""
     made = []
 
-    def make(kind, path="unused", sha256="0" * 64, **more):
-        made.append(EngineProcess(kind, str(path), sha256, **more))
+    def make(kind, path=None, **more):
+        sha256 = "0" * 64 if path is None else BaseMap.load(path).sha256
+        made.append(EngineProcess(kind, str(path or "unused"), **{"sha256": sha256} | more))
         return made[-1]
 
     yield make
@@ -102,12 +103,14 @@ def alive(pid):
 
 @pytest.mark.slow
 def test_killed_engine_process_is_restarted(engine, world_file, world_drive):
-    process = engine("track", world_file, BaseMap.load(world_file).sha256)
+    child = EngineChild("track")
+    process = engine("track", world_file, child=child)
     good = job(world_drive.clouds[0])
     try:
         process.start()
         process.wait_ready()
         first = process.pid
+        assert first == child.process.pid
         result = process.run(good)
         assert result.fix.state is State.SEARCHING
         assert result.request is not None
@@ -135,7 +138,7 @@ def test_killed_engine_process_is_restarted(engine, world_file, world_drive):
 
 @pytest.mark.slow
 def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine, world_file):
-    process = engine("search", world_file, BaseMap.load(world_file).sha256)
+    process = engine("search", world_file)
     process.start()
     process.wait_prepared()
     process.watch()
@@ -155,7 +158,7 @@ def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine,
 
 @pytest.mark.slow
 def test_idle_engine_that_cannot_open_its_map_says_why(engine, world_file):
-    process = engine("track", world_file)
+    process = engine("track", world_file, sha256="0" * 64)
     process.start()
     with pytest.raises(DiedError, match="replaced by another map"):
         until(process.watch, 60.0)
@@ -164,7 +167,7 @@ def test_idle_engine_that_cannot_open_its_map_says_why(engine, world_file):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 def test_stopped_engine_is_ended_during_a_job(engine, world_file, world_drive):
-    process = engine("track", world_file, BaseMap.load(world_file).sha256)
+    process = engine("track", world_file)
     process.start()
     process.wait_prepared()
     process.end_stopped()
@@ -183,19 +186,6 @@ def test_stopped_engine_is_ended_during_a_job(engine, world_file, world_drive):
     until(lambda: process.end_stopped() or failed, 10.0)  # not thirty seconds
     thread.join(10.0)
     assert process.run(job(world_drive.clouds[0])).request is not None
-
-
-@pytest.mark.slow
-def test_child_that_was_started_before_is_the_first(engine, world_file, world_drive):
-    child = EngineChild("track")
-    process = engine("track", world_file, BaseMap.load(world_file).sha256, child=child)
-    process.start()
-    assert process.pid == child.process.pid
-    assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
-    os.kill(process.pid, signal.SIGKILL)
-    with pytest.raises(DiedError):
-        process.run(job())
-    assert process.run(job(world_drive.clouds[0])).request is not None  # another one
 
 
 @pytest.mark.slow
@@ -219,7 +209,7 @@ def test_child_ends_with_its_parent():
 
 @pytest.mark.slow
 def test_hung_worker_is_killed_during_send(engine, world_file, world_drive):
-    process = engine("track", world_file, BaseMap.load(world_file).sha256, job_timeout=30.0)
+    process = engine("track", world_file, job_timeout=30.0)
     good = job(world_drive.clouds[0])
     process.start()
     process.run(good)

@@ -64,12 +64,6 @@ def reference(engines, world_drive):
     return follower
 
 
-@pytest.fixture(scope="module")
-def alone(reference):
-    """Its fixes."""
-    return reference.fixes
-
-
 @pytest.fixture
 def launched(monkeypatch):
     """Names of the kernel modules that were launched since it was last cleared."""
@@ -118,25 +112,25 @@ def same(fix, other):
         np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_track_and_search_engines_equal_localizer_one_frame_late(alone, world_fixes):
+def test_track_and_search_engines_equal_localizer_one_frame_late(reference, world_fixes):
     first = next(k for k, fix in enumerate(world_fixes) if fix.state is State.TRACKING)
     assert first + 1 < FRAMES
-    assert alone[0].state is State.SEARCHING
+    assert reference.fixes[0].state is State.SEARCHING
     for k in range(1, first + 1):
-        assert alone[k].state is world_fixes[k - 1].state
-        assert alone[k].T_map_body is None
+        assert reference.fixes[k].state is world_fixes[k - 1].state
+        assert reference.fixes[k].T_map_body is None
     for k in range(first + 1, FRAMES):
-        same(alone[k], world_fixes[k])
+        same(reference.fixes[k], world_fixes[k])
 
 
 @pytest.mark.slow
-def test_two_robots_give_same_results_as_each_alone(engines, alone, world_drive):
+def test_two_robots_give_same_results_as_each_alone(engines, reference, world_drive):
     other_drive = world_drive.seen_from(OTHER_ODOMETRY)
     one, two = Follower(*engines, "one"), Follower(*engines, "two", epoch=9)
     for k in range(FRAMES):
         one.follow(world_drive, [k])
         two.follow(other_drive, [k])
-    for here, there, undisturbed in zip(one.fixes, two.fixes, alone, strict=True):
+    for here, there, undisturbed in zip(one.fixes, two.fixes, reference.fixes, strict=True):
         same(here, undisturbed)
         assert there.state is undisturbed.state
         if there.T_map_body is not None:
@@ -181,18 +175,18 @@ def test_what_comes_with_a_rejected_frame_is_applied_once(engines, reference, wo
         same(fix, undisturbed)
 
 
-def test_new_epoch_resets_both_engines(engines, alone, world_drive):
+def test_new_epoch_resets_both_engines(engines, reference, world_drive):
     follower = Follower(*engines, "restarted")
     follower.follow(world_drive, range(2))
     follower.epoch, follower.search_result, follower.fixes = 2, None, []
     # another odometry frame: votes of the old one would speak for places that are not
     follower.follow(world_drive.seen_from(OTHER_ODOMETRY), range(FRAMES))
-    assert [fix.state for fix in follower.fixes] == [fix.state for fix in alone]
-    np.testing.assert_allclose(follower.fixes[-1].T_map_body, alone[-1].T_map_body, atol=0.02)
+    assert [fix.state for fix in follower.fixes] == [fix.state for fix in reference.fixes]
+    np.testing.assert_allclose(follower.fixes[-1].T_map_body, reference.fixes[-1].T_map_body, atol=0.02)
 
 
 @pytest.mark.slow
-def test_forgotten_robot_starts_from_scratch(engines, alone, world_drive):
+def test_forgotten_robot_starts_from_scratch(engines, reference, world_drive):
     follower = Follower(*engines, "forgotten")
     follower.follow(world_drive, range(3))
     for engine in engines:
@@ -200,7 +194,7 @@ def test_forgotten_robot_starts_from_scratch(engines, alone, world_drive):
         engine.forget("never seen")
     follower.search_result, follower.fixes = None, []
     follower.follow(world_drive, range(3))
-    for fix, first in zip(follower.fixes, alone, strict=False):
+    for fix, first in zip(follower.fixes, reference.fixes, strict=False):
         assert fix.state is first.state
         assert (fix.evidence and fix.evidence.reason) == (first.evidence and first.evidence.reason)
 

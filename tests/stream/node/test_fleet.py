@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 from fake_node import Site
 from fake_robot import SHA, T_MAP_ODOM, Robot, pose
-from nightly import nightly
-from serving import FALSE, Service, free_address, health_at
-from sockets import until
-from zenoh_routers import Router
 
-from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import TransportError
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages.types import Sample
@@ -184,75 +174,3 @@ def test_only_the_node_that_serves_a_robot_acts_on_its_queries_and_guesses():
         nodes["a"].node.endpoints[robot].end_serving()
         with pytest.raises(TransportError, match="no answer"):
             net.query(f"coview/{robot}/rpc/reset")
-
-
-class Other:
-    """Another process that serves the robot of a service."""
-
-    def __init__(self, service, router, *arguments):
-        self.metrics = free_address()
-        command = ("serve", str(service.map), "--robot", "r1", "--connect", router, "--no-state")
-        self.process = subprocess.Popen(
-            python_command("coview_stream", *command, "--metrics", self.metrics, *arguments),
-            env=python_environment(),
-            stderr=subprocess.DEVNULL,
-        )
-
-    def ready(self):
-        return (document := health_at(self.metrics)) is not None and document["ready"]["ok"]
-
-    def robot(self):
-        document = health_at(self.metrics)
-        return None if document is None else document["robots"].get("r1")
-
-    def end(self):
-        self.process.kill()
-        self.process.wait()
-
-
-@nightly
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux" or os.name != "posix", reason="stops processes")
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
-def test_one_node_serves_and_another_goes_on_when_it_dies_or_hangs(world_file, slow_drive, tmp_path, end):
-    fleet = ("--fleet", "yard")
-    with Router() as router:
-        service = Service(
-            world_file, slow_drive, tmp_path, router=router.endpoint, robots_router=router.endpoint, arguments=fleet
-        )
-        other = Other(service, router.endpoint, *fleet)
-        try:
-            until(other.ready, 60.0)
-            service.tracks(60.0)
-            first = only_server(service, service, other)
-            victim = (service, other)[first].process
-            count = len(service.poses)
-            victim.send_signal(end)
-            until(lambda: len(service.poses) > count + 5, 20.0)
-            gap = max(b - a for (a, _), (b, _) in itertools.pairwise(service.poses[count - 5 :]))
-            assert gap < 6.0, "of a busy machine; 3 s on an idle one"
-            if end is signal.SIGSTOP:
-                victim.send_signal(signal.SIGCONT)  # it takes its robot back, and nobody else serves it
-                until(lambda: serving_now(service, other) == first, 30.0)
-                assert only_server(service, service, other) == first
-            assert max(service.errors()) < FALSE
-        finally:
-            service.process.send_signal(signal.SIGCONT)
-            other.process.send_signal(signal.SIGCONT)
-            other.end()
-            service.end()
-
-
-def only_server(service, *nodes):
-    """After some time to settle: which of the nodes of a fleet has the robot; its poses come once."""
-    time.sleep(3.0)
-    count = len(service.poses)
-    time.sleep(3.0)
-    assert 15 < len(service.poses) - count < 45  # ten a second, not twice as many
-    return serving_now(*nodes)
-
-
-def serving_now(*nodes):
-    """Which of the nodes has the robot, None unless it is one."""
-    has = [k for k, node in enumerate(nodes) if node.robot() is not None]
-    return has[0] if len(has) == 1 else None

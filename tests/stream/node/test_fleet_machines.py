@@ -1,4 +1,4 @@
-"""A fleet on machines of their own, network namespaces: a cable is pulled, and plugged in again."""
+"""A fleet on machines of its own, network namespaces: a cable is pulled, a node hangs, and both come back."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import os
 import queue
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -62,10 +63,18 @@ class Machine:
             pass
         return text.split("this node is ")[1].split()[0].rstrip(",.;")
 
-    def pull(self, out):
-        ip("link", "set", self.cable, "down" if out else "up")
+    def fail(self, fault):
+        if fault == "cable":
+            ip("link", "set", self.cable, "down")
+        else:
+            self.node.send_signal(signal.SIGSTOP)
+
+    def recover(self):
+        ip("link", "set", self.cable, "up")
+        self.node.send_signal(signal.SIGCONT)
 
     def close(self):
+        self.recover()
         self.node.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.node.wait(10.0)
@@ -110,22 +119,23 @@ def fleet(world_file):
 
 
 @nightly
-def test_cable_that_is_pulled_moves_robots_and_plugged_in_again_gives_no_false_pose(fleet, slow_drive):
+@pytest.mark.parametrize("fault", ["cable", "hang"])
+def test_machine_that_fails_loses_its_robots_and_gives_no_false_pose_when_it_is_back(fleet, slow_drive, fault):
     machines = {machine.number_in_fleet(): machine for machine in fleet}
     robots = [Robot(name, slow_drive) for name in ROBOTS]
     try:
         until(lambda: all(len(robot.poses) > 5 for robot in robots), 90.0)
         victim = robots[0].nodes[-1][1]
         moved = [robot for robot in robots if robot.nodes[-1][1] == victim]
-        machines[victim].pull(out=True)
-        pulled = time.monotonic()
-        until(lambda: all(robot.served_by({victim}, pulled) for robot in moved), 20.0)
-        taken = [robot.served_by({victim}, pulled) - pulled for robot in moved]
-        until(lambda: all(robot.poses[-1][0] > pulled + 5.0 for robot in moved), 60.0)
+        machines[victim].fail(fault)
+        failed = time.monotonic()
+        until(lambda: all(robot.served_by({victim}, failed) for robot in moved), 20.0)
+        taken = [robot.served_by({victim}, failed) - failed for robot in moved]
+        until(lambda: all(robot.poses[-1][0] > failed + 5.0 for robot in moved), 60.0)
         assert max(taken) < MAX_GAP, taken
-        machines[victim].pull(out=False)
-        plugged = time.monotonic()
-        until(lambda: all(robot.served_by(set(machines) - {victim}, plugged) for robot in moved), 60.0)
+        machines[victim].recover()
+        back = time.monotonic()
+        until(lambda: all(robot.served_by(set(machines) - {victim}, back) for robot in moved), 60.0)
         time.sleep(5.0)
         now = time.monotonic()
         until(lambda: all(robot.poses[-1][0] > now for robot in robots), 60.0)

@@ -103,8 +103,7 @@ def test_guess_is_told_again_to_an_engine_that_begins_anew():
         lambda session: session.restart_search("asked to search again", forget=True),
     ],
 )
-def test_guess_that_waits_is_forgotten_with_the_rest(forget):
-    robot = Robot()
+def test_guess_that_waits_is_forgotten_with_the_rest(robot, forget):
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, within=300.0))
     forget(robot.session)
     assert robot.frame(0.0, unknown).guess is None

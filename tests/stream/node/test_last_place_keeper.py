@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_node import STEP, Site
+from fake_node import STEP, Site, declared
 from fake_robot import SHA, T_MAP_ODOM, Robot, ns, pose, tracking, unknown
 from sockets import until
 
@@ -56,24 +56,17 @@ def test_calibration_goes_with_the_pose_hint_alone(robot):
     assert robot.frame(0.5, unknown).calibration is None
 
 
-def test_calibration_of_a_robot_without_a_place_is_told_but_not_kept(robot, tmp_path):
-    """What is corrected is learnt anew while it searches; only a place that was accepted vouches for it."""
+def test_calibration_of_a_robot_without_a_place_is_reported_but_not_saved(robot, tmp_path):
+    """A robot that searches estimates its corrections again; only an accepted place confirms them."""
     known, relearnt = Calibration(pitch=0.05), Calibration(pitch=-0.03)
 
-    def told(answer, calibration):
-        def run(job):
-            result = answer(job)
-            return replace(result, fix=replace(result.fix, calibration=calibration))
+    def calibrated(result, calibration):
+        return replace(result, fix=replace(result.fix, calibration=calibration))
 
-        return run
-
-    def lost(job):
-        return unknown(job, State.LOST)
-
-    robot.frame(0.1, told(tracking, known))
+    robot.frame(0.1, lambda job: calibrated(tracking(job), known))
     keeper = LastPlaceKeeper(tmp_path, [robot.session])
     keeper.keep()
-    robot.frame(0.2, told(lost, relearnt))
+    robot.frame(0.2, lambda job: calibrated(unknown(job, State.LOST), relearnt))
     assert robot.session.robot_state.calibration == relearnt
     keeper.keep()
     assert load(tmp_path, robot.session.keys.robot, SHA).calibration == known
@@ -169,26 +162,21 @@ def test_last_known_pose_is_the_newest(robot):
 
 def test_pose_hint_reaches_the_localizer(world_map, world_drive):
     engine = TrackEngine(world_map)
-    there = world_drive.T_map_body[0]
 
-    def job(k, hint=None):
-        return FrameJob("r1", 1, ns(0.5 * k), world_drive.clouds[k], world_drive.T_odom_body[k], hint=hint)
+    def hints(k, hint=None):
+        job = FrameJob("r1", 1, ns(0.5 * k), world_drive.clouds[k], world_drive.T_odom_body[k], hint=hint)
+        return engine.run(job).request.hints
 
-    (T_map_odom,) = engine.run(job(0, there)).request.hints
-    assert [len(engine.run(job(k)).request.hints) for k in (1, 2)] == [1, 1]
+    assert [len(hints(0, world_drive.T_map_body[0])), len(hints(1)), len(hints(2))] == [1, 1, 1]
     engine.forget("r1")
-    request = engine.run(job(0, pose_from(np.eye(3), [1e9, 0.0, 0.0]))).request  # of no use, but the frame is
-    assert request.hints == ()
-    assert request is not None
-    assert T_map_odom.shape == (4, 4)
+    assert hints(0, pose_from(np.eye(3), [1e9, 0.0, 0.0])) == ()  # the hint is of no use, but the frame is
 
 
 # ---- the node
 
 
 def remembering(folder, *names, **more):
-    site = Site(*names)
-    site.node.declare()
+    site = declared(*names)
     return site, LastPlaceKeeper(folder, list(site.sessions.values()), **more)
 
 

@@ -44,8 +44,12 @@ class Robot(fake_robot.Robot):
         return self
 
 
-def test_frame_is_paired_with_its_own_lidar_odometry():
-    robot = Robot()
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_frame_is_paired_with_its_own_lidar_odometry(robot):
     job = robot.frame(0.5)
     assert (job.stamp_ns, job.T_odom_body[0, 3]) == (ns(0.5), 1.0)
     assert job.times is None
@@ -54,8 +58,7 @@ def test_frame_is_paired_with_its_own_lidar_odometry():
     assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 1, "fixes": 1, "poses": 1}
 
 
-def test_sweep_is_forwarded_deskewed():
-    robot = Robot()
+def test_sweep_is_forwarded_deskewed(robot):
     robot.saw(0.0, codec="foxglove", times=TIMES)
     assert robot.placed().times is not None
     job = robot.answered()
@@ -67,8 +70,7 @@ def test_sweep_is_forwarded_deskewed():
     assert np.allclose(plain.answered().points, POINTS)
 
 
-def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
-    robot = Robot()
+def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow(robot):
     robot.frame(0.0)
     for k in range(1, 8):
         robot.saw(0.1 * k)
@@ -82,8 +84,7 @@ def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
     assert state(robot) is State.TRACKING
 
 
-def test_one_odometry_job_at_a_time():
-    robot = Robot()
+def test_one_odometry_job_at_a_time(robot):
     robot.saw(0.0)
     robot.saw(0.1)
     assert robot.session.take_job("odometry") is not None
@@ -108,8 +109,7 @@ def test_missing_clouds_and_rejected_clouds_have_different_reasons():
     assert robot.session.errors.texts[-1].endswith("3 of 9 points between 1 and 100 m")
 
 
-def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
-    robot = Robot()
+def test_before_the_first_pose_the_reason_names_clouds_not_odometry(robot):
     assert robot.session.state()[1] == "waiting for clouds on coview/r1/in/cloud"
     robot.saw(0.0)
     assert robot.session.state()[1] == "no frame has been processed yet"

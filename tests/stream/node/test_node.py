@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from fake_node import STEP, THREADS, Site
+from fake_node import STEP, THREADS, Site, declared
 from fake_robot import SHA, ns
 from sockets import until
 
@@ -99,25 +99,17 @@ def test_only_state_changes_are_published_between_regular_statuses(pair):
     assert len(pair.statuses("r2")) == 1
 
 
-def test_relocalize_request_restarts_one_robot(pair):
+@pytest.mark.parametrize(("ask", "state", "received"), [("relocalize", "LOST", 1), ("reset", "SEARCHING", 0)])
+def test_request_restarts_one_robot(pair, ask, state, received):
     for name in ("r1", "r2"):
         pair.frame(name, 0.0)
-    reply = pair.net.query("coview/r1/rpc/relocalize")
-    assert (reply["ok"], reply["robot"], reply["state"]) == (True, "r1", "LOST")
-    assert pair.status("r1")["counters"]["received"] == 1
+    reply = pair.net.query(f"coview/r1/rpc/{ask}", {"why": "test"})
+    assert (reply["ok"], reply["robot"], reply["state"]) == (True, "r1", state)
+    json.dumps(reply)
+    assert pair.status("r1")["counters"]["received"] == received
     assert pair.status("r2")["state"] == "TRACKING"
     pair.frame("r1", STEP)
     assert pair.status("r1")["state"] == "TRACKING"
-
-
-def test_reset_request_clears_one_robot(pair):
-    for name in ("r1", "r2"):
-        pair.frame(name, 0.0)
-    reply = pair.net.query("coview/r1/rpc/reset", {"why": "test"})
-    assert (reply["ok"], reply["robot"], reply["state"]) == (True, "r1", "SEARCHING")
-    assert sum(pair.status("r1")["counters"].values()) == 0
-    assert pair.status("r2")["counters"]["processed"] == 1
-    json.dumps(reply)
 
 
 def test_close_publishes_last_status_once(site):
@@ -166,37 +158,29 @@ def test_node_with_threads_end_to_end():
     assert "shutting down" in site.statuses("r1")[-1]["reason"]
 
 
-@pytest.mark.slow
-def test_close_does_not_wait_for_stuck_network():
+@pytest.mark.parametrize("part", [pytest.param("network", marks=pytest.mark.slow), "publisher"])
+def test_close_does_not_wait_for_a_stuck_network(part):
     site = Site("r1")
-    site.node.start()
+    site.node.start() if part == "network" else site.node.declare()
     stuck = threading.Event()
-    site.net.close = stuck.wait
+    if part == "network":
+        site.net.close = stuck.wait
+    else:
+        for publisher in site.net.publishers:
+            publisher.put = lambda message: stuck.wait()
     begin = time.monotonic()
     assert site.node.close(timeout=0.6) is False
     assert time.monotonic() - begin < 5.0
-    assert (site.track.closed, site.search.closed) == (1, 1)
-    assert "shutting down" in site.statuses("r1")[-1]["reason"]
+    if part == "network":
+        assert (site.track.closed, site.search.closed) == (1, 1)
+        assert "shutting down" in site.statuses("r1")[-1]["reason"]
     stuck.set()
     until(lambda: site.node.close(timeout=0.0))
-
-
-def test_close_does_not_wait_for_stuck_publisher():
-    site = Site("r1")
-    site.node.declare()
-    stuck = threading.Event()
-    for publisher in site.net.publishers:
-        publisher.put = lambda message: stuck.wait()
-    assert site.node.close(timeout=0.3) is False
-    stuck.set()
-    until(lambda: site.node.close(timeout=0.0))
-    assert site.net.closed
 
 
 @pytest.mark.parametrize(("away", "losses"), [(True, 0), (False, 1)])
 def test_pause_explained_by_network_outage_keeps_the_place(away, losses):
-    site = Site("r1")
-    site.node.declare()
+    site = declared("r1")
     site.frame("r1", 0.0)
     site.status("r1")
     if away:

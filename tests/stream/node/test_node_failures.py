@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_node import STEP, Site
+from fake_node import STEP, Site, declared
 from fake_robot import ns, search_request, tracking, unknown
 from sockets import until
 
@@ -126,11 +126,8 @@ def test_engine_death_is_reported_before_first_frame(site):
 
 
 def test_dead_search_engine_loses_no_place(pair):
-    def ask(job):
-        return unknown(job, ask=search_request())
-
     pair.frame("r1", 0.0)
-    pair.engine.answer = ask
+    pair.engine.answer = lambda job: unknown(job, ask=search_request())
     pair.sees("r2", 0.0)
     pair.search.dead = True
     pair.work("r2")
@@ -145,8 +142,7 @@ def test_dead_search_engine_loses_no_place(pair):
 
 def test_robots_are_served_round_robin():
     names = ("r1", "r2", "r3", "r4")
-    site = Site(*names)
-    site.node.declare()
+    site = declared(*names)
     served = []
     for k in range(40):
         for name in names:
@@ -246,8 +242,7 @@ def test_failing_status_is_not_retried_in_a_loop():
 
 
 def test_unencodable_pose_of_one_robot_does_not_affect_others():
-    site = Site("r1", "r2")
-    site.node.declare()
+    site = declared("r1", "r2")
     site.engine.answer = lambda job: tracking(job, sigma=float("nan") if job.robot == "r1" else 0.1)
     for name in ("r1", "r2"):
         site.frame(name, 0.0)

@@ -6,7 +6,7 @@ import json
 import time
 
 import numpy as np
-from fake_node import STEP, Site
+from fake_node import STEP, declared
 from fake_robot import SHA, T_MAP_ODOM, message, ns
 from small_world import pose_error
 
@@ -19,8 +19,7 @@ from coview_stream.stream.transport.rmw import NO_HASH, gid_of
 
 
 def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
-    site = Site("r1", engines=(TrackEngine(world_map), SearchEngine(world_map)))
-    site.node.declare()
+    site = declared("r1", engines=(TrackEngine(world_map), SearchEngine(world_map)))
     right = []
     for k in range(8):
         moved = encode_odometry(OdometryMessage(ns(0.5 * k), world_drive.T_odom_body[k]), "json")
@@ -52,8 +51,7 @@ def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
 
 
 def test_poses_follow_rmw_zenoh_conventions():
-    site = Site("r1", preset="rmw_zenoh")
-    site.node.declare()
+    site = declared("r1", preset="rmw_zenoh")
     keys = site.keys["r1"]
     for seconds in (0.0, STEP):
         moved = encode_odometry(message(seconds), "cdr")
@@ -77,8 +75,7 @@ def test_poses_follow_rmw_zenoh_conventions():
 
 
 def test_each_robot_has_its_own_rmw_publisher():
-    site = Site("r1", "r2", preset="rmw_zenoh")
-    site.node.declare()
+    site = declared("r1", "r2", preset="rmw_zenoh")
     publishers = sorted(t for t in site.net.announced if "/MP/" in t)
     assert len(publishers) == 2
     assert len({t.split("/")[4] for t in publishers}) == 2  # entity ids
@@ -86,8 +83,7 @@ def test_each_robot_has_its_own_rmw_publisher():
 
 
 def test_pose_encoding_option():
-    site = Site("r1", pose_format="cdr")
-    site.node.declare()
+    site = declared("r1", pose_format="cdr")
     site.frame("r1", 0.0)
     site.poses("r1")
     (sent,) = site.net.samples("coview/r1/out/pose")

@@ -1,10 +1,10 @@
-"""Frames and their odometry: who waits for what, and what people are told when nothing comes."""
+"""Pairing of frames with odometry, and the reasons of a state without either."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from fake_robot import KEYS, POINTS, SHA, Robot, cloud, ends, ns, odometry, pose, reason, tracking, unknown
+from fake_robot import KEYS, POINTS, SHA, Robot, cloud, ends, ns, odometry, pose, reason, tracking
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.localization.state import State
@@ -12,16 +12,9 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.node.session import Session
 
 
-def test_frame_is_paired_with_odometry_at_its_stamp(robot):
-    robot.drive(0.0, 0.5, rate=10.0)
-    robot.saw(0.325, now=1000.5)
-    np.testing.assert_allclose(robot.session.take_job("track").T_odom_body, pose(0.65), atol=1e-9)
-
-
 def test_frame_waits_for_odometry_after_its_stamp(robot):
     robot.drive(0.0, 0.1)
-    robot.saw(0.12)
-    assert robot.session.take_job("track") is None
+    assert robot.job_for(0.12) is None
     robot.moved(0.15)
     job = robot.session.take_job("track")
     assert job.stamp_ns == ns(0.12)
@@ -29,11 +22,9 @@ def test_frame_waits_for_odometry_after_its_stamp(robot):
 
 
 def test_frame_without_odometry_does_not_block_others(robot):
-    """One cloud from the far future must not shut out those of the present."""
     robot.drive(0.0, 0.1)
-    robot.saw(3600.0, now=1000.1)
-    robot.saw(0.05, now=1000.1)
-    assert robot.session.take_job("track").stamp_ns == ns(0.05)
+    robot.saw(3600.0, now=1000.1)  # from the far future
+    assert robot.job_for(0.05, now=1000.1).stamp_ns == ns(0.05)
     robot.session.tick(1000.5)
     assert robot.counters.no_odometry == 1
     robot.drive(0.15, 0.6)
@@ -53,8 +44,7 @@ def test_waiting_clouds_are_bounded(robot):
 def test_sweep_waits_for_odometry_at_its_end(robot):
     robot.drive(0.0, 0.2)
     times = np.linspace(0.0, 0.1, len(POINTS))
-    robot.saw(0.15, now=1000.26, codec="foxglove", times=times)
-    assert robot.session.take_job("track") is None
+    assert robot.job_for(0.15, now=1000.26, codec="foxglove", times=times) is None
     robot.moved(0.26)
     job = robot.session.take_job("track")
     np.testing.assert_allclose(job.times, times, atol=1e-6)
@@ -73,8 +63,7 @@ def test_sweep_wait_is_bounded(robot):
 
 def test_sweep_with_times_before_the_stamp(robot):
     robot.drive(0.0, 0.2)
-    robot.saw(0.18, codec="foxglove", times=np.linspace(-0.1, 0.0, len(POINTS)))
-    job = robot.session.take_job("track")
+    job = robot.job_for(0.18, codec="foxglove", times=np.linspace(-0.1, 0.0, len(POINTS)))
     assert job.segment.stamps.tolist()[0] <= ns(0.08)
     assert job.segment.stamps.tolist()[-1] >= ns(0.18)
 
@@ -82,15 +71,15 @@ def test_sweep_with_times_before_the_stamp(robot):
 def test_deskew_option_off():
     robot = Robot(NodeConfig(deskew=False))
     robot.drive(0.0, 0.2)
-    robot.saw(0.18, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
-    assert robot.session.take_job("track").segment is None
+    assert robot.job_for(0.18, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS))).segment is None
 
 
 def test_reason_names_the_missing_messages(robot):
+    robot.session.tick(2000.0)
     assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
-    robot.saw(0.0)
+    robot.saw(1000.0)
     assert reason(robot) == f"waiting for odometry on {KEYS.odometry}"
-    robot.moved(0.0)
+    robot.moved(1000.0)
     assert "no frame has been processed yet" in reason(robot)
 
 
@@ -102,15 +91,6 @@ def test_reason_names_clock_difference(robot, difference):
         robot.session.tick(robot.now)
     assert "clock" in reason(robot)
     assert ends(robot.counters) >= 15
-
-
-def test_reason_is_taken_from_evidence(robot):
-    robot.frame(0.0, unknown, reason="two places fit")
-    assert robot.session.state() == (State.SEARCHING, "two places fit")
-    robot.frame(0.1)
-    assert robot.session.state() == (State.TRACKING, "verified")
-    robot.frame(0.2, unknown, state=State.LOST, reason="evidence gone, 2 times in a row")
-    assert robot.session.state() == (State.LOST, "evidence gone, 2 times in a row")
 
 
 def test_error_log_is_deduplicated_and_bounded(robot):
@@ -150,12 +130,10 @@ def test_codec_options_override_encoding():
     assert session.take_job("track") is not None
 
 
-def test_frame_that_replaced_another_defers_registration():
-    robot = Robot()
+def test_frame_that_replaced_another_defers_registration(robot):
     robot.drive(-0.1, 0.5)
     robot.saw(0.0)
     robot.saw(0.1)
     job = robot.answered()
     assert (job.stamp_ns, job.defer) == (ns(0.1), True)
-    robot.saw(0.2)
-    assert not robot.session.take_job("track").defer
+    assert not robot.job_for(0.2).defer

@@ -67,8 +67,7 @@ def test_protection_level_grows_with_distance_and_keeps_its_doubt():
     assert level(robot) is None
 
 
-def test_heading_error_propagates_to_position():
-    robot = Robot()
+def test_heading_error_propagates_to_position(robot):
     heading = np.zeros((6, 6))
     heading[5, 5] = np.radians(1.0) ** 2
     robot.localized(0.0, covariance=heading)
@@ -91,8 +90,7 @@ def test_correction_does_not_change_published_stamps(robot):
     for k in range(1, 40):
         robot.moved(0.05 * k)
         if k % 2 == 0:
-            robot.saw(0.05 * k - 0.02)
-            job = robot.session.take_job("track")
+            job = robot.job_for(0.05 * k - 0.02)
             robot.session.handle_result(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
         sent = robot.session.pose()
         stamps.append(sent.stamp_ns)
@@ -139,15 +137,13 @@ def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     assert state(robot) is State.TRACKING
     assert robot.session.pose() is not None
     robot.moved(0.4, now=silent + 0.2)
-    robot.saw(0.39, now=silent + 0.2)
-    assert not robot.session.take_job("track").require_verification
+    assert not robot.job_for(0.39, now=silent + 0.2).require_verification
 
 
 def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     robot.localized(0.0)
     robot.drive(0.05, 0.3)
-    robot.saw(0.25)
-    job = robot.session.take_job("track")
+    job = robot.job_for(0.25)
     robot.session.tick(robot.now + 0.6)
     robot.session.handle_result(job, tracking(job), robot.now + 0.7)
     assert robot.session.pose() is None
@@ -173,16 +169,14 @@ def test_dead_reckoning_ends_after_timeout():
         robot.session.tick(robot.now)
     assert robot.session.pose() is None
     assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
-    robot.saw(2.19)
-    assert robot.session.take_job("track").require_verification
+    assert robot.job_for(2.19).require_verification
 
 
 def test_rejected_frames_do_not_extend_dead_reckoning():
     robot = Robot(NodeConfig(dead_reckoning_timeout=1.0)).localized(0.0)
     for k in range(1, 30):
         robot.moved(0.05 * k)
-        robot.saw(0.05 * k - 0.01)
-        job = robot.session.take_job("track")
+        job = robot.job_for(0.05 * k - 0.01)
         robot.session.handle_failure(job, "too few points", rejected=True)
         robot.session.tick(robot.now)
     assert state(robot) is State.LOST
@@ -208,8 +202,7 @@ def test_odometry_jump_restarts_search(robot):
     assert robot.session.pose() is None
     assert robot.session.state() == (State.LOST, "odometry jumped")
     robot.moved(0.2, x=900.1)
-    robot.saw(0.18)
-    job = robot.session.take_job("track")
+    job = robot.job_for(0.18)
     assert job.epoch != first.epoch
     assert not job.require_verification  # the engine begins anew as well
     assert job.search_result is None
@@ -231,8 +224,7 @@ def test_one_stamp_never_gets_two_poses():
     first = robot.session.pose()
     robot.saw(0.0)
     robot.drive(0.05, 0.1)
-    robot.saw(0.1)
-    job = robot.session.take_job("track")
+    job = robot.job_for(0.1)
     before = robot.session.pose()
     robot.session.handle_result(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
     assert robot.session.pose() is before

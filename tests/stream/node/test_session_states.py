@@ -57,8 +57,7 @@ def test_results_of_old_epoch_are_ignored(robot, how):
     robot.frame(0.0, unknown, ask=search_request(0.0))
     searching = robot.session.take_job("search")
     robot.drive(0.05, 0.2)
-    robot.saw(0.15)
-    busy = robot.session.take_job("track")
+    busy = robot.job_for(0.15)
     if how == "begin_anew":
         robot.session.restart_search("asked to")
     elif how == "reset":
@@ -72,8 +71,7 @@ def test_results_of_old_epoch_are_ignored(robot, how):
     far = 500.0 if how == "jump" else 0.6
     robot.moved(0.3, x=far)
     robot.moved(0.35, x=far)
-    robot.saw(0.33)
-    job = robot.session.take_job("track")
+    job = robot.job_for(0.33)
     assert job.search_result is None
     assert job.epoch > busy.epoch
     # the old frame's end does not end the new one
@@ -83,68 +81,45 @@ def test_results_of_old_epoch_are_ignored(robot, how):
 
 def test_failure_of_old_epoch_does_not_end_running_frame(robot):
     robot.drive(0.0, 0.2)
-    robot.saw(0.15)
-    old = robot.session.take_job("track")
+    old = robot.job_for(0.15)
     robot.session.restart_search("asked to")
-    robot.saw(0.18)
-    busy = robot.session.take_job("track")
+    busy = robot.job_for(0.18)
     assert busy is not None
     robot.session.handle_failure(old, "boom", rejected=False)
-    robot.saw(0.19)
-    assert robot.session.take_job("track") is None
+    assert robot.job_for(0.19) is None
     robot.session.handle_result(busy, tracking(busy), robot.now)
     assert robot.session.pose() is not None
 
 
-def test_search_result_goes_with_the_next_frame_once(robot):
+def test_search_result_goes_with_frames_until_one_is_not_rejected(robot):
     robot.frame(0.0, unknown, ask=search_request(0.0))
-    said = search_result()
-    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
-    assert robot.frame(0.1, unknown).search_result is said
-    assert robot.frame(0.2, unknown).search_result is None
-
-
-def test_search_result_is_kept_when_frame_is_rejected(robot):
-    robot.frame(0.0, unknown, ask=search_request(0.0))
-    said = search_result()
-    robot.session.handle_result(robot.session.take_job("search"), said, robot.now)
+    result = search_result()
+    robot.session.handle_result(robot.session.take_job("search"), result, robot.now)
     robot.drive(0.05, 0.2)
-    robot.saw(0.1)
-    robot.session.handle_failure(robot.session.take_job("track"), "too few points", rejected=True)
-    robot.saw(0.15)
-    assert robot.session.take_job("track").search_result is said
-
-
-def test_failed_search_skips_only_its_keyframe(robot):
-    robot.frame(0.0, unknown, ask=search_request(0.0))
-    robot.session.handle_failure(robot.session.take_job("search"), "boom")
-    assert robot.frame(0.1, unknown, ask=search_request(0.1)).search_result is None
-    assert robot.session.take_job("search") is not None
+    robot.session.handle_failure(robot.job_for(0.1), "too few points", rejected=True)
+    assert robot.frame(0.3, unknown).search_result is result
+    assert robot.frame(0.4, unknown).search_result is None
 
 
 def test_engine_failure_starts_new_epoch(robot):
     epoch = robot.localized(0.0).frame(0.1).epoch
     robot.drive(0.15, 0.3)
-    robot.saw(0.25)
-    robot.session.handle_failure(robot.session.take_job("track"), "boom", rejected=False)
+    robot.session.handle_failure(robot.job_for(0.25), "boom", rejected=False)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     assert robot.frame(0.4, unknown).epoch != epoch
 
 
-def test_odometry_gap_during_first_fix_restarts_search():
-    robot = Robot()
+def test_odometry_gap_during_first_fix_restarts_search(robot):
     robot.frame(0.0, unknown, state=State.AMBIGUOUS)
     robot.drive(0.05, 0.3)
-    robot.saw(0.2)
-    busy = robot.session.take_job("track")  # carries the verdict that will be accepted
+    busy = robot.job_for(0.2)  # carries the verdict that will be accepted
     robot.moved(2.0, x=0.6, now=robot.now + 0.02)
     assert robot.counters.odometry_gaps == 1
     robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)
     assert robot.session.pose() is None
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
-    robot.saw(2.05)
-    assert robot.session.take_job("track").epoch > busy.epoch  # the search begins anew
+    assert robot.job_for(2.05).epoch > busy.epoch  # the search begins anew
 
 
 def test_long_odometry_outage_loses_the_place():
@@ -174,36 +149,26 @@ def changes(robot):
     return [(c["from"], c["to"], c["reason"]) for c in told(robot)]
 
 
-def test_odometry_pause_while_doubted_keeps_the_place(covered):
+@pytest.mark.parametrize("noticed", [False, True])
+def test_odometry_pause_while_doubted_keeps_the_place(covered, noticed):
     epoch = covered.frame(0.2, doubted).epoch
+    if noticed:
+        covered.session.tick(covered.now + 0.4)
+        assert state(covered) is State.DOUBTED
+        covered.session.tick(covered.now + 0.6)
+        assert changes(covered)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
     covered.moved(0.9, x=0.4)
     assert covered.counters.odometry_gaps == 1
-    assert state(covered) is State.DOUBTED
-    assert covered.counters.losses == 0
+    assert state(covered) is (State.LOST if noticed else State.DOUBTED)
     covered.moved(1.0, x=0.5)
     covered.saw(0.95)
     job = covered.answered()
     assert (job.epoch, job.require_verification) == (epoch, True)
     assert covered.session.pose() is not None
+    assert covered.counters.losses == noticed
 
 
-def test_odometry_timeout_while_doubted_keeps_the_place(covered):
-    epoch = covered.frame(0.2, doubted).epoch
-    covered.session.tick(covered.now + 0.4)
-    assert state(covered) is State.DOUBTED
-    covered.session.tick(covered.now + 0.6)
-    assert changes(covered)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
-    covered.moved(0.9, x=0.4)
-    covered.moved(1.0, x=0.5)
-    covered.saw(0.95)
-    job = covered.answered()
-    assert (job.epoch, job.require_verification) == (epoch, True)
-    assert state(covered) is State.TRACKING
-    assert covered.counters.losses == 1
-
-
-def test_odometry_pause_while_searching_restarts_search():
-    robot = Robot()
+def test_odometry_pause_while_searching_restarts_search(robot):
     epoch = robot.frame(0.0, unknown, state=State.AMBIGUOUS).epoch
     robot.moved(0.7, x=0.4)
     assert robot.frame(0.8, unknown).epoch != epoch
@@ -231,8 +196,7 @@ def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(an
         robot.session.tick(robot.now)
     assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
     assert robot.counters.losses == 1
-    robot.saw(3.9, now=robot.now)
-    job = robot.session.take_job("track")
+    job = robot.job_for(3.9, now=robot.now)
     assert job.stamp_ns == ns(3.9)
     for k in range(80, 84):  # while the frame is under way
         robot.moved(0.05 * k, x=0.3)
@@ -247,8 +211,7 @@ def test_loss_has_newest_reason_and_is_counted_once():
     robot.session.tick(silent)
     for answer, stamp in ((doubted, 0.1), (unknown, 0.2)):
         robot.moved(stamp, now=silent + stamp)
-        robot.saw(stamp - 0.01, now=silent + stamp)
-        job = robot.session.take_job("track")
+        job = robot.job_for(stamp - 0.01, now=silent + stamp)
         more = {"state": State.LOST, "reason": "in doubt for 60 s"} if answer is unknown else {}
         robot.session.handle_result(job, answer(job, **more), silent + stamp)
         if answer is doubted:
@@ -271,8 +234,7 @@ def test_frame_from_before_gap_does_not_count_as_verification():
     assert robot.counters.odometry_gaps == 1
     robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
-    robot.saw(2.05)
-    job = robot.session.take_job("track")
+    job = robot.job_for(2.05)
     assert job.require_verification
 
 
@@ -292,27 +254,18 @@ def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
 
 
 @pytest.mark.parametrize(("ended", "said"), [("clouds", "no clouds for 6 s"), ("odometry", "no odometry for 6 s")])
-def test_searching_robot_whose_data_end_says_so_and_for_how_long(ended, said):
-    robot = Robot()
+def test_searching_robot_whose_data_end_says_so_and_for_how_long(robot, ended, said):
     robot.frame(0.0, unknown)
-    before = robot.session.state()[1]
     for k in range(1, 61):  # 6 s
         if ended != "odometry":
             robot.moved(0.1 * k)
         if ended != "clouds":
             robot.saw(0.1 * k)
         robot.session.tick(1000.0 + 0.1 * k)
-    assert robot.session.state()[1] == f"{said}; before: {before}"
+    assert robot.session.state()[1] == f"{said}; before: no place fits"
 
 
-def test_robot_that_never_sent_anything_waits_for_it():
-    robot = Robot()
-    robot.session.tick(2000.0)
-    assert robot.session.state()[1].startswith("waiting for clouds")
-
-
-def test_fix_and_loss_are_in_the_state_history():
-    robot = Robot()
+def test_fix_and_loss_are_in_the_state_history(robot):
     assert told(robot) == []
     robot.localized(0.0)
     robot.frame(0.1, doubted, reason="rays pass through the map")

@@ -6,15 +6,7 @@ import pytest
 import zenoh
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.transport.keys import (
-    PRESETS,
-    check_chunk,
-    check_disjoint,
-    check_expression,
-    check_prefix,
-    matches,
-    robot_keys,
-)
+from coview_stream.stream.transport.keys import PRESETS, check_disjoint, check_expression, matches, robot_keys
 
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
 
@@ -138,11 +130,6 @@ def test_key_expression_validity_agrees_with_zenoh(text: str) -> None:
             check_expression(text, "key")
 
 
-def test_valid_names_and_bases_are_returned_unchanged() -> None:
-    assert check_chunk("rover-1", "--robot") == "rover-1"
-    assert check_prefix("a/b", "--base") == "a/b"
-
-
 def fleet(preset="native", names=("r1", "r2"), **given):
     return [robot_keys(preset, "coview", name, **given) for name in names]
 
@@ -178,8 +165,3 @@ def test_pose_key_read_by_another_robot_is_refused():
     first = robot_keys("native", "coview", "r1", pose="coview/r2/in/odom")
     with pytest.raises(ConfigError, match=r"poses of robot r1 .* input of r2"):
         check_disjoint([first, robot_keys("native", "coview", "r2")])
-
-
-def test_duplicate_robot_name_is_refused():
-    with pytest.raises(ConfigError, match="each name once"):
-        check_disjoint(fleet(names=("r1", "r1")))

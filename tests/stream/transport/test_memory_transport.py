@@ -11,32 +11,6 @@ from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.transport import Transport
 
 
-def test_samples_reach_matching_handlers_before_publish_returns() -> None:
-    net = MemoryTransport()
-    wild: list[Sample] = []
-    exact: list[Sample] = []
-    net.subscribe("coview/*/in/cloud", wild.append, "newest")
-    net.subscribe("coview/r1/in/cloud", exact.append, "all")
-    first, second = Sample("coview/r1/in/cloud", b"1"), Sample("coview/r2/in/cloud", b"2", "x", b"y")
-    net.publish(first)
-    net.publish(second)
-    assert wild == [first, second]
-    assert exact == [first]
-    assert net.subscribed == {"coview/*/in/cloud": "newest", "coview/r1/in/cloud": "all"}
-
-
-def test_published_samples_are_recorded_and_delivered() -> None:
-    net = MemoryTransport()
-    heard: list[Sample] = []
-    net.subscribe("**", heard.append, "all")
-    publisher = net.publisher("a/b", "realtime")
-    publisher.put(Encoded(b"x", "application/json", b"t"))
-    publisher.close()
-    publisher.put(Encoded(b"late"))
-    assert net.published == heard == net.samples("a/*") == [Sample("a/b", b"x", "application/json", b"t")]
-    assert net.publishers[0].urgency == "realtime"
-
-
 def test_raising_handler_is_recorded_and_called_again(caplog: pytest.LogCaptureFixture) -> None:
     net = MemoryTransport()
     calls: list[bytes] = []
@@ -52,26 +26,6 @@ def test_raising_handler_is_recorded_and_called_again(caplog: pytest.LogCaptureF
     assert calls == [b"\0", b"\1", b"\2"]
     assert [str(error) for error in net.raised] == ["bad frame"] * 3
     assert len(caplog.records) == 1
-
-
-def test_queries_return_answers_or_raise_the_reason() -> None:
-    net = MemoryTransport()
-
-    def refuse(_: dict[str, str]) -> dict[str, object]:
-        raise ValueError("not now")
-
-    end = net.answer("r1/rpc/reset", lambda parameters: {"ok": True, **parameters})
-    net.answer("r1/rpc/relocalize", refuse)
-    assert net.query("r1/rpc/reset", {"why": "test"}) == {"ok": True, "why": "test"}
-    with pytest.raises(TransportError, match="refused: not now"):
-        net.query("r1/rpc/relocalize")
-    assert [str(error) for error in net.raised] == ["not now"]
-    with pytest.raises(TransportError, match="r2/rpc/reset"):
-        net.query("r2/rpc/reset")
-    end()
-    end()
-    with pytest.raises(TransportError, match="r1/rpc/reset: no answer"):
-        net.query("r1/rpc/reset")
 
 
 def test_network_outage_and_return() -> None:
