@@ -51,11 +51,6 @@ def test_option_prints_numbers_for_each_station(world_file, capsys):
     assert found["within"]["40"] + found["never"] == pytest.approx(1.0)
 
 
-def test_plain_info_does_not_look(world_file, capsys):
-    assert main(["info", str(world_file), "--json"]) == 0
-    assert "ambiguity" not in json.loads(capsys.readouterr().out)
-
-
 @pytest.mark.parametrize(
     ("more", "said"),
     [

@@ -34,8 +34,9 @@ def site(map_points, world_run, world_drive, tmp_path_factory):
 @pytest.mark.slow
 def test_las_has_sources_stamps_and_reference_system(site, world_run, tmp_path, capsys):
     pytest.importorskip("pyproj")
-    out = tmp_path / "fused.laz"
-    assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", "-o", str(out), "--changes"]) == 0
+    out, more = tmp_path / "fused.laz", ["--changes", "--picture", str(tmp_path / "f.png")]
+    assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", "-o", str(out), *more]) == 0
+    assert (tmp_path / "f.png").stat().st_size > 10_000
     said = capsys.readouterr().out
     assert "1 frames without a pose" in said
     assert "blind spots" in said
@@ -82,13 +83,6 @@ def test_joint_writes_trajectories_and_says_what_it_kept(site, world_run, tmp_pa
     before = read_tum(site / "out" / "trajectory.tum")
     assert np.array_equal(stamps, before[0])
     assert np.abs(poses[:, :3, 3] - before[1][:, :3, 3]).max() < 0.1
-
-
-@pytest.mark.slow
-def test_picture(site, world_run, tmp_path):
-    arguments = ["-o", str(tmp_path / "f.npy"), "--changes", "--picture", str(tmp_path / "f.png")]
-    assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", *arguments]) == 0
-    assert (tmp_path / "f.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import asyncio
 import json
 import struct
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -281,36 +282,32 @@ def test_malformed_endpoint_is_refused():
 def test_client_over_real_sockets():
     endpoint = free_endpoint()
     clouds, odometry = [], []
-    node = open_transport(listen=[endpoint])
-    try:
-        with RobotClient("r1", endpoint) as robot:
-            assert not robot.wait_for_node(0.05)
-            # odometry first, as the node does: the client waits for a subscriber to its clouds
-            node.subscribe("coview/r1/in/odom", lambda s: odometry.append(decode_odometry(s)), "all")
-            node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(decode_cloud(s)), "newest")
-            node.answer("coview/r1/rpc/reset", lambda parameters: {"ok": True})
-            pose_out = node.publisher("coview/r1/out/pose", "realtime")
-            status_out = node.publisher("coview/r1/out/status", "data")
-            assert robot.wait_for_node(5)
+    with closing(open_transport(listen=[endpoint])) as node, RobotClient("r1", endpoint) as robot:
+        assert not robot.wait_for_node(0.05)
+        # odometry first, as the node does: the client waits for a subscriber to its clouds
+        node.subscribe("coview/r1/in/odom", lambda s: odometry.append(decode_odometry(s)), "all")
+        node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(decode_cloud(s)), "newest")
+        node.answer("coview/r1/rpc/reset", lambda parameters: {"ok": True})
+        pose_out = node.publisher("coview/r1/out/pose", "realtime")
+        status_out = node.publisher("coview/r1/out/status", "data")
+        assert robot.wait_for_node(5)
 
-            points = np.random.default_rng(1).normal(size=(65536, 3)).astype(np.float32)
-            robot.send_odometry(T, 7.0)
-            robot.send_cloud(points, 7.0)
-            until(lambda: clouds and odometry)
-            np.testing.assert_array_equal(clouds[0].points, points)
-            assert clouds[0].stamp_ns == odometry[0].stamp_ns == 7_000_000_000
+        points = np.random.default_rng(1).normal(size=(65536, 3)).astype(np.float32)
+        robot.send_odometry(T, 7.0)
+        robot.send_cloud(points, 7.0)
+        until(lambda: clouds and odometry)
+        np.testing.assert_array_equal(clouds[0].points, points)
+        assert clouds[0].stamp_ns == odometry[0].stamp_ns == 7_000_000_000
 
-            pose_out.put(encode_pose(pose_message(9), "cdr"))
-            status_out.put(Encoded(b'{"state": "TRACKING"}', "application/json"))
-            pose = next(robot.poses(timeout=5))
-            assert (pose.stamp_ns, pose.robot) == (9, "r1")
-            assert next(robot.statuses(timeout=5)) == {"state": "TRACKING"}
+        pose_out.put(encode_pose(pose_message(9), "cdr"))
+        status_out.put(Encoded(b'{"state": "TRACKING"}', "application/json"))
+        pose = next(robot.poses(timeout=5))
+        assert (pose.stamp_ns, pose.robot) == (9, "r1")
+        assert next(robot.statuses(timeout=5)) == {"state": "TRACKING"}
 
-            until(lambda: answers(robot))
-            with pytest.raises(TransportError, match="no answer"):
-                robot.relocalize(timeout=0.5)
-    finally:
-        node.close()
+        until(lambda: answers(robot))
+        with pytest.raises(TransportError, match="no answer"):
+            robot.relocalize(timeout=0.5)
 
 
 def answers(robot):
@@ -325,16 +322,13 @@ def test_last_large_frame_is_sent_before_close():
     """Measured: without waiting, a 1 MB frame put just before closing never arrives."""
     endpoint = free_endpoint()
     clouds = []
-    node = open_transport(listen=[endpoint])
-    try:
+    with closing(open_transport(listen=[endpoint])) as node:
         node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(len(s.payload)), "newest")
         with RobotClient("r1", endpoint) as robot:
             assert robot.wait_for_node(5)
             robot.send_cloud(np.ones((100_000, 3), np.float32), 1.0)
         until(lambda: clouds)
         assert clouds == [1_200_000]
-    finally:
-        node.close()
 
 
 def run(main):

@@ -219,20 +219,9 @@ def test_engine_that_can_keep_up_searches_for_every_keyframe():
     assert max(Robots(8, 8, 0.05).waits) < 16 * 0.05 + 0.05
 
 
-ROBOTS = ("a", "b", "c", "d")
-
-
-def served(turns, count, ready=ROBOTS):
-    """Robots in the order in which they are served, of those that are ``ready``."""
-    names = ""
-    for _ in range(count):
-        k = next(k for k in turns.order() if ROBOTS[k] in ready)
-        turns.serve(k)
-        names += ROBOTS[k]
-    return names
-
-
 def test_idle_robot_keeps_its_turn():
-    turns = RoundRobin(4)
-    assert served(turns, 2, ready="bd") == "bd"
-    assert served(turns, 4) == "acbd"
+    turns, served = RoundRobin(4), []
+    for ready in 2 * [(1, 3)] + 4 * [(0, 1, 2, 3)]:
+        served.append(next(k for k in turns.order() if k in ready))
+        turns.serve(served[-1])
+    assert served == [1, 3, 0, 2, 1, 3]

@@ -267,14 +267,9 @@ def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, caplog):
     assert "unforeseen" in caplog.text
 
 
-def running(site, kept):
-    site.node.start({"last-pose": kept.run})
-    return site
-
-
 def test_running_node_saves_periodically_and_at_close(tmp_path):
     site = Site("r1")
-    running(site, LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.5))
+    site.node.start({"last-pose": LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.5).run})
     try:
         site.sees("r1", 0.0)
         until(lambda: load(tmp_path, "r1", SHA) is not None)
@@ -301,7 +296,7 @@ def test_hanging_disk_does_not_block_the_node(tmp_path, access):
     site = Site("r1")
     if access == "load":
         hangs.set()
-    running(site, LastPlaceKeeper(Folder(tmp_path), list(site.sessions.values()), interval=0.02))
+    site.node.start({"last-pose": LastPlaceKeeper(Folder(tmp_path), list(site.sessions.values()), interval=0.02).run})
     try:
         hangs.set()
         site.sees("r1", 0.0)

@@ -69,24 +69,21 @@ def test_reload_obeys_the_key_of_the_start(site, world_map, key, said):
 
 @pytest.mark.slow
 def test_engine_that_starts_again_refuses_the_map_that_was_changed_meanwhile(site):
-    """By the hash in its header it is the one that the node has verified."""
     path, key = site / "site.coview", read_verify_key(site / "ours.pub")
     node = BaseMap.load(path, verify_key=key)
-    process = EngineProcess("track", str(path), node.sha256, trust=Trust(key, node.identity))
-    try:
-        process.start()
-        process.wait_ready()
-        process.close()
-    finally:
-        process.close()
+
+    def open_engine():
+        process = EngineProcess("track", str(path), node.sha256, trust=Trust(key, node.identity))
+        try:
+            process.start()
+            process.wait_ready()
+        finally:
+            process.close()
+
+    open_engine()
     time.sleep(0.02)  # the clock of file systems has steps of some milliseconds
     with path.open("r+b") as file:
-        file.seek(-100, os.SEEK_END)
+        file.seek(-100, os.SEEK_END)  # the hash in its header stays the one that the node has verified
         file.write(bytes(100))
-    again = EngineProcess("track", str(path), node.sha256, trust=Trust(key, node.identity))
-    try:
-        again.start()
-        with pytest.raises(CoViewError, match="changed since it was signed"):
-            again.wait_ready()
-    finally:
-        again.close()
+    with pytest.raises(CoViewError, match="changed since it was signed"):
+        open_engine()

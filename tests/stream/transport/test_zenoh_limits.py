@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import pytest
 import zenoh
@@ -19,9 +20,10 @@ from coview_stream.stream.transport.zenoh_transport import open_transport
 
 def test_oversized_message_is_delivered_as_its_size():
     endpoint = free_endpoint()
-    node = open_transport(listen=[endpoint], max_payload=1000)
-    robot = open_transport(connect=[endpoint])
-    try:
+    with (
+        closing(open_transport(listen=[endpoint], max_payload=1000)) as node,
+        closing(open_transport(connect=[endpoint])) as robot,
+    ):
         got = []
         node.subscribe("r1/x", got.append, "all")
         publisher = robot.publisher("r1/x", "data")
@@ -38,9 +40,6 @@ def test_oversized_message_is_delivered_as_its_size():
             Sample("r1/x", b"", size=1001),
             Sample("r1/x", b"last", "", b"!"),
         ]
-    finally:
-        robot.close()
-        node.close()
 
 
 def test_oversized_message_is_not_copied():

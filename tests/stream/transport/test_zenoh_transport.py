@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,8 @@ ROOT = Path(__file__).parents[3]
 def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
     """Two transports that talk: a listening peer and its client."""
     endpoint = free_endpoint()
-    node = open_transport(listen=[endpoint])
-    robot = open_transport(connect=[endpoint])
-    yield node, robot
-    robot.close()
-    node.close()
+    with closing(open_transport(listen=[endpoint])) as node, closing(open_transport([endpoint])) as robot:
+        yield node, robot
 
 
 @pytest.mark.parametrize("selector", ["**", "coview/**", "coview/*/rpc/*", "coview/@node/**", "*/r1/rpc/reset"])
@@ -294,14 +292,11 @@ def test_missing_config_file_and_busy_port_are_named(tmp_path: Path) -> None:
     with pytest.raises(TransportError, match=r"gone\.json5: No such file"):
         open_transport(config=tmp_path / "gone.json5")
     endpoint = free_endpoint()
-    first = open_transport(listen=[endpoint])
-    try:
-        with pytest.raises(
-            TransportError, match=r"in use.*holds the port: --connect to it, or another --listen"
-        ) as caught:
-            open_transport(listen=[endpoint])
-    finally:
-        first.close()
+    with (
+        closing(open_transport(listen=[endpoint])),
+        pytest.raises(TransportError, match=r"in use.*holds the port: --connect to it, or another --listen") as caught,
+    ):
+        open_transport(listen=[endpoint])
     assert endpoint in str(caught.value)
 
 
