@@ -134,8 +134,7 @@ class Chain:
         return scored, [place for place in found if place is not None]
 
 
-METHODS = ("scan context", "co-view", "both", "global", "dense", "verified", "search")
-"""In the tables' order."""
+METHODS = ("scan context", "co-view", "both", "search")  # in the tables' order
 
 
 class Methods:
@@ -157,7 +156,7 @@ class Methods:
         query, truth = query_of(drive, self.config)
         truth = to_local(truth, self.base_map.origin)
         places = {name: _in_turn(hypotheses, query) for name, hypotheses in self._by_hand(query).items()}
-        metric = self._by_features(query, truth, places)
+        metric = self._by_features(query, truth)
         # the product's search by learned features: its most probable place, and the errors of a pose that it gives
         self._search.reset()
         result = self._search.update(query)
@@ -176,19 +175,13 @@ class Methods:
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in by_volume.items()}
 
-    def _by_features(self, query: SearchRequest, truth: Pose, places: dict[str, Floats]) -> dict[str, Any]:
-        """Add the places by learned features; return the error of the best one, and whether it would be believed."""
+    def _by_features(self, query: SearchRequest, truth: Pose) -> dict[str, Any]:
+        """Return the error of the best place by learned features, and whether it would be believed."""
         view = self._learned.encode(query.surroundings, on_ground(query.surroundings, query))
-        vote = self._learned.vote(view)
         consensus = Consensus(self.base_map.station_grid, replace(self.config.consensus, peaks=BEST))
-        consensus.vote(vote)
+        consensus.vote(self._learned.vote(view))
         voted = [replace(place, learned=True) for place in consensus.hypotheses()]
         scored, candidates = self._chain.register(voted, self._chain.scan(query))
-        features = self._learned.features
-        places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
-        stations, shifts = vote.candidates()
-        places["dense"] = distinct(self.base_map.stations[stations, :2], -vote.at(stations, shifts))
-        places["verified"] = _in_turn(candidates, query)
         after = errors(candidates[0].T_map_odom, truth, query) if candidates else None
         return {"after": after, "passes": bool(candidates) and scored.error < 0.5}
 
@@ -206,15 +199,12 @@ def _in_turn(hypotheses: list[Hypothesis], query: SearchRequest) -> Floats:
 
 
 FIRST_SEED = 20_000  # seeds from here on are neither for training nor for tuning
-RADIUS = 30.0
-"""Metres: virtual scans reach as far as the queries do, so that the descriptors compare like with like."""
-
+RADIUS = 30.0  # metres: virtual scans reach as far as the queries do
 _QUICK = 4  # queries of a world, and worlds
 
 Answer = dict[str, Any]
 RIGHT = 10.0  # metres from the truth within which a place is the right one
-NEAR, EXACT = (2.0, 5.0), (0.3, 1.0)
-"""Metres and degrees: a pose that is not within the first is false; within the second it is a success."""
+NEAR, EXACT = (2.0, 5.0), (0.3, 1.0)  # metres and degrees: a pose beyond the first is false, within the second exact
 
 _FOREST, _ON_DISK = "forest", ["on", "disk"]  # words of the kind of a place
 WORDS = ("sparse", "medium", "dense")
@@ -239,30 +229,24 @@ def _within(errors: Sequence[float] | None, metres: float, degrees: float) -> bo
     return errors is not None and errors[0] <= metres and errors[1] <= degrees
 
 
-def groups(answers: Sequence[Answer]) -> Iterator[tuple[str, list[Answer]]]:
+def groups(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
     """All answers, then those of forests, also by density, of built places, and of worlds on disk."""
-    kinds: dict[str, Callable[[list[str]], bool]] = {
-        "all": lambda words: True,
-        "forest": lambda words: _FOREST in words,
-    }
-    for word in WORDS:
-        kinds[f"forest, {word}"] = partial(lambda words, word: {_FOREST, word} <= set(words), word=word)
-    kinds["built"] = lambda words: _FOREST not in words and words != _ON_DISK
-    kinds["on disk"] = lambda words: words == _ON_DISK
-    for name, belongs in kinds.items():
-        if some := [answer for answer in answers if belongs(answer["kind"].split())]:
-            yield name, some
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f}"
+    out: dict[str, list[Answer]] = {}
+    for answer in answers:
+        words = answer["kind"].split()
+        forest = [_FOREST, *(f"forest, {word}" for word in WORDS if word in words)]
+        kinds = forest if _FOREST in words else ["on disk"] if words == _ON_DISK else ["built"]
+        for name in ("all", *kinds):
+            out.setdefault(name, []).append(answer)
+    order = ("all", _FOREST, *(f"forest, {word}" for word in WORDS), "built", "on disk")
+    return {name: out[name] for name in order if name in out}
 
 
 def recall_table(answers: Sequence[Answer]) -> str:
     """AR@1 / AR@5 in per cent, by method."""
     lines = []
-    for name, some in groups(answers):
-        pairs = [[_percent(recall(some, method, best)) for best in (1, 5)] for method in METHODS]
+    for name, some in groups(answers).items():
+        pairs = [[f"{100 * recall(some, method, best):.0f}" for best in (1, 5)] for method in METHODS]
         lines.append([name, str(len(some)), *map(" / ".join, pairs)])
     return table(("AR@1 / AR@5, %", "n", *METHODS), lines)
 
@@ -270,19 +254,17 @@ def recall_table(answers: Sequence[Answer]) -> str:
 def metric_table(answers: Sequence[Answer]) -> str:
     """Poses by learned features after registration, and those that the search gives by this one keyframe."""
     lines = []
-    for name, some in groups(answers):
+    for name, some in groups(answers).items():
         poses = [answer["after"] for answer in some if answer["after"] is not None]
         metres, degrees = np.median(poses, axis=0).tolist() if poses else (None, None)
         given = [answer["found"][0] for answer in some if answer["found"] is not None]
         lines.append([
             name, str(len(some)), number(metres, 3), number(degrees, 2),
-            *(_percent(success(some, *limits)) for limits in (EXACT, NEAR)), str(sum(map(false, some))),
+            *(f"{100 * success(some, *limits):.0f}" for limits in (EXACT, NEAR)), str(sum(map(false, some))),
             str(len(given)), str(sum(error > NEAR[0] for error in given)),
         ])  # fmt: skip
     near, exact = (f"{metres:g} m, {degrees:g} deg, %" for metres, degrees in (NEAR, EXACT))
-    return table(
-        ("", "n", "registered: m", "deg", exact, near, "passes, false", "search gives", "false"), lines,
-    )  # fmt: skip
+    return table(("", "n", "registered: m", "deg", exact, near, "passes, false", "search gives", "false"), lines)
 
 
 def options(parser: ArgumentParser) -> None:

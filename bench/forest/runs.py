@@ -56,7 +56,7 @@ class Through:
 
     @property
     def name(self) -> str:
-        """Directory of the world."""
+        """Name of the world's directory."""
         return f"{'stand' if self.drawn else 'track'}-{self.sensor}-{self.seed}"
 
 
@@ -69,7 +69,6 @@ RUNS = (
     Through("mid360", 21_103, 60.0, drawn=True),
     Through("vlp16-inclined", 21_104, 60.0, drawn=True),
 )
-"""The usual ones."""
 
 
 def world_of(run: Through) -> Path:
@@ -122,9 +121,7 @@ def _poses(path: Floats, step: float, ground: Any, rng: np.random.Generator) -> 
 
 def _map_of(world: Path) -> Path:
     """Return the map of a world with learned features, built now unless it is there, in the benchmark's folder."""
-    own = world.parent.resolve() == place().resolve()
-    name = world.name if own else f"{world.resolve().parent.name}-{world.name}"
-    out = place() / f"{name}.coview"
+    out = place() / f"{world.resolve().parent.name}-{world.name}.coview"
     spec = {"code": code(), "weights": weights(), **on_disk(world)}
     remembered(out.with_suffix(".built.json"), spec, lambda: BaseMap.build(base_of(world), learned=True).save(out))
     return out

@@ -1,8 +1,7 @@
-"""Other libraries on the same queries, on this machine.
+"""Other libraries on the same queries: a robot that was switched on eight metres ago.
 
-The queries are those of a robot that was switched on eight metres ago. A trial ends after ``--limit`` seconds, so a
-slow peer answers the first queries only, and the shares of both sides are of those. Extra ``peers``; a peer that is
-missing gets a line with the remedy.
+A trial ends after ``--limit`` seconds, so a slow peer answers the first queries only, and the shares of both sides are
+of those. Extra ``peers``; a peer that is missing gets a line with the remedy.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import pickle
+import signal
 import sys
 import tempfile
 import time
@@ -114,9 +114,8 @@ class Tracking:
 class KissMatcher:
     """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
 
-    Settings in its favour: of voxels of 0.7, 1, 1.5 and 2 m (at 0.5 m the whole map takes minutes), with its default
-    solver and with Quatro, made for level clouds, the pair that was right most often on six places of either world;
-    the rest by default. It vouches by its own example's rule: a valid solution with five final inliers or more.
+    Of voxels of 0.7 to 2 m, with its default solver and with Quatro, the pair that was right most often on six places
+    of either world; the rest by default. It vouches by its own example's rule: a valid solution with five inliers.
     """
 
     VOXEL, INLIERS = 1.0, 5
@@ -138,9 +137,9 @@ class KissMatcher:
 class MapClosures:
     """MapClosures 2.2 (MIT): ORB features of density images, a tree of binary words, 2D RANSAC.
 
-    The map is cut into local maps; the submap is the query that may close a loop with one. Settings in its favour:
-    local maps of 60 m, the submap's reach, every 15 m, much denser than its pipeline makes them; the best of all
-    closures counts; the rest by default. It vouches by its pipeline's rule: more than five inliers.
+    The submap is the query that may close a loop with one of the map's local maps. In its favour these are of 60 m,
+    the submap's reach, every 15 m, much denser than its pipeline makes them; the best of all closures counts. It
+    vouches by its pipeline's rule: more than five inliers.
     """
 
     SPACING, REACH, VOXEL = 15.0, 60.0, 0.5
@@ -189,10 +188,8 @@ class MapClosures:
 class Features:
     """Open3D (MIT): FPFH features, then RANSAC or fast global registration; the submap against the whole map.
 
-    Settings of its tutorial on global registration, with a voxel for outdoor clouds: 1 m, normals within 2 voxels,
-    features within 5, correspondences within 1.5 (RANSAC; 4 points, edge length 0.9, mutual filter off, 10^5 iterations
-    at confidence 0.999) or half a voxel (FGR). The map's features are made once. It has no rule of its own for when to
-    believe a result; the tutorial looks at the fitness (share of points with a partner), so it vouches from 0.5.
+    Settings of its tutorial on global registration, with a voxel of 1 m for outdoor clouds. The tutorial looks at the
+    fitness (share of points with a partner), so it vouches from 0.5.
     """
 
     VOXEL, FITNESS = 1.0, 0.5
@@ -265,11 +262,10 @@ class SmallGicp:
 
 
 class NearbyGicp(SmallGicp):
-    """small_gicp: the submap to the map, from a pose nearby.
+    """small_gicp: the submap to the map, from a pose nearby, on all cores.
 
-    Correspondences within 1 m, as documented; all cores. The map is prepared once, at 0.25 m. In its favour the submap
-    is cut to 50 m and thinned to 0.5 m, as in our registration: without that it is as exact and takes two to four times
-    as long (measured). Thinning and covariances of the submap are part of a query. It vouches when it has converged.
+    In its favour the submap is cut to 50 m and thinned to 0.5 m, as in our registration: without that it is as exact
+    and two to four times as slow. Preparing the submap is part of a query. It vouches when it has converged.
     """
 
     MAP, SUBMAP, REACH, NEAR = 0.25, 0.5, 50.0, 1.0
@@ -348,7 +344,7 @@ COLUMNS = (
 
 
 def milliseconds(trials: Sequence[Trial]) -> float:
-    """Return the median time of all queries; NaN without one."""
+    """Return the median time of all queries; NaN without any."""
     return 1e3 * float(np.median([a["seconds"] for t in trials for a in t.answers] or [math.nan]))
 
 
@@ -385,10 +381,10 @@ def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) ->
 
 
 def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: Path, limit_s: float) -> Trial:
-    """Let a peer answer, in a process of its own; what it did before a crash or the limit counts."""
-    trial = Trial(peer.name, scene, count)
+    """Let a peer answer, in a process of its own; its answers before a crash or the limit count."""
+    trial, limit = Trial(peer.name, scene, count), ["--limit", str(limit_s)]
     try:
-        for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file)], None, limit_s):
+        for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file), *limit], None):
             if row.holds is False:
                 trial.trouble = row.name.removeprefix("peers: ")
             else:
@@ -418,15 +414,10 @@ def contest(count: int, limit_s: float) -> Iterator[Trial]:
     with tempfile.TemporaryDirectory() as scratch:
         for scene, config in WORLDS.items():
             file = Path(scratch) / scene
-            isolated(_keep, scene, count, file)
+            file.write_bytes(pickle.dumps(isolated(places, scene, count)))
             for peer in PEERS:
                 print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
                 yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
-
-
-def _keep(scene: str, count: int, file: Path) -> None:
-    file.write_bytes(pickle.dumps(places(scene, count), protocol=pickle.HIGHEST_PROTOCOL))
-    coview_kernels.shutdown()
 
 
 def options(parser: ArgumentParser) -> None:
@@ -439,6 +430,7 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Compare ours with every peer: share of right poses, time of a query, false accepts."""
     if asked.trial:
+        signal.alarm(math.ceil(asked.limit))  # ends this process
         yield from _asked(*asked.trial)
         return
     trials = list(contest(4 if asked.quick else asked.places, asked.limit))

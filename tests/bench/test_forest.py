@@ -20,7 +20,7 @@ def answer(off, **more):
 
 def test_recall_counts_the_best_and_the_best_five():
     answers = [answer([3.0, 50.0]), answer([50.0, 9.9]), answer([10.0, 10.1, 80.0]), answer([])]
-    assert (recall(answers, "dense", 1), recall(answers, "dense", 5)) == (0.25, 0.5)
+    assert (recall(answers, "search", 1), recall(answers, "search", 5)) == (0.25, 0.5)
 
 
 def test_metric_success_needs_both_metres_and_degrees_and_a_wrong_pose_that_passes_is_false():
