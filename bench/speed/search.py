@@ -1,9 +1,8 @@
 """The whole search step on one core, in a town and on a campus.
 
 A robot without a place drives twelve keyframes from each of many starts along a simulated run. No place is ever
-accepted, so that most steps have the votes of ten keyframes. The same drives are then searched as usual, for the step
-that accepts a place. The map is built by the command, learned features included. A row's time is that of
-``GlobalSearch.update``, without the frames between keyframes.
+accepted: most steps have the votes of ten keyframes. The map is built by the command, learned features included. Times
+are those of ``GlobalSearch.update``, without the frames between keyframes.
 """
 
 from __future__ import annotations
@@ -38,9 +37,7 @@ WORLDS = {
 }
 """About 10,000 stations each; seeds that nothing was tuned on."""
 
-P50_MS, P95_MS, LEAST_RIVALS = 60.0, 100.0, 200
-"""The targets."""
-
+P50_MS, P95_MS, LEAST_RIVALS = 60.0, 100.0, 200  # the targets
 KEYFRAMES, DRIVES = 12, 9  # of a drive, where the consensus has a window of ten; of a world
 _CROPS = 24  # of the map, as the search engine has it
 _STARTS = 7  # a run's starts lie this share of it apart, then between those
@@ -71,33 +68,25 @@ def requests(run: Run, localizer: Localizer, number: int) -> Iterator[SearchRequ
 
 
 def searched(site: Path, run_folder: Path, drives: int) -> dict[str, Any]:
-    """Search along some drives: milliseconds of the steps and of those that accept, rivals, and memory."""
+    """Search along some drives: milliseconds and rivals of the steps, and memory."""
     bind_to_one_core()
     rule = AcceptanceConfig()
     object.__setattr__(rule, "risk", sys.float_info.min)  # no place meets it, and no user may ask for it
-    never, usual = LocalizerConfig(acceptance=rule), LocalizerConfig()
-    base_map, run = BaseMap.load(site), open_run(run_folder)
-    maps, index = LocalMaps(base_map, usual.registration.source_range, _CROPS), SearchIndex.of(base_map, usual)
+    config, base_map, run = LocalizerConfig(acceptance=rule), BaseMap.load(site), open_run(run_folder)
+    maps = LocalMaps(base_map, config.registration.source_range, _CROPS)
+    index = SearchIndex.of(base_map, config)
     coview_kernels.warm_up()
     index.prepare()
-    searches = [GlobalSearch(base_map, config, maps, index) for config in (never, usual)]
-    localizer = Localizer(base_map, never, maps, index)
-    times, rivals, fixes = list[float](), list[int](), list[float]()
+    search, localizer = GlobalSearch(base_map, config, maps, index), Localizer(base_map, config, maps, index)
+    times, rivals = list[float](), list[int]()
     for number in range(drives + 1):
-        for search in searches:
-            for request in requests(run, localizer, number):
-                begin = time.perf_counter()
-                result = search.update(request)
-                took = 1e3 * (time.perf_counter() - begin)
-                if not number:  # caches fill during the first drive
-                    continue
-                if search is searches[0]:
-                    times.append(took)
-                    rivals.append(len(result.rivals))
-                elif result.accepted is not None:
-                    fixes.append(took)
-                    break
-    return {"stations": len(base_map), "ms": times, "rivals": rivals, "fixes": fixes, "megabytes": peak_megabytes()}
+        for request in requests(run, localizer, number):
+            begin = time.perf_counter()
+            result = search.update(request)
+            if number:  # caches fill during the first drive
+                times.append(1e3 * (time.perf_counter() - begin))
+                rivals.append(len(result.rivals))
+    return {"stations": len(base_map), "ms": times, "rivals": rivals, "megabytes": peak_megabytes()}
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -110,7 +99,4 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for share, most in ((50, P50_MS), (95, P95_MS)):
             yield bounded(f"{name}: step p{share}", float(np.percentile(done["ms"], share)), "ms", most)
         yield reached(f"{name}: rivals scored per step, median", float(np.median(done["rivals"])), "", LEAST_RIVALS)
-        if done["fixes"]:
-            median = float(np.median(done["fixes"]))
-            yield informs(f"{name}: step that accepts a place, median of {len(done['fixes'])}", median, "ms")
         yield informs(f"{name}: memory of the searching process, peak", done["megabytes"], "MB", done)
