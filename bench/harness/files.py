@@ -28,11 +28,7 @@ ROOT = Path(__file__).parents[2]
 PYTHON = (sys.executable, "-P")
 """Begins a command: this interpreter, with no import root but those of :func:`environment`."""
 
-_ROOTS = {
-    "coview_stream": Path(coview_stream.__file__).parent,
-    "coview_kernels": Path(coview_kernels.__file__).parent,
-    "bench": ROOT / "bench",
-}
+_ROOTS = {path.name: path for path in (*map(Path, (*coview_stream.__path__, *coview_kernels.__path__)), ROOT / "bench")}
 
 Result = TypeVar("Result")
 
@@ -45,20 +41,16 @@ def folder() -> Path:
 def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dict[str, Any]:
     """Return the result in ``file`` if it was made for an equal ``spec``; else make it and store it there.
 
-    An interrupted benchmark resumes on results of the same code, because ``spec`` holds a :func:`fingerprint`. Only a
-    dictionary is stored; ``make`` may write files itself and return something else.
+    ``spec`` holds a :func:`fingerprint` of the code. Only a dictionary is stored; ``make`` may write files itself.
     """
     spec = json.loads(json.dumps(spec))
-    if file.is_file():
-        stored = json.loads(file.read_text())
-        if stored["spec"] == spec:
-            return dict(stored["result"])
-    made = make()
-    result = json.loads(json.dumps(made if isinstance(made, dict) else {}))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(file) as part:
-        part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
-    return dict(result)
+    if not file.is_file() or json.loads(file.read_text())["spec"] != spec:
+        made = make()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(file) as part:
+            result = made if isinstance(made, dict) else {}
+            part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
+    return dict(json.loads(file.read_text())["result"])
 
 
 def fingerprint(*parts: str) -> str:

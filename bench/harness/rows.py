@@ -71,10 +71,9 @@ def _plain(value: Any) -> Any:
 
 
 def medians(*sides: Callable[[], object], repeat: int = REPEAT, warm_up: int = 1) -> list[float]:
-    """Median milliseconds of each side, taken in turns after ``warm_up`` runs each.
+    """Median milliseconds of each side, taken in turns after ``warm_up`` runs each, without the garbage collector.
 
-    Every other round goes backwards, so both neighbours of a side get its hot or cold caches. The garbage collector is
-    off meanwhile.
+    Every other round goes backwards, so both neighbours of a side get its hot or cold caches.
     """
     if not sides or repeat < 1:
         raise ValueError(f"medians of {len(sides)} sides and {repeat} rounds: at least one of each is needed")

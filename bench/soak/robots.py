@@ -84,7 +84,6 @@ class Robot:
     poses: int = 0
     false: list[tuple[float, float, float]] = field(default_factory=list)  # moment, metres, degrees
     unreadable: int = 0
-    worst: tuple[float, float] = (0.0, 0.0)  # metres, degrees
     fed: float = -math.inf  # monotonic time at which its newest odometry reached the router
     corrected: float = -math.inf  # moment of the newest frame behind a pose
     latencies: list[float] = field(default_factory=list)  # seconds
@@ -121,7 +120,6 @@ class Robot:
         moment = (pose.stamp_ns - EPOCH_NS) / 1e9
         metres, degrees = (float(error[0]) for error in errors([pose], self.drive.truth))
         self.poses += 1
-        self.worst = max(self.worst[0], metres), max(self.worst[1], degrees)
         if self.elsewhere or not (metres <= FALSE_METRES and degrees <= FALSE_DEGREES):
             self.false.append((round(moment, 2), round(metres, 2), round(degrees, 2)))
         corrected = moment - pose.age

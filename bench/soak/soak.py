@@ -13,8 +13,9 @@ import sys
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from random import Random
+from typing import Any
 
 import numpy as np
 
@@ -32,19 +33,6 @@ WARM = 600.0  # seconds at a process's start that its slope leaves out
 FED = 2.0  # seconds without odometry at the router after which a robot counts as disconnected
 MIN_HOURS = 0.25  # a slope over less is no evidence
 LEAKS = (("megabytes", 1.0, "MB/h"), ("descriptors", 1.0, "per h"))  # figure, target per hour, unit
-
-
-@dataclass
-class Event:
-    """One fault and its outcome."""
-
-    fault: str
-    begin: float  # seconds since the first robot drove
-    recoveries: dict[str, float | None] = field(default_factory=dict)  # seconds of each robot; None: not within STUCK
-    stuck: list[str] = field(default_factory=list)  # robots that did not recover although frames arrived
-    unfed: list[str] = field(default_factory=list)  # robots whose frames did not reach the router
-    false: int = 0
-    crashes: int = 0
 
 
 def options(parser: ArgumentParser) -> None:
@@ -84,7 +72,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     robots = [Robot(f"r{k + 1}", towns[k % 2], elsewhere=k % 2 == 1) for k in range(asked.robots)]
     stage = Stage(map_of(folder(), home), robots, folder() / "soak.log", asked.seed)
     wanted = [robot for robot in robots if not robot.elsewhere]
-    begin, events = time.monotonic(), list[Event]()
+    begin, events = time.monotonic(), list[dict[str, Any]]()
     try:
         stage.wait(120.0, lambda: all(robot.state for robot in robots))
         stage.begin()
@@ -97,9 +85,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for name in itertools.chain([first], faults):
             event = play(stage, wanted, name, begin, asked.every)
             events.append(event)
-            times = (f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in event.recoveries.items())
-            text = "; ".join((*times, f"{event.false} false, {event.crashes} crashes"))
-            yield Row(f"soak/{len(events)}: {name}", text=text, details=asdict(event))
+            times = (f"{name} {'STUCK' if s is None else f'{s:.1f} s'}" for name, s in event["recoveries"].items())
+            text = "; ".join((*times, f"{event['false']} false, {event['crashes']} crashes"))
+            yield Row(f"soak/{len(events)}: {name}", text=text, details=event)
             if time.monotonic() > begin + 60 * asked.minutes:
                 break
     except KeyboardInterrupt:
@@ -109,10 +97,11 @@ def rows(asked: Namespace) -> Iterator[Row]:
     hours = (time.monotonic() - begin) / 3600
     for robot in robots:
         yield from figures(robot, hours)
-    stuck, unfed = ([name for event in events for name in getattr(event, kind)] for kind in ("stuck", "unfed"))
-    text = f"{len(stuck)} of {len(events) * len(wanted)}"
-    yield judged("soak/stuck for 60 s while frames came", text, "0", not stuck, len(stuck))
-    yield informs("soak/robots of the bench that did not reach the router again", len(unfed), "")
+    unfed = sum(len(event["unfed"]) for event in events)
+    stuck = sum(s is None for event in events for s in event["recoveries"].values()) - unfed
+    text = f"{stuck} of {len(events) * len(wanted)}"
+    yield judged("soak/stuck for 60 s while frames came", text, "0", stuck == 0, stuck)
+    yield informs("soak/robots of the bench that did not reach the router again", unfed, "")
     yield from processes(stage, hours)
     yield informs("soak/end after SIGTERM, worst", ended, "s")
 
@@ -124,23 +113,22 @@ def recovered(stage: Stage, robots: Sequence[Robot], since: float, seconds: floa
     stage.wait(seconds, lambda: all(robot.recovered for robot in robots))
 
 
-def play(stage: Stage, wanted: Sequence[Robot], name: str, start: float, every: float) -> Event:
-    """Make one fault; wait until all robots have recovered and the next fault is due."""
-    begin, event = time.monotonic(), Event(name, time.monotonic() - start)
+def play(stage: Stage, wanted: Sequence[Robot], name: str, start: float, every: float) -> dict[str, Any]:
+    """Make one fault; wait until all robots have recovered and the next fault is due; return the outcome."""
+    begin = time.monotonic()
     false, crashes = count(stage)
     whole = FAULTS[name](stage)
     recovered(stage, wanted, whole, STUCK)
-    for robot in wanted:
-        event.recoveries[robot.name] = None if robot.recovered is None else robot.recovered - whole
-        if robot.recovered is None:
-            (event.stuck if time.monotonic() < robot.fed + FED else event.unfed).append(robot.name)
+    seconds = {robot.name: robot.recovered and robot.recovered - whole for robot in wanted}
+    unfed = [robot.name for robot in wanted if not robot.recovered and time.monotonic() > robot.fed + FED]
     stage.revive()
-    if event.stuck or event.unfed:  # counted; the next fault needs working robots
+    if None in seconds.values():  # counted; the next fault needs working robots
         stage.rescue()
         recovered(stage, wanted, time.monotonic(), STUCK)
     stage.wait(max(5.0 if every >= 30 else 1.0, begin + every - time.monotonic()))
-    event.false, event.crashes = (now - before for now, before in zip(count(stage), (false, crashes), strict=True))
-    return event
+    now = count(stage)
+    outcome = {"recoveries": seconds, "unfed": unfed, "false": now[0] - false, "crashes": now[1] - crashes}
+    return {"fault": name, "begin": begin - start, **outcome}
 
 
 def count(stage: Stage) -> tuple[int, int]:
@@ -151,7 +139,7 @@ def count(stage: Stage) -> tuple[int, int]:
 def figures(robot: Robot, hours: float) -> Iterator[Row]:
     """Yield false poses and latency of a robot."""
     name, wrong = f"soak/{robot.name}{', elsewhere' * robot.elsewhere}", len(robot.false) + robot.unreadable
-    figures = {"states": dict(robot.states), "false": robot.false[:100], "worst": robot.worst, "hours": hours}
+    figures = {"states": dict(robot.states), "false": robot.false[:100], "hours": hours}
     row = judged(f"{name}: false or unreadable poses", f"{wrong} of {robot.poses}", "0", wrong == 0, wrong)
     yield replace(row, details=figures)
     if robot.latencies:
@@ -184,7 +172,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     for name in sorted({event["fault"] for event in events}):
         played = [event for event in events if event["fault"] == name]
         times = [s for event in played for s in event["recoveries"].values() if s is not None]
-        lost = sum(len(event["stuck"]) + len(event["unfed"]) + event["crashes"] > 0 for event in played)
+        lost = sum(None in event["recoveries"].values() or event["crashes"] > 0 for event in played)
         spent = [f"{np.median(times):.1f}", f"{max(times):.1f}"] if times else ["-", "-"]
         false = str(sum(event["false"] for event in played))
         body.append([name, str(len(played)), str(len(played) - lost), *spent, false])

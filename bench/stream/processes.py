@@ -1,7 +1,7 @@
 """The processes around the node: a router with a metronome, senders, a rogue; and the recorder, in this process.
 
 They use raw zenoh and the documented keys. The metronome ticks at 10 Hz through the same router; its jitter at the
-recorder is the machine's own, to be compared with the poses'.
+recorder is the machine's own.
 """
 
 from __future__ import annotations
@@ -55,9 +55,8 @@ class RobotPlan:
 
     def schedule(self) -> list[tuple[float, Kind]]:
         """Return the times of all messages with their kinds, in order; at equal times odometry first."""
-        periods: dict[Kind, float] = {"odom": self.odometry_period, "cloud": self.cloud_period}
-        counts = {kind: round(self.seconds / period) if period else 0 for kind, period in periods.items()}
-        times = [(round(k * periods[kind], 6), kind) for kind, count in counts.items() for k in range(count)]
+        periods: tuple[tuple[Kind, float], ...] = (("odom", self.odometry_period), ("cloud", self.cloud_period))
+        times = [(round(k * p, 6), kind) for kind, p in periods if p for k in range(round(self.seconds / p))]
         return sorted(times, key=lambda item: item[0])
 
 
@@ -81,7 +80,7 @@ class Drive:
         return min(along, 2 * last - along)
 
     def cloud(self, content: float) -> Points:
-        """(N, 3) frame nearest to that moment, body frame, metres."""
+        """Return the frame nearest to that moment, (N, 3), body frame, metres."""
         return _cloud(self._world, round(self._at(content)), self._plan.points)
 
     def T_odom_body(self, content: float) -> Pose:
@@ -110,13 +109,13 @@ def _run(world: Path) -> Run:
 
 
 @functools.cache  # shared by the robots of a process
-def _cloud(world: Path, index: int, points: int | None) -> Points:
-    cloud = _run(world).read(index).points
-    if points is None:
-        return cloud
+def _cloud(world: Path, index: int, count: int | None) -> Points:
+    points = _run(world).read(index).points
+    if count is None:
+        return points
     rng = np.random.default_rng(index)
-    cloud = cloud[rng.choice(len(cloud), points, replace=points > len(cloud))]
-    return (cloud + rng.normal(0, 0.01, cloud.shape)).astype(np.float32)
+    points = points[rng.choice(len(points), count, replace=count > len(points))]
+    return (points + rng.normal(0, 0.01, points.shape)).astype(np.float32)
 
 
 METRONOME = "bench/metronome"
@@ -213,8 +212,8 @@ class Sent(NamedTuple):
 def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan]) -> None:
     """Stream the plans' robots through one session, on time; every cloud is loaded before."""
     drives = {plan.robot: Drive(world, plan) for plan in plans}
-    todo = sorted(((due, plan) for plan in plans for due in plan.schedule()), key=lambda item: item[0][0])
-    for (content, kind), plan in todo:
+    todo = sorted(((*due, plan) for plan in plans for due in plan.schedule()), key=lambda item: item[0])
+    for content, kind, plan in todo:
         if kind == "cloud":
             drives[plan.robot].cloud(content)
     puts: dict[str, list[tuple[int, float]]] = {plan.robot: [] for plan in plans}
@@ -222,7 +221,7 @@ def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan
     with open_session("client", connect=[endpoint]) as session:
         conn.send("ready")
         start = float(conn.recv())
-        for (content, kind), plan in todo:
+        for content, kind, plan in todo:
             while (wait := start + content - time.monotonic()) > 0:
                 time.sleep(wait)
             if conn.poll():

@@ -9,9 +9,8 @@ import pytest
 from bench import __main__ as bench
 from bench import results
 from bench.__main__ import BENCHMARKS, Benchmark, run
-from bench.harness import rows
 from bench.harness.files import fingerprint, remembered
-from bench.harness.rows import Row, against, bounded, failed, informs, judged, medians, reached
+from bench.harness.rows import Row, against, bounded, failed, informs, judged, reached
 from coview_stream.errors import InputError
 
 
@@ -26,16 +25,6 @@ def test_rows_judge_what_they_compare():
     assert reached("r", math.nan, "%", 95.0).holds is False
     assert judged("j", "3 of 4", "all", False, 3).text == "3 of 4"
     assert (informs("c", 1.0, "MB").holds, failed("d", "gone").holds) == (None, False)
-
-
-def test_medians_take_turns_and_warm_up_first(monkeypatch):
-    calls, clock = [], iter(range(10_000))
-    monkeypatch.setattr(rows.time, "perf_counter", lambda: float(next(clock)))
-    sides = [lambda k=k: calls.append(k) for k in range(3)]
-    assert medians(*sides, repeat=4) == [1e3, 1e3, 1e3]
-    assert calls == [0, 1, 2, 0, 1, 2, 2, 1, 0, 0, 1, 2, 2, 1, 0]
-    with pytest.raises(ValueError, match="at least one"):
-        medians(*sides, repeat=0)
 
 
 def test_a_row_survives_json():

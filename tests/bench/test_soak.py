@@ -1,20 +1,14 @@
-"""Scores of the soak: false poses, recoveries, slopes of memory; and a short one."""
+"""Scores of the soak: false poses, recoveries, slopes of memory, order of faults."""
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
-from nightly import nightly
 
-from bench.harness.files import ROOT, environment
-from bench.harness.rows import Row
 from bench.soak.robots import Robot
 from bench.soak.soak import chosen
 from bench.soak.stage import ENDS_PROCESSES, FAULTS, Sampled, slope
@@ -92,21 +86,3 @@ def test_a_leak_shows_across_restarts_and_warming_up_is_none() -> None:
     rows = [samples(900.0 * k, 800.0, 100.0 + k, 0.0, warm_up=40.0) for k in range(4)]
     assert abs(slope(rows, "megabytes", warm=240.0) or 0.0) < 0.7
     assert slope([samples(0.0, 60.0, 1.0, 0.0)], "megabytes", warm=0.0) is None
-
-
-@pytest.mark.slow
-@nightly
-def test_a_short_soak_survives_two_faults(tmp_path: Path) -> None:
-    pytest.importorskip("psutil")
-    out = tmp_path / "rows.json"
-    words = ["--quick", "--minutes", "0.3", "--every", "8", "--robots", "1", "--faults", "router", "no odometry"]
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "bench", "soak", *words, "--work", str(tmp_path), "--json", str(out)],
-        cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=400, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    rows = [Row.from_dict(values) for values in json.loads(out.read_text())]
-    events = [row.details for row in rows if "recoveries" in row.details]
-    assert {event["fault"] for event in events} == {"router killed, back after 3 s", "no odometry for 5 s"}
-    assert all(event["recoveries"]["r1"] < 60 for event in events)
-    assert all(row.holds for row in rows if row.holds is not None)
