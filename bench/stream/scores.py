@@ -21,7 +21,7 @@ MAX_MISMATCH_NS = 2_000_000
 
 
 class Posed(NamedTuple):
-    """One pose as it arrived: (4, 4) map <- body, and the seconds since the frame that corrected it, NaN if untold."""
+    """A pose on arrival: (4, 4) map <- body, and the seconds since the frame that corrected it, NaN if unknown."""
 
     arrival: float
     stamp_ns: int
@@ -30,7 +30,7 @@ class Posed(NamedTuple):
 
 
 class Told(NamedTuple):
-    """One status as it arrived."""
+    """A status on arrival."""
 
     arrival: float
     fields: dict[str, Any]
@@ -68,9 +68,9 @@ def rate_hz(intervals: Floats) -> float:
     return float(len(intervals) / intervals.sum()) if len(intervals) else math.nan
 
 
-def jitter_ms(intervals: Floats, period: float = 0.1) -> float:
-    """p99 of the distance of the intervals from ``period`` seconds, in milliseconds; NaN without any."""
-    return percentile_ms(np.abs(intervals - period), 99)
+def jitter_ms(intervals: Floats) -> float:
+    """p99 of the distance of the intervals from 0.1 s, in milliseconds; NaN without any."""
+    return percentile_ms(np.abs(intervals - 0.1), 99)
 
 
 def percentile_ms(seconds: Floats, percent: float) -> float:
