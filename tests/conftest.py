@@ -122,7 +122,7 @@ def elsewhere():
 
 @pytest.fixture(scope="session")
 def world_fixes(world_map, world_drive):
-    """What a localizer says of the drive, frame by frame."""
+    """Fixes of the drive, frame by frame."""
     return follow(Localizer(world_map), world_drive)
 
 

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 
 import light_installation
 import pytest
 
+from tests.test_public_names import run_python
+
 
 @pytest.mark.slow
 def test_client_needs_no_extra():
-    script = f"BLOCKED = {set(light_installation.EXTRA_OF)!r}{light_installation.BLOCK}\n"
-    script += "import light_installation\nlight_installation.check_client()"
-    paths = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}
-    )
-    assert done.returncode == 0, done.stderr
+    block = f"BLOCKED = {set(light_installation.EXTRA_OF)!r}{light_installation.BLOCK}"
+    run_python(f"{block}\nimport light_installation\nlight_installation.check_client()")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.file_format import check_arrays
-from coview_stream.basemap.joined import join_maps, joined_file, load_map, read_names, write_names
+from coview_stream.basemap.joined import join_maps, load_map, read_names, write_names
 from coview_stream.basemap.map_parts import MapPart, MapParts
 from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
 from coview_stream.basemap.summary import MapView
@@ -96,13 +96,6 @@ def test_maps_that_do_not_go_together_are_named(world_map):
         join_maps({})
 
 
-def test_file_of_joined_maps_is_made_once(world_file):
-    path = joined_file([("a", world_file), ("b", world_file)])
-    made = path.stat()
-    assert joined_file([("a", world_file), ("b", world_file)]) == path
-    assert path.stat().st_ino == made.st_ino
-
-
 def test_parts_are_read_strictly():
     part = MapPart("a", "0" * 64, None, (1.0, 2.0, 3.0), -5.0, 5.0)
     rows = MapParts([part]).to_json()
@@ -127,7 +120,9 @@ def test_names_are_loaded_as_one_map(world_file):
     parts = MapParts.of(base_map.parameters)
     assert [part.name for part in parts] == ["ground", "upper"]
     assert BaseMap.load(base_map.path, check=False).sha256 == base_map.sha256
+    made = base_map.path.stat().st_ino
     assert load_map(names).path == base_map.path
+    assert base_map.path.stat().st_ino == made  # the joined file is made once
 
 
 def test_with_a_key_all_maps_must_be_signed(world_file, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +48,7 @@ def test_file_with_only_nan_points_is_refused(tmp_path: Path, suffix: str) -> No
 @pytest.mark.parametrize(("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")])
 def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: str) -> None:
     write_cloud(tmp_path / f"a{real}", POINTS[:52])
-    os.rename(tmp_path / f"a{real}", tmp_path / f"a{named}")  # noqa: PTH104 - Path.rename reads worse here
+    (tmp_path / f"a{real}").rename(tmp_path / f"a{named}")
     content = "LAS" if real == ".laz" else real[1:].upper()
     with pytest.raises(CloudError, match=f"content is {content}"):
         read_cloud(tmp_path / f"a{named}")

@@ -32,7 +32,7 @@ def odometry(seconds, T=None, codec="json"):
 
 
 def capture(clouds=(), odometry=(), seconds=3.0, **more):
-    """What came at the given local times: pairs (time, sample)."""
+    """A capture of messages that came at local times: pairs (time, sample)."""
     return RobotCapture(
         KEYS,
         [capture_cloud(sample, at) for at, sample in clouds],

@@ -41,7 +41,7 @@ def street(rng: np.random.Generator) -> tuple[FieldMap, np.ndarray]:
 
 
 def scan_at(points: np.ndarray, pose: np.ndarray, rng: np.random.Generator) -> FieldScan:
-    """What a robot at ``pose`` (x, y, z, yaw) sees of the walls and the ground; its pivot is 1.5 m above the ground."""
+    """Scan of the walls and the ground from ``pose`` (x, y, z, yaw); the robot's pivot is 1.5 m above the ground."""
     c, s = np.cos(pose[3]), np.sin(pose[3])
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     high = points[points[:, 2] > 1.0][::3]

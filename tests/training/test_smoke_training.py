@@ -43,19 +43,16 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
         train_session(tmp_path, short)
 
 
-@pytest.mark.parametrize("options", [["--first-world", "18999"], ["--first-world", "20000"], ["--first-world", "-5"]])
-def test_held_out_worlds_are_refused_for_training(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+@pytest.mark.parametrize(
+    ("option", "number", "says"),
+    [
+        *(("--first-world", number, "held out") for number in (18_999, 20_000, -5)),
+        *((option, number, option.strip("-")) for option, number in (("--worlds", 0), ("--steps", 0), ("--seed", -1))),
+    ],
+)
+def test_held_out_worlds_and_invalid_settings_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, number: int, says: str
 ) -> None:
-    assert main(["train", str(tmp_path), "--smoke", *options]) == 2
-    assert "held out" in capsys.readouterr().err
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("options", [["--worlds", "0"], ["--steps", "0"], ["--seed", "-1"]])
-def test_invalid_training_settings_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
-) -> None:
-    assert main(["train", str(tmp_path), "--smoke", *options]) == 2
-    assert options[0].strip("-") in capsys.readouterr().err
+    assert main(["train", str(tmp_path), "--smoke", option, str(number)]) == 2
+    assert says in capsys.readouterr().err
     assert not any(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""What the web page is told: poses, statuses from anyone, scans in the map frame, the map."""
+"""Events of the web page: poses, statuses from anyone, scans in the map frame, the map."""
 
 from __future__ import annotations
 

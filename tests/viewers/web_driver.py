@@ -50,7 +50,7 @@ class Browser:
         return self._call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
 
     def complaints(self):
-        """What the console says, of which a refused resource or a script's error is one."""
+        """Messages of the console, such as refused resources and errors of scripts."""
         return [entry["message"] for entry in self._call("POST", f"{self.session}/se/log", {"type": "browser"})]
 
     def close(self):

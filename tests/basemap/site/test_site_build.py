@@ -136,6 +136,8 @@ def test_directories_and_sources_that_no_site_can_be_built_of(halves, tmp_path):
     (tmp_path / "full" / "mine.txt").write_text("x")
     with pytest.raises(MapError, match=r"full: is no site, and not empty"):
         build_site(halves, tmp_path / "full", CONFIG)
+    with pytest.raises(MapError, match="is no site"):
+        BaseMap.load(tmp_path / "full")
     with pytest.raises(MapError, match="is a file"):
         build_site(halves, halves / "a.las", CONFIG)
     with pytest.raises(InputError, match="built of files"):
@@ -231,11 +233,6 @@ def test_damaged_and_swapped_layers_are_named(site, cache, tmp_path):
         BaseMap.load(tmp_path)
     one.write_bytes(kept)
     assert len(BaseMap.load(tmp_path))
-
-
-def test_directory_that_is_no_site_is_refused(tmp_path, cache):
-    with pytest.raises(MapError, match="is no site"):
-        BaseMap.load(tmp_path)
 
 
 def test_map_in_one_file_becomes_a_site_and_one_file_again(world_map, learned_map, tmp_path, cache):

@@ -1,4 +1,4 @@
-"""What happens to the light: wide beams, rain, dust, blooming signs, windows."""
+"""Faults of the light: wide beams, rain, dust, blooming signs, windows."""
 
 from __future__ import annotations
 

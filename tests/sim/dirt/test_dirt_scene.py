@@ -1,4 +1,4 @@
-"""What moves, what changed since the survey, and faults of the survey."""
+"""Traffic, changes since the survey, snow and grass, and faults of the survey."""
 
 from __future__ import annotations
 
