@@ -100,7 +100,7 @@ def unknown(job, state=State.SEARCHING, reason="no place fits", ask=None):
 
 
 def doubted(job, cause=RejectionReason.BLIND, reason="only 0 points to register"):
-    """The engine's answer: here you were, but what is seen now does not show it."""
+    """The engine's answer: here you were, but this frame does not show it."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.DOUBTED, reason, cause=cause)
     fix = Fix(job.stamp_ns * 1e-9, State.DOUBTED, evidence=evidence)
     return FrameResult(fix, None, 0.01, EVENTS[State.DOUBTED])

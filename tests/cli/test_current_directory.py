@@ -1,4 +1,4 @@
-"""What lies in the current directory is not run: neither by the commands nor by the processes that they start."""
+"""Neither the commands nor the processes that they start import from the current directory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``coview-stream info``: what is inside, or one line."""
+"""``coview-stream info``: the contents of a map, or one line."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class Screen(io.StringIO):
 
 
 def watch(endpoint, *options, out=None, err=None):
-    """Run the command until one of the screens has enough, 20 s at most; return what they show."""
+    """Run the command until one of the screens has enough, 20 s at most; return their texts."""
     out, err = out or Screen(), err or Screen()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         assert main(["watch", "--connect", endpoint, "--seconds", "20", *options]) == 0

@@ -1,4 +1,4 @@
-"""The table of robots: what it shows, and what it no longer shows. Time is handed in."""
+"""The table of robots: its cells, and when they become empty. The tests set the time."""
 
 from __future__ import annotations
 

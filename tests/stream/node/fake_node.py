@@ -90,7 +90,7 @@ class Site:
         self.net.publish(cloud(seconds, keys=self.keys[name], **fields))
 
     def work(self, name):
-        """Let the engines do what there is to do for a robot."""
+        """Let the engines do the work that waits for a robot."""
         session = self.sessions[name]
         for engine in ("track", "search"):
             if (job := session.take_job(engine)) is not None:

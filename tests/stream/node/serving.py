@@ -121,7 +121,7 @@ class Service(Driver):
             self._log.append(line)
 
     def robot(self):
-        """What the node says of the robot; None where another one of its fleet has it."""
+        """The robot in the health of the node; None if another node of its fleet has it."""
         return self.health()["robots"].get("r1")
 
     def health(self):

@@ -36,7 +36,7 @@ def job(points=None, robot="r1", stamp_ns=1_000_000_000):
 
 
 class Engine:
-    """Does what it is told."""
+    """Answers each job with a place, or fails with an error."""
 
     def __init__(self, error=None):
         self.error = error

@@ -112,7 +112,7 @@ def test_searches_are_counted_from_the_loss(queue):
         assert queue.search_demand.searches == searches
     old = queue.take_search_request()
     queue.ask(restart=3)
-    queue.search_done(old, search_result(), NOW)  # says nothing of what is searched for now
+    queue.search_done(old, search_result(), NOW)  # says nothing about the search of now
     assert queue.search_demand == SearchDemand(NOW, 0, 0)
 
 

@@ -1,4 +1,4 @@
-"""The engine's two halves on the small world: together what a localizer is, and one robot is nothing to another."""
+"""The track and the search engine on the small world: together they are a localizer; robots do not mix."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OTHER_ODOMETRY = pose_from(rot_z(-1.2), [-300.0, 40.0, 7.0])
 
 
 class Follower:
-    """Feeds a robot's frames to two engines in turn: what a frame asks is searched before the next one."""
+    """Feeds the frames of a robot to both engines: the search that a frame asks for ends before the next frame."""
 
     def __init__(self, track, search, robot="r1", epoch=1):
         self.track, self.search, self.robot, self.epoch = track, search, robot, epoch
@@ -78,7 +78,7 @@ def launched(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
 def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_drive, launched):
-    """What is not named is compiled when the first job needs it, which takes a second."""
+    """A kernel without a name is compiled when the first job needs it, which takes a second."""
     track, search = TrackEngine(world_map), SearchEngine(world_map)
     asked = {}
 

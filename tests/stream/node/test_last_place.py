@@ -68,18 +68,15 @@ def test_calibration_with_fields_of_another_release_is_read(tmp_path):
     assert load(tmp_path, "r1", SHA).calibration == Calibration(pitch=0.05)
 
 
-def test_missing_file_gives_none_without_warning(tmp_path, caplog):
-    assert load(tmp_path / "not there", "r1", SHA) is None
-    assert not caplog.records
-
-
-def test_each_robot_and_map_has_its_own_file(tmp_path):
+def test_each_robot_and_map_has_its_own_file(tmp_path, caplog):
     save(tmp_path, "r1", LAST)
     save(tmp_path, "r2", LAST)
     save(tmp_path, "r1", replace(LAST, map_sha256="f" * 64))
     assert len(list(tmp_path.iterdir())) == 3
     assert load(tmp_path, "r3", SHA) is None
     assert load(tmp_path, "r1", "e" * 64) is None
+    assert load(tmp_path / "not there", "r1", SHA) is None
+    assert not caplog.records
 
 
 NAMES = ("site/hall 3/r1", "..", "a\\b", "C:r1", "Roboter Ä", "R1", "rué" * 90, "con", "a%2Fb", "r1.json", "-")
@@ -133,9 +130,9 @@ USELESS = {
 }
 
 
-@pytest.mark.parametrize("what", USELESS)
-def test_unusable_content_is_a_warning_naming_the_file(tmp_path, caplog, what):
-    content = USELESS[what]
+@pytest.mark.parametrize("kind", USELESS)
+def test_unusable_content_is_a_warning_naming_the_file(tmp_path, caplog, kind):
+    content = USELESS[kind]
     path = file_of(tmp_path, "r1", SHA)
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     assert load(tmp_path, "r1", SHA) is None
@@ -185,7 +182,7 @@ def test_anything_but_a_file_is_a_warning(tmp_path, caplog, kind):
     assert f"{path}: the last pose cannot be read" in caplog.text
 
 
-def test_what_a_power_cut_left_behind_is_removed(tmp_path):
+def test_parts_that_a_power_cut_left_are_removed(tmp_path):
     path = save(tmp_path, "r1", LAST)
     path.with_suffix(".part").write_text("of an earlier release")
     (tmp_path / f"{path.stem}.k2j3h4.part").write_text("half")

@@ -1,4 +1,4 @@
-"""What a node knows from one start to the next: saved, handed over, forgotten, and no trouble if the disk is."""
+"""Places that a node keeps between two starts: saved, handed over, forgotten; a bad disk is only a warning."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def robot():
 
 
 def jobs_of(robot, count=3, answer=unknown, begin=0.1):
-    """What the next frames take to the engine as a hint."""
+    """Hints that the next frames take to the engine."""
     return [robot.frame(begin + 0.1 * k, answer).hint for k in range(count)]
 
 
@@ -135,7 +135,7 @@ def test_reset_or_relocalize_drops_pose_hints(robot, ask):
     robot.session.offer(LastPlace(SHA, 5, BEFORE))  # by a disk that has been slow
     robot.moved(0.25)
     assert jobs_of(robot, 3, begin=0.3) == [None] * 3
-    # but what has been found since then is known
+    # but a place that was found since then is known
     robot.frame(0.8)
     assert robot.session.last_place().stamp_ns == ns(0.81)
     robot.session.engine_restarted()

@@ -1,4 +1,4 @@
-"""A robot that sends clouds only: what its session makes of them, with an odometry engine that the test plays."""
+"""The session of a robot that sends clouds only; the test plays the odometry engine."""
 
 from __future__ import annotations
 

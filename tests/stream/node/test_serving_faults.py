@@ -13,7 +13,7 @@ from sockets import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
 
-# what a host's clock does: another day at every look, forwards and backwards
+# the host's clock shows another day at every look, before or after
 JUMPING_CLOCK = """
 import random, time
 _now, _ns, _rng = time.time, time.time_ns, random.Random(7)
@@ -81,7 +81,7 @@ def test_frozen_stamps_give_no_pose(serve):
     assert service.robot()["counters"]["duplicate"] > 5
     service.stamp_of = running
     service.tracks(60.0)
-    # while it stood still, one stamp was of many places: what counts are the others
+    # while it stood still, one stamp was of many places: only the others count
     off = {pose.stamp_ns: error for (_, pose), error in zip(list(service.poses), service.errors(), strict=False)}
     off.pop(round(running(frozen[0]) * 1e9), None)
     assert max(off.values()) < FALSE

@@ -32,7 +32,7 @@ def test_links_that_go_bad_cost_no_more_than_the_time_that_they_are_bad(world_fi
                 link.mode(mode)
                 time.sleep(SECONDS[mode])
                 link.mode("open")
-                if mode == "corrupt":  # what is on its way may still be spoilt
+                if mode == "corrupt":  # messages on their way may still be spoilt
                     garbled.append((begin, time.monotonic() + 1.0))
                     time.sleep(1.0)
                 service.tracks(60.0)

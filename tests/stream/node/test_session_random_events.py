@@ -46,12 +46,12 @@ class Chaos:
         self.published = None  # clock restarts, stamp
         self.engine = None, State.SEARCHING  # its epoch and state
 
-    def stamp(self, what):
-        if what == "next":
+    def stamp(self, kind):
+        if kind == "next":
             self.clock += 0.05
             self.last = self.clock
-        elif what != "same":
-            self.last = self.clock + what
+        elif kind != "same":
+            self.last = self.clock + kind
         return self.last
 
     def happen(self, event, value):

@@ -112,7 +112,7 @@ def test_access_control_example_limits_robots_to_their_keys(
         for key in ("coview/r2/in/odom", "coview/r2/out/pose", "coview/r1/out/pose", "coview/r1/alive"):
             put(first, key, b"forged")
         until(lambda: put(first, "coview/r1/in/odom", b"after") or heard[-1].payload == b"after")
-        ours = (b"before", b"after", b"forged")  # what the round trips sent may still arrive
+        ours = (b"before", b"after", b"forged")  # messages of the round trips may still arrive
         assert {(sample.key, sample.payload) for sample in heard if sample.payload in ours} == {
             ("coview/r1/in/odom", b"before"),
             ("coview/r1/in/odom", b"after"),

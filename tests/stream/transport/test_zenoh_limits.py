@@ -1,4 +1,4 @@
-"""Over real sockets: what is too large is not copied, and reports never wait."""
+"""Over real sockets: a message that is too large is not copied, and reports never wait."""
 
 from __future__ import annotations
 
