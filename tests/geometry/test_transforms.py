@@ -94,10 +94,10 @@ def test_is_pose_accepts_only_rigid_transforms():
 def test_norms_equal_numpy_and_keep_the_input(dtype):
     points = np.random.default_rng(1).normal(0, 30, (500, 3)).astype(dtype)
     before, origin = points.copy(), np.array([3.0, -2.0, 1.0], dtype)
-    found = g.norms(points), g.norms(points, origin)
-    assert found[0].dtype == found[1].dtype == dtype
-    np.testing.assert_allclose(found[0], np.linalg.norm(points, axis=1), rtol=1e-6)
-    np.testing.assert_allclose(found[1], np.linalg.norm(points - origin, axis=1), rtol=1e-6)
+    result = g.norms(points), g.norms(points, origin)
+    assert result[0].dtype == result[1].dtype == dtype
+    np.testing.assert_allclose(result[0], np.linalg.norm(points, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(result[1], np.linalg.norm(points - origin, axis=1), rtol=1e-6)
     np.testing.assert_array_equal(points, before)
     assert g.norms(points[:0]).shape == (0,)
 
@@ -155,10 +155,10 @@ def test_log_so3_matches_scipy():
 def test_slerp_matches_scipy():
     R = Rotation.from_rotvec(VECTORS[:270]).as_matrix()
     start, end, share = R[:-1], R[1:], RNG.random(len(R) - 1)
-    found = slerp(start, end, share)
+    result = slerp(start, end, share)
     for k in range(len(start)):
         path = Slerp([0.0, 1.0], Rotation.from_matrix(R[k : k + 2]))
-        np.testing.assert_allclose(found[k], path(share[k]).as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(result[k], path(share[k]).as_matrix(), atol=1e-9)
     np.testing.assert_allclose(slerp(start, end, np.zeros(len(start))), start, atol=1e-15)
     np.testing.assert_allclose(slerp(start, end, np.ones(len(start))), end, atol=1e-13)
     np.testing.assert_allclose(slerp(start[3], end[3], 0.25), slerp(start[3:4], end[3:4], [0.25])[0])
@@ -167,10 +167,10 @@ def test_slerp_matches_scipy():
 @pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3])
 def test_nearest_rotation_is_a_rotation(noise):
     R = Rotation.from_rotvec(VECTORS).as_matrix()
-    found = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
-    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
-    np.testing.assert_allclose(found, R, atol=10 * noise + 1e-14)
-    assert (np.linalg.det(found) > 0).all()
+    result = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
+    np.testing.assert_allclose(result @ np.swapaxes(result, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
+    np.testing.assert_allclose(result, R, atol=10 * noise + 1e-14)
+    assert (np.linalg.det(result) > 0).all()
 
 
 T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])

@@ -120,7 +120,7 @@ RULE = AcceptanceConfig()
 
 
 @pytest.fixture
-def found(world_map, world_drive):
+def tracking(world_map, world_drive):
     """A localizer that tracks, after the drive's first five frames."""
     localizer = Localizer(world_map)
     assert follow(localizer, world_drive, range(5))[-1].state is State.TRACKING
@@ -150,36 +150,36 @@ def covered(seed):
     return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
 
 
-def test_rejected_registration_gives_doubted_state_without_pose(found, world_fixes, world_drive):
+def test_rejected_registration_gives_doubted_state_without_pose(tracking, world_fixes, world_drive):
     assert world_fixes[0].evidence.cause is world_fixes[0].evidence.innovation is None  # as the search's
-    (usual,) = follow(found, world_drive, [5])
+    (usual,) = follow(tracking, world_drive, [5])
     assert (usual.evidence.cause, usual.evidence.reason) == (RejectionReason.VERIFIED, "verified")
     assert 0.0 < usual.evidence.innovation < RULE.max_innovation
     assert usual.evidence.stamp == 2.5
     assert usual.drift is not None
     assert usual.evidence.confidence > 1.0 - RULE.risk
-    doubtful = found.step(dusty(world_drive, 6), world_drive.T_odom_body[6], 3.0)
+    doubtful = tracking.step(dusty(world_drive, 6), world_drive.T_odom_body[6], 3.0)
     assert doubtful.state is State.DOUBTED
     assert doubtful.T_map_body is doubtful.T_map_odom is doubtful.covariance is doubtful.drift is None
     assert doubtful.confidence == 0.0
     assert doubtful.evidence.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     assert 0.5 < doubtful.evidence.confidence < 1.0 - RULE.risk
     assert "wrong 1 in " in doubtful.evidence.reason
-    (known,) = follow(found, world_drive, [7])
+    (known,) = follow(tracking, world_drive, [7])
     assert known.state is State.TRACKING
     assert right(known, world_drive.T_map_body[7])
 
 
 @pytest.mark.parametrize("driving", [False, True])
-def test_covered_sensor_is_doubted_and_checked_at_each_frame(found, world_drive, driving):
+def test_covered_sensor_is_doubted_and_checked_at_each_frame(tracking, world_drive, driving):
     """Uncovered, the pose is back at once, and nothing was lost: the frames before are no evidence of the place."""
     at = [5 + driving * (k // 3) for k in range(6)]
-    fixes = [found.step(covered(k), world_drive.T_odom_body[n], 3.0 + k) for k, n in enumerate(at)]
+    fixes = [tracking.step(covered(k), world_drive.T_odom_body[n], 3.0 + k) for k, n in enumerate(at)]
     assert [fix.state for fix in fixes] == [State.DOUBTED] * 6
     assert [fix.T_map_body for fix in fixes] == [None] * 6
     assert fixes[0].evidence.cause is RejectionReason.BLIND
     assert fixes[-1].evidence.stamp == 8.0
-    (again,) = follow(found, world_drive, [at[-1]], 9.0)
+    (again,) = follow(tracking, world_drive, [at[-1]], 9.0)
     assert again.state is State.TRACKING
     assert right(again, world_drive.T_map_body[at[-1]])
 
@@ -188,14 +188,14 @@ def test_covered_sensor_is_doubted_and_checked_at_each_frame(found, world_drive,
 
 
 @pytest.mark.slow
-def test_restarted_odometry_far_away_is_lost_and_relocalized(found, world_drive):
+def test_restarted_odometry_far_away_is_lost_and_relocalized(tracking, world_drive):
     """A place without a map may lie at the map's edge, but no robot drives 6,000 km between two frames."""
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
-    lost = found.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
+    lost = tracking.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
     assert lost.evidence.cause is RejectionReason.OFF_MAP
     assert lost.state is State.LOST
     assert lost.T_map_body is None
-    again = follow(found, anew, range(1, 5), 3.5)
+    again = follow(tracking, anew, range(1, 5), 3.5)
     assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in enumerate(again, start=1))
     assert again[-1].state is State.TRACKING
 
@@ -223,9 +223,9 @@ def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
 
 
 @pytest.mark.slow
-def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
+def test_kidnapping_with_frozen_odometry_is_detected(tracking, world_drive):
     elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
-    fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
+    fixes = [tracking.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
     assert all(fix.T_map_body is None for fix in fixes)
     assert {fix.state for fix in fixes} <= {State.DOUBTED, State.LOST}
     assert fixes[0].state is State.DOUBTED
@@ -262,16 +262,16 @@ def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive,
 
 
 @pytest.mark.slow
-def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive):
+def test_covered_sensor_is_doubted_then_lost_then_relocalized(tracking, world_drive):
     """As soon as any place could be: the first keyframe that sees anything counts already."""
     seconds = np.arange(2.5, 2.5 + RULE.max_blind_s + 2.0, 1.0)
-    fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
+    fixes = [tracking.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
     assert all(fix.T_map_body is None for fix in fixes)
     assert fixes[0].evidence.cause is RejectionReason.BLIND
     blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.max_blind_s]
     assert {fix.state for fix in blind} == {State.DOUBTED}
     assert fixes[-1].state is State.LOST
-    again = follow(found, world_drive, range(6, 10), 100.0)
+    again = follow(tracking, world_drive, range(6, 10), 100.0)
     posed = [k for k, fix in enumerate(again) if fix.T_map_body is not None]
     assert posed[0] < 3
     for k in posed:
@@ -319,21 +319,21 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seen", ["the place", "dust", "garbage"])
-def test_first_frame_after_pause_decides_the_state(found, world_drive, seen):
+def test_first_frame_after_pause_decides_the_state(tracking, world_drive, seen):
     """Frames from before the pause are no doubt that has lasted: one good frame is enough."""
     cloud = {"the place": world_drive.clouds[5], "dust": dusty(world_drive, 5), "garbage": garbage()}[seen]
-    found.require_verification()
-    fix = found.step(cloud, world_drive.T_odom_body[5], 60.0)
+    tracking.require_verification()
+    fix = tracking.step(cloud, world_drive.T_odom_body[5], 60.0)
     assert fix.state is fix.evidence.state is (State.TRACKING if seen == "the place" else State.DOUBTED)
     assert fix.evidence.cause is not None
 
 
 @pytest.mark.slow
-def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(found, world_drive):
+def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(tracking, world_drive):
     """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
-    follow(found, world_drive, [5])
-    found.require_verification()
+    follow(tracking, world_drive, [5])
+    tracking.require_verification()
     moved = carried(world_drive, 5, 0)
-    fixes = follow(found, moved, range(4), 2.6)
+    fixes = follow(tracking, moved, range(4), 2.6)
     assert fixes[0].T_map_body is None
     assert all(fix.T_map_body is None or right(fix, moved.T_map_body[k]) for k, fix in enumerate(fixes))

@@ -49,8 +49,8 @@ def test_leaning_sensor_is_levelled(world_map, world_drive, world_fixes, lean, k
     errors, fix = follow(localizer, clouds, world_drive.T_odom_body, world_drive.T_map_body)
     assert len(errors) >= 0.85 * sum(each.T_map_body is not None for each in world_fixes)
     assert (errors.max(axis=0) < (0.1, 0.6)).all()
-    found = np.degrees([fix.calibration.roll, fix.calibration.pitch])
-    np.testing.assert_allclose(found, -np.array(lean), atol=0.4)
+    estimate = np.degrees([fix.calibration.roll, fix.calibration.pitch])
+    np.testing.assert_allclose(estimate, -np.array(lean), atol=0.4)
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_leaders_that_alternate_do_not_begin_the_search_anew_at_every_frame(worl
         if request is not None:
             epochs.append(request.epoch)
         lean = pose_from(exp_so3(np.radians([0.0, 4.0 * (k % 2), 0.0])), np.zeros(3))
-        said = KeyframeEvidence(0.1 * k, State.SEARCHING, "", evidence=shares, confidence=0.9)
-        localizer.apply_search_result(SearchResult(None, said, epoch=epochs[-1], leader=lean))
+        report = KeyframeEvidence(0.1 * k, State.SEARCHING, "", evidence=shares, confidence=0.9)
+        localizer.apply_search_result(SearchResult(None, report, epoch=epochs[-1], leader=lean))
     assert abs(localizer.calibration.pitch) > np.radians(1.0)
     assert len(set(epochs)) == 2

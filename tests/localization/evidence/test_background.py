@@ -35,11 +35,11 @@ def rng():
 
 @pytest.mark.parametrize("number", [12, NUMBER, 60])
 def test_known_background_and_number_are_recovered(rng, number):
-    found = background_of(chance_places(rng, 250, number=number))
-    np.testing.assert_allclose(found.structure, CHANCE, atol=0.04)
-    assert found.structure.sum() == pytest.approx(1.0)
-    assert found.passed == pytest.approx(PASSED, abs=0.02)
-    assert all(0.5 * number < each < 2.0 * number for each in found.number)
+    estimate = background_of(chance_places(rng, 250, number=number))
+    np.testing.assert_allclose(estimate.structure, CHANCE, atol=0.04)
+    assert estimate.structure.sum() == pytest.approx(1.0)
+    assert estimate.passed == pytest.approx(PASSED, abs=0.02)
+    assert all(0.5 * number < each < 2.0 * number for each in estimate.number)
 
 
 @pytest.mark.parametrize(
@@ -48,8 +48,8 @@ def test_known_background_and_number_are_recovered(rng, number):
 def test_a_scan_is_no_more_observations_than_the_patches_that_it_shows(rng, most, expected):
     chance = chance_places(rng, 250, number=60)[:, 0]
     usual = estimate_background(chance, scatter(chance), chance).number
-    found = estimate_background(chance, scatter(chance), chance, most).number
-    assert found == (expected or usual)
+    estimate = estimate_background(chance, scatter(chance), chance, most).number
+    assert estimate == (expected or usual)
 
 
 def test_scans_of_other_surroundings_are_more_observations(rng):
@@ -64,18 +64,18 @@ def test_scans_of_other_surroundings_are_more_observations(rng):
 def test_few_copies_of_the_right_place_do_not_inflate_the_background(rng, copies):
     chance = chance_places(rng, 200)
     twins = observation(np.tile([0.8, 0.15, 0.03, 0.02], (copies, 1)), passed=0.01, ground=0.95)[:, None]
-    usual, found = background_of(chance), background_of(np.concatenate([chance, twins]))
-    np.testing.assert_allclose(found.structure, usual.structure, atol=0.04)
-    assert all(there < 1.3 * here for there, here in zip(found.number, usual.number, strict=True))
+    usual, estimate = background_of(chance), background_of(np.concatenate([chance, twins]))
+    np.testing.assert_allclose(estimate.structure, usual.structure, atol=0.04)
+    assert all(there < 1.3 * here for there, here in zip(estimate.number, usual.number, strict=True))
 
 
 def test_a_site_that_repeats_itself_makes_its_pattern_worth_nothing(rng):
     """Half of all places are alike: then they are the background."""
     chance = chance_places(rng, 100)
     alike = observation(rng.multinomial(NUMBER, [0.7, 0.15, 0.05, 0.1], 100) / NUMBER, passed=0.02)[:, None]
-    found = background_of(np.concatenate([chance, alike]))
-    assert found.structure[0] > 0.35
-    assert found.number[0] < background_of(chance).number[0]
+    estimate = background_of(np.concatenate([chance, alike]))
+    assert estimate.structure[0] > 0.35
+    assert estimate.number[0] < background_of(chance).number[0]
 
 
 def test_same_scan_again_and_again_is_no_new_evidence(rng):
@@ -87,28 +87,28 @@ def test_same_scan_again_and_again_is_no_new_evidence(rng):
 
 
 def test_without_places_something_modest_is_presumed():
-    found = estimate_background(NOTHING, np.full(4, np.nan), NOTHING)
-    assert found.structure.sum() == pytest.approx(1.0)
-    assert (found.structure > 0).all()
-    assert 0 < found.passed < 1
-    assert all(1 < each < 50 for each in found.number)
-    assert all(np.isfinite(found.ground))
+    estimate = estimate_background(NOTHING, np.full(4, np.nan), NOTHING)
+    assert estimate.structure.sum() == pytest.approx(1.0)
+    assert (estimate.structure > 0).all()
+    assert 0 < estimate.passed < 1
+    assert all(1 < each < 50 for each in estimate.number)
+    assert all(np.isfinite(estimate.ground))
 
 
 def test_few_places_count_little_against_what_is_presumed(rng):
     presumed = estimate_background(NOTHING, np.full(4, np.nan), NOTHING)
     one = observation([[1.0, 0.0, 0.0, 0.0]])
-    found = estimate_background(one, scatter(one), one)
-    assert presumed.structure[0] < found.structure[0] < 0.5
-    assert np.isfinite(found.number).all()
+    estimate = estimate_background(one, scatter(one), one)
+    assert presumed.structure[0] < estimate.structure[0] < 0.5
+    assert np.isfinite(estimate.number).all()
 
 
 def test_uncovered_places_say_nothing(rng):
     """Beyond the map nothing is explained or unexplained: such places do not dilute the background."""
     chance = chance_places(rng, 150)
     beyond = observation(np.tile(CHANCE, (100, 1)), covered=np.zeros(100), covered_ground=np.zeros(100))[:, None]
-    found = background_of(np.concatenate([chance, beyond]))
-    np.testing.assert_allclose(found.structure, CHANCE, atol=0.05)
+    estimate = background_of(np.concatenate([chance, beyond]))
+    np.testing.assert_allclose(estimate.structure, CHANCE, atol=0.05)
 
 
 @pytest.mark.parametrize("level", [0.05, 0.5, 0.9])

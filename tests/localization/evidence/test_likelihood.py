@@ -82,8 +82,8 @@ def test_ratio_is_the_plain_sum_over_the_nuisances():
         rng.dirichlet([2, 1, 1, 2], 20), rng.uniform(0, 0.2, 20), rng.uniform(0, 1, 20), rng.uniform(0.3, 1, 20),
         rng.uniform(0.3, 1, 20),
     )  # fmt: skip
-    found = log_likelihood_ratios(rows, BACKGROUND)
-    np.testing.assert_allclose(found, [plain_sum(row, BACKGROUND) for row in rows], rtol=1e-4, atol=1e-4)
+    result = log_likelihood_ratios(rows, BACKGROUND)
+    np.testing.assert_allclose(result, [plain_sum(row, BACKGROUND) for row in rows], rtol=1e-4, atol=1e-4)
 
 
 def test_nuisances_have_a_prior_that_what_chance_shows_of_edges_decides():
@@ -107,9 +107,9 @@ def likeliest_share(rows, background):
 
 def test_the_more_is_explained_the_higher_the_ratio():
     steps = [(1 - t) * CHANCE + t * GOOD for t in np.linspace(0.0, 1.0, 11)]
-    found = ratio(steps)
-    assert (np.diff(found) > 0).all()
-    assert found[-1] > found[0] + 10
+    result = ratio(steps)
+    assert (np.diff(result) > 0).all()
+    assert result[-1] > result[0] + 10
     kept = likeliest_share(observation(steps), BACKGROUND)
     assert (np.diff(kept) >= 0).all()
     assert kept[0] < 0.2 < 0.7 < kept[-1]
@@ -118,17 +118,17 @@ def test_the_more_is_explained_the_higher_the_ratio():
 @pytest.mark.parametrize("number", [5.0, 50.0, 500.0])
 def test_place_at_the_shares_of_chance_gains_nothing(number):
     background = Background(CHANCE, PASSED, (5.0, 5.0), (number, number))
-    found = ratio([CHANCE, 0.5 * CHANCE + 0.5 * np.array([0.0, 0.0, 0.0, 1.0])], background=background, ground=0.5)
-    assert (found < 0.5).all()
-    assert found[1] < found[0]
+    result = ratio([CHANCE, 0.5 * CHANCE + 0.5 * np.array([0.0, 0.0, 0.0, 1.0])], background=background, ground=0.5)
+    assert (result < 0.5).all()
+    assert result[1] < result[0]
 
 
 def test_what_the_map_does_not_cover_adds_nothing():
     assert ratio([GOOD], passed=0.0, covered=0.0, covered_ground=0.0)[0] == pytest.approx(0.0, abs=1e-6)
     covered = np.array([0.25, 0.5, 0.75, 1.0])
-    found = ratio(np.tile(GOOD, (4, 1)), passed=0.005, covered=covered, covered_ground=covered, ground=0.9)
-    assert (np.diff(found) > 0).all()  # a rival that has it covered gains by it
-    assert found[0] > 0
+    result = ratio(np.tile(GOOD, (4, 1)), passed=0.005, covered=covered, covered_ground=covered, ground=0.9)
+    assert (np.diff(result) > 0).all()  # a rival that has it covered gains by it
+    assert result[0] > 0
 
 
 @pytest.mark.parametrize("background", [(0.5, 0.5), (1.5, 1.5), (2.0, 30.0), (30.0, 2.0), (300.0, 1.0)])
@@ -163,8 +163,8 @@ def searches_by_chance(count, places, number, seed):
     for _ in range(count):
         seen = chance_places(rng, places, number=number)[:, 0]
         ratios = log_likelihood_ratios(seen, estimate_background(seen, scatter(seen), seen))
-        found = posterior(ratios, votes, places)
-        yield found.error(votes == found.place.argmax())
+        result = posterior(ratios, votes, places)
+        yield result.error(votes == result.place.argmax())
 
 
 @pytest.mark.parametrize(
@@ -185,14 +185,14 @@ def test_stated_error_is_reached_by_chance_no_more_often_than_it_says(searches, 
 
 def test_right_place_is_told_from_chance():
     """The same searches with the right place among the others: calibration is not silence."""
-    rng, found = np.random.default_rng(8), []
+    rng, result = np.random.default_rng(8), []
     for _ in range(300):
         seen = chance_places(rng, 40, number=40)[:, 0]
         right = observation(rng.multinomial(40, GOOD, 1) / 40, passed=0.01, ground=0.9)
         background = estimate_background(seen, scatter(seen), seen)
         ratios = log_likelihood_ratios(np.concatenate([right, seen]), background)
-        found.append(posterior(ratios, np.arange(41), 41).error(np.arange(41) == 0))
-    assert (np.array(found) < 1e-4).mean() > 0.9
+        result.append(posterior(ratios, np.arange(41), 41).error(np.arange(41) == 0))
+    assert (np.array(result) < 1e-4).mean() > 0.9
 
 
 ERRORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
@@ -274,11 +274,11 @@ def mask(count, *chosen):
 
 @given(st.lists(st.tuples(st.floats(-1e5, 1e5), st.integers(0, 400)), max_size=40), st.integers(0, 500))
 def test_probabilities_sum_to_one(places, more):
-    found = of([ratio for ratio, _ in places], [rank for _, rank in places], len(places) + more)
-    assert found.place.shape == (len(places),)
-    assert (found.place >= 0).all()
-    assert found.none >= 0
-    assert found.place.sum() + found.none == pytest.approx(1.0)
+    result = of([ratio for ratio, _ in places], [rank for _, rank in places], len(places) + more)
+    assert result.place.shape == (len(places),)
+    assert (result.place >= 0).all()
+    assert result.none >= 0
+    assert result.place.sum() + result.none == pytest.approx(1.0)
 
 
 def test_none_of_these_wins_without_evidence():
@@ -319,8 +319,8 @@ def test_vote_rank_lowers_the_prior():
 def test_small_errors_are_exact():
     """1 - p is 0 in float64 from 1e-16 on: the error is summed over all that is not the place."""
     for ratio in (20.0, 60.0, 200.0, 600.0):
-        found = of([ratio], count=1)
-        assert found.error(FIRST) == pytest.approx(math.exp(-ratio), rel=1e-6)
+        result = of([ratio], count=1)
+        assert result.error(FIRST) == pytest.approx(math.exp(-ratio), rel=1e-6)
     rival = of([300.0, 200.0], count=2)
     assert rival.error(mask(2, 0)) == pytest.approx(math.exp(-100.0), rel=1e-6)
     assert 1.0 - rival.place[0] == 0.0

@@ -38,24 +38,24 @@ def beside(truth, count=60):
 def test_shares_are_shares(world_map, scan, truth):
     for part in (scan.few, scan.many):
         for move in Move:
-            seen = part.look_up(world_map.field, beside(truth), move)
-            assert seen.poses.shape == (60, 4)
-            assert seen.shares.shape == (60, len(Share))
-            assert ((seen.shares >= 0) & (seen.shares <= 1)).all()
-            assert ((seen.parts >= 0) & (seen.parts <= 1)).all()
-            assert (seen.shares[:, Share.ON] <= seen.shares[:, Share.NEAR]).all()
-            explained = seen.shares[:, Share.NEAR] + seen.shares[:, Share.EDGE]
-            assert (explained <= seen.shares[:, Share.COVERED] + 1e-6).all()
-            assert (seen.shares[:, Share.GROUND] <= seen.shares[:, Share.COVERED_GROUND]).all()
+            view = part.look_up(world_map.field, beside(truth), move)
+            assert view.poses.shape == (60, 4)
+            assert view.shares.shape == (60, len(Share))
+            assert ((view.shares >= 0) & (view.shares <= 1)).all()
+            assert ((view.parts >= 0) & (view.parts <= 1)).all()
+            assert (view.shares[:, Share.ON] <= view.shares[:, Share.NEAR]).all()
+            explained = view.shares[:, Share.NEAR] + view.shares[:, Share.EDGE]
+            assert (explained <= view.shares[:, Share.COVERED] + 1e-6).all()
+            assert (view.shares[:, Share.GROUND] <= view.shares[:, Share.COVERED_GROUND]).all()
 
 
 @pytest.mark.parametrize("away", [300.0, 5e4])
 def test_nothing_is_covered_off_the_map(world_map, scan, truth, away):
     for move in Move:
-        seen = scan.few.look_up(world_map.field, truth + np.array([away, -away, 0.0, 0.0]), move)
-        assert not seen.shares.any()
-        assert not seen.scores.any()
-        assert seen.evidence(0).inside == 0.0
+        view = scan.few.look_up(world_map.field, truth + np.array([away, -away, 0.0, 0.0]), move)
+        assert not view.shares.any()
+        assert not view.scores.any()
+        assert view.evidence(0).inside == 0.0
 
 
 def test_shares_are_those_counted_by_hand(world_map, scan, truth):
@@ -113,9 +113,9 @@ def test_part_takes_no_more_points_than_asked_for_and_knows_how_many_each_stands
 
 def test_empty_scan_observes_nothing(world_map, truth):
     nothing = np.empty((0, 3), dtype=np.float32)
-    seen = ScanPart.of((nothing,) * 3, (9, 9, 9)).look_up(world_map.field, truth, Move.NONE)
-    assert not seen.shares.any()
-    assert seen.scores.tolist() == [0.0]
+    view = ScanPart.of((nothing,) * 3, (9, 9, 9)).look_up(world_map.field, truth, Move.NONE)
+    assert not view.shares.any()
+    assert view.scores.tolist() == [0.0]
 
 
 def test_scans_from_one_place_see_the_surroundings_of_one_and_those_from_afar_of_several(scan, world_drive):

@@ -111,10 +111,10 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
     for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
         step, information = gicp.fused_step(A, gradient, begin, PIVOT, prior)
         np.testing.assert_array_equal(information, A + B)
-        found = gicp.retract(begin, step, PIVOT)
-        away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
+        fit = gicp.retract(begin, step, PIVOT)
+        away = transform(fit, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
         np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
-        np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
+        np.testing.assert_allclose(boxminus(fit, TILTED)[:3], wanted[:3], atol=1e-7)
 
 
 # ---- registrations
@@ -125,16 +125,16 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
 def test_gicp_and_trimmed_icp_agree_from_one_metre_and_five_degrees(target, centre):
     scan = scan_of(target)
     start = TRUTH @ exp_se3(np.array([0.01, -0.01, np.radians(5.0), 0.8, -0.6, 0.1]))
-    found, other = (register(scan, start, target, c, c.search, centre=centre, iterations=30) for c in (CONFIG, TRIMMED))
-    assert pose_error(found.T_map_source, TRUTH)[0] < 0.01
-    metres, degrees = pose_error(found.T_map_source, other.T_map_source)
+    fit, other = (register(scan, start, target, c, c.search, centre=centre, iterations=30) for c in (CONFIG, TRIMMED))
+    assert pose_error(fit.T_map_source, TRUTH)[0] < 0.01
+    metres, degrees = pose_error(fit.T_map_source, other.T_map_source)
     assert metres < 0.02
     assert degrees < 0.1
-    assert found.converged
-    assert found.pairs > 1000
-    assert 0.005 < found.rmse < 0.04
-    np.testing.assert_allclose(found.information, found.information.T)
-    assert np.linalg.eigvalsh(found.information).min() > 1
+    assert fit.converged
+    assert fit.pairs > 1000
+    assert 0.005 < fit.rmse < 0.04
+    np.testing.assert_allclose(fit.information, fit.information.T)
+    assert np.linalg.eigvalsh(fit.information).min() > 1
 
 
 def test_points_without_map_counterpart_are_trimmed_and_non_finite_ones_dropped(target):
@@ -149,8 +149,8 @@ def test_points_without_map_counterpart_are_trimmed_and_non_finite_ones_dropped(
         np.concatenate([scan.height, np.full(len(stray), 2.0, np.float32)]),
     )
     start = TRUTH @ exp_se3(np.array([0.0, 0.0, 0.03, 0.3, -0.2, 0.1]))
-    found = register(crowd, start, target, CONFIG, CONFIG.search, centre=np.zeros(3))
-    assert pose_error(found.T_map_source, TRUTH)[0] < 0.03
+    fit = register(crowd, start, target, CONFIG, CONFIG.search, centre=np.zeros(3))
+    assert pose_error(fit.T_map_source, TRUTH)[0] < 0.03
     with pytest.raises(ValueError, match="finite"):
         register(scan, np.full((4, 4), np.nan), target, CONFIG, CONFIG.track)
 

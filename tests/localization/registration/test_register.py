@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
+from small_world import pose_error
 
 from coview_kernels import Prior, Registration
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z, rotation_angle
+from coview_stream.geometry.transforms import boxminus, boxplus, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
@@ -40,11 +41,6 @@ def scan(target):
     return source_of(target.points[np.sort(some)], TRUTH)
 
 
-def errors(T, truth=TRUTH):
-    gap = inverse(truth) @ T
-    return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(rotation_angle(gap)))
-
-
 def with_outliers(scan, share):
     rng = np.random.default_rng(2)
     n = int(len(scan.points) * share / (1 - share))
@@ -67,21 +63,22 @@ def with_outliers(scan, share):
 )
 def test_known_six_dof_offset_is_found(target, scan, offset):
     start = TRUTH @ exp_se3(np.array(offset, float))
-    found = register(scan, start, target, CONFIG, CONFIG.search)
-    metres, degrees = errors(found.T_map_source)
+    result = register(scan, start, target, CONFIG, CONFIG.search)
+    metres, degrees = pose_error(result.T_map_source, TRUTH)
     assert metres < 0.01
     assert degrees < 0.05
-    assert found.converged
-    assert found.rmse < 0.01
-    assert found.pairs > 1000
-    assert 0 < found.iterations <= CONFIG.iterations * len(CONFIG.search)
+    assert result.converged
+    assert result.rmse < 0.01
+    assert result.pairs > 1000
+    assert 0 < result.iterations <= CONFIG.iterations * len(CONFIG.search)
 
 
 @pytest.mark.parametrize("centre", [None, np.zeros(3), np.array([8.0, -5.0, 1.0])], ids=["no pivot", "zero", "pivot"])
 def test_registration_with_forty_percent_outliers(target, scan, centre):
     start = TRUTH @ exp_se3(np.array([0.01, 0.0, 0.06, 0.8, -0.7, 0.1]))
     crowd = with_outliers(scan, 0.4)
-    metres, degrees = errors(register(crowd, start, target, CONFIG, CONFIG.search, centre=centre).T_map_source)
+    result = register(crowd, start, target, CONFIG, CONFIG.search, centre=centre)
+    metres, degrees = pose_error(result.T_map_source, TRUTH)
     assert metres < 0.03
     assert degrees < 0.15
 
@@ -107,19 +104,19 @@ def test_empty_local_map_gives_no_registration(target, scan):
 def test_weak_prior_does_not_outweigh_the_map(target, scan):
     wrong = TRUTH @ exp_se3(np.array([0, 0, 0.02, 0.3, 0.3, 0]))
     weak = Prior(wrong, np.diag(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]) ** -2))
-    found = register(scan, wrong, target, CONFIG, CONFIG.search, weak)
-    assert errors(found.T_map_source)[0] < 0.02
+    result = register(scan, wrong, target, CONFIG, CONFIG.search, weak)
+    assert pose_error(result.T_map_source, TRUTH)[0] < 0.02
 
 
 def test_local_maps_hold_all_points_within_radius_and_are_cached(world_map):
     maps, crops = LocalMaps(world_map, radius=6.0), {}
     for position in np.random.default_rng(3).uniform(-12, 12, (30, 3)):
-        found = maps.around(position)
+        result = maps.around(position)
         wanted = np.hypot(*(world_map.points[:, :2] - position[:2]).T) < 6.0
-        inside = np.hypot(*(found.points[:, :2] - position[:2]).T) < 6.0
+        inside = np.hypot(*(result.points[:, :2] - position[:2]).T) < 6.0
         assert inside.sum() == wanted.sum()
-        assert len(found.points) == len(found.normals)
-        crops[id(found)] = found
+        assert len(result.points) == len(result.normals)
+        crops[id(result)] = result
     assert 1 < len(crops) <= 9
 
 
@@ -187,8 +184,8 @@ def widened(sigma):
 
 def test_well_observed_directions_are_inflated_and_floored():
     sigma = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
-    found = registration_covariance(information_of(sigma), CONFIG)
-    np.testing.assert_allclose(found, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
+    result = registration_covariance(information_of(sigma), CONFIG)
+    np.testing.assert_allclose(result, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
 
 
 def test_weak_direction_is_widened_alone():
@@ -197,22 +194,22 @@ def test_weak_direction_is_widened_alone():
     strong = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
     weak = (CONFIG.inflation / 0.3) ** 2
     tunnel = strong + (weak - along @ strong @ along) * np.outer(along, along)
-    found = registration_covariance(tunnel, CONFIG)
-    assert np.sqrt(along @ found @ along) == pytest.approx(widened(0.3), rel=0.02)
+    result = registration_covariance(tunnel, CONFIG)
+    assert np.sqrt(along @ result @ along) == pytest.approx(widened(0.3), rel=0.02)
     across = np.array([0.0, 0.0, 0.0, 1.0, -1.0, 0.0]) / np.sqrt(2)
-    assert np.sqrt(across @ found @ across) < 0.025
-    assert np.sqrt(found[2, 2]) < 1.5e-3
+    assert np.sqrt(across @ result @ across) < 0.025
+    assert np.sqrt(result[2, 2]) < 1.5e-3
 
 
 def test_angle_is_weak_by_displacement_at_the_lever_arm():
     """A degree moves 0.17 m at 10 m, which is weak; a twentieth of that hardly matters."""
     sigma = np.full(6, 0.001)
     sigma[2], sigma[0] = np.radians(1.0), np.radians(0.05)
-    found = np.sqrt(np.diag(registration_covariance(information_of(sigma), CONFIG)))
+    result = np.sqrt(np.diag(registration_covariance(information_of(sigma), CONFIG)))
     lever = CONFIG.weak_lever
-    assert found[2] == pytest.approx(widened(sigma[2] * lever) / lever, rel=0.01)
-    assert found[2] > 1.5 * sigma[2]
-    assert found[0] == pytest.approx(np.hypot(sigma[0], FLOOR[0]), rel=0.05)
+    assert result[2] == pytest.approx(widened(sigma[2] * lever) / lever, rel=0.01)
+    assert result[2] > 1.5 * sigma[2]
+    assert result[0] == pytest.approx(np.hypot(sigma[0], FLOOR[0]), rel=0.05)
 
 
 @pytest.mark.parametrize("weakest", [0.0, -1e-3, 1e-9])
@@ -220,20 +217,20 @@ def test_zero_information_gives_the_max_sigma(weakest):
     """Also where a subtraction has left a little less than nothing."""
     information = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
     information[4, 4] = weakest
-    found = registration_covariance(information, CONFIG)
-    check_covariance(found, "found")
-    assert np.sqrt(found[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
+    result = registration_covariance(information, CONFIG)
+    check_covariance(result, "found")
+    assert np.sqrt(result[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
 
 
 def test_sigma_grows_continuously_as_information_falls():
     sigmas = np.geomspace(0.01, 30.0, 60)
-    found = [
+    result = [
         np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3]) for s in sigmas
     ]
-    steps = np.diff(np.log(found))
+    steps = np.diff(np.log(result))
     assert (steps >= -1e-9).all()
     assert steps.max() < 0.3  # twice the step of the sigmas at most
-    assert (np.array(found) >= np.minimum(sigmas, CONFIG.weak_sigma) * 0.999).all()
+    assert (np.array(result) >= np.minimum(sigmas, CONFIG.weak_sigma) * 0.999).all()
 
 
 @pytest.mark.parametrize("bad", [np.eye(5), np.full((6, 6), np.nan)])

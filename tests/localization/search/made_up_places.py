@@ -61,8 +61,8 @@ def place(probability, T_map_odom=HERE, score=0.7, hinted=False, **hypothesis):
 
 def candidate(at, score=0.8):
     """What comes of a place once it is registered."""
-    found = Registration(at.T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return replace(at, registration=found, evidence=Evidence(score, score, 1.0, 1.0, 0.9))
+    fit = Registration(at.T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
+    return replace(at, registration=fit, evidence=Evidence(score, score, 1.0, 1.0, 0.9))
 
 
 def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk, undecided=0.0) -> SearchResult:

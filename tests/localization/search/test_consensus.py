@@ -105,10 +105,12 @@ def test_sparse_scores_are_the_dense_sum_on_a_ragged_site():
         votes.append((vote.centre, vote.scores))
         consensus.vote(vote)
         dense = dense_scores(grid, votes[-4:])
-        found = consensus.hypotheses()
-        assert len(found) == 60 * 4
-        np.testing.assert_allclose([h.votes for h in found], [dense[h.station, h.shift] for h in found], atol=1e-5)
-        assert [h.votes for h in found] == sorted(h.votes for h in found)
+        hypotheses = consensus.hypotheses()
+        assert len(hypotheses) == 60 * 4
+        np.testing.assert_allclose(
+            [h.votes for h in hypotheses], [dense[h.station, h.shift] for h in hypotheses], atol=1e-5
+        )
+        assert [h.votes for h in hypotheses] == sorted(h.votes for h in hypotheses)
 
 
 def test_places_that_one_keyframe_names_are_scored_by_all():
@@ -155,9 +157,9 @@ def test_peaks_are_distinct_in_place_or_heading():
     votes[one, 3], votes[beside, 3], votes[one, 4] = 0.30, 0.31, 0.32  # one hypothesis, seen thrice
     votes[one, 9], votes[far, 0], votes[far, S - 1] = 0.35, 0.40, 0.41  # headings are compared around the circle
     consensus.vote(vote_of(np.zeros(3), votes))
-    found = consensus.hypotheses()
-    assert [(h.station, h.shift) for h in found] == [(one, 3), (one, 9), (far, 0)]
-    assert [h.votes for h in found] == sorted(h.votes for h in found)
+    hypotheses = consensus.hypotheses()
+    assert [(h.station, h.shift) for h in hypotheses] == [(one, 3), (one, 9), (far, 0)]
+    assert [h.votes for h in hypotheses] == sorted(h.votes for h in hypotheses)
 
 
 def test_consensus_window_is_bounded_and_clear_empties_it(voted):

@@ -39,9 +39,9 @@ def misled(localizer, drive, metres=8.0):
     first = pose_from(drive.T_odom_body[0][:3, :3], np.zeros(3))  # about the localizer's anchor
     T_map_odom = drive.T_map_body[0] @ inverse(first)
 
-    def wrong(found):
-        gaps = [(each.T_map_odom - T_map_odom) @ np.append(votes.centre, 1.0) for each in found]
-        return [each for each, gap in zip(found, gaps, strict=True) if np.linalg.norm(gap[:2]) > metres]
+    def wrong(places):
+        gaps = [(each.T_map_odom - T_map_odom) @ np.append(votes.centre, 1.0) for each in places]
+        return [each for each, gap in zip(places, gaps, strict=True) if np.linalg.norm(gap[:2]) > metres]
 
     votes = name_instead(localizer.search, wrong)
     return localizer
@@ -142,7 +142,7 @@ def test_hint_of_lookalike_place_is_never_accepted(lookalike_map, world_drive):
 def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_drive):
     """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
     localizer = Localizer(lookalike_map)
-    votes = name_instead(localizer.search, lambda found: found if len(votes) > 3 else [])
+    votes = name_instead(localizer.search, lambda places: places if len(votes) > 3 else [])
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
     assert all(f.evidence.confidence > 0.5 for f in fixes[:3])  # in the wrong one, and it was alone

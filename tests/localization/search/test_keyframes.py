@@ -176,9 +176,9 @@ def test_moved_robot_or_jumped_odometry_is_reported_once_unless_cleared(frames, 
         after = [(points + jump, place + jump) for points, place in frames[10:16]]
     if cleared:
         check.clear()
-    told = [check.contradicts(*frame) for frame in after]
-    assert told.count(True) == (not cleared)
-    assert told[_PATIENCE - 1] or cleared
+    alarms = [check.contradicts(*frame) for frame in after]
+    assert alarms.count(True) == (not cleared)
+    assert alarms[_PATIENCE - 1] or cleared
 
 
 def test_single_deviating_frame_is_ignored(frames):

@@ -46,11 +46,11 @@ def knowing(drive):
     T_map_odom = drive.T_map_body[0] @ inverse(first)
 
     def distances(matcher, centre):
-        found = np.random.default_rng(0).normal(1.0, 0.1, (len(matcher.stations), matcher.config.yaws))
+        table = np.random.default_rng(0).normal(1.0, 0.1, (len(matcher.stations), matcher.config.yaws))
         there = transform(T_map_odom, centre[None])[0, :2]
         station = np.hypot(*(matcher.stations[:, :2] - there).T).argmin()
-        found[station, round(-yaw_of(T_map_odom) / (2 * np.pi / matcher.config.yaws)) % matcher.config.yaws] = -1.0
-        return found
+        table[station, round(-yaw_of(T_map_odom) / (2 * np.pi / matcher.config.yaws)) % matcher.config.yaws] = -1.0
+        return table
 
     return distances
 
@@ -121,12 +121,12 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
 
     def distances(matcher, centre):
         xy = matcher.stations[:, :2]
-        found = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), matcher.config.yaws))
+        table = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), matcher.config.yaws))
         away = np.hypot(*(xy - xy.mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
-        found[wrong, np.arange(5) * 7] = -1.0
+        table[wrong, np.arange(5) * 7] = -1.0
         named.append(wrong)
-        return found
+        return table
 
     fixes = follow(localizer_of(learned_map, distances), world_drive)
     assert right(fixes, world_drive)

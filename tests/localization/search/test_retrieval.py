@@ -102,9 +102,9 @@ def test_vote_is_that_of_the_exact_distances(stations, query):
     vote = CoViewVote(np.zeros(3), Retrieval(stations).compared().index, query)
     exact = TableVote.of_distances(np.zeros(3), [exact_distances(stations.full[name], query[name]) for name in query])
     station, shift = (each.ravel() for each in np.indices((M, S)))
-    found, expected = vote.at(station, shift), exact.at(station, shift)
-    assert np.abs(found - expected).max() < 1.0
-    assert np.corrcoef(found, expected)[0, 1] > 0.98
+    values, expected = vote.at(station, shift), exact.at(station, shift)
+    assert np.abs(values - expected).max() < 1.0
+    assert np.corrcoef(values, expected)[0, 1] > 0.98
     np.testing.assert_array_equal(vote.at(np.full(3, -1), np.arange(3)), 0.0)
     assert vote.sectors == S
 
@@ -159,9 +159,9 @@ def test_storeys_have_squares_of_their_own(few_are_many, world_map):
         assert np.nanmax(np.nanmax(heights, axis=1) - np.nanmin(heights, axis=1)) < 3.0
         np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(grid)))
         # each of them is found at its height by the one that stands for it
-        found = compared.grid.at(grid.stations)
-        assert (found >= 0).all()
-        assert (np.abs(compared.grid.stations[found, 2] - grid.stations[:, 2]) < 3.0).all()
+        values = compared.grid.at(grid.stations)
+        assert (values >= 0).all()
+        assert (np.abs(compared.grid.stations[values, 2] - grid.stations[:, 2]) < 3.0).all()
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -175,8 +175,8 @@ def test_circle_has_the_scores_of_the_map(world_map, request, many):
     query = {name: world_map.descriptors(name)[40].astype(np.float32) for name in world_map.descriptor_config.channels}
     asked, whole = compared.index.query(query), index.query(query)
     every = np.arange(len(compared))
-    found, expected = compared.index.all_shifts(asked, every), index.all_shifts(whole, compared.numbers)
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    values, expected = compared.index.all_shifts(asked, every), index.all_shifts(whole, compared.numbers)
+    np.testing.assert_allclose(values, expected, atol=1e-4)
     if not many:
         single = compared.index.at(asked, every, np.zeros(len(every)))
         np.testing.assert_allclose(single, index.at(whole, compared.numbers, np.zeros(len(every))), atol=1e-4)

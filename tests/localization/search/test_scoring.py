@@ -67,25 +67,25 @@ def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan)
         hypothesis(off(1.2, -1.4, 4.0, scan)),
     ]
     far = hypothesis(off(9.0, -7.0, 120.0, scan), station=8)
-    found = scored(scorer, [far, *near], scan)
-    assert len(found.rivals) == len(found.places) == 2
-    best, other = found.places
+    result = scored(scorer, [far, *near], scan)
+    assert len(result.rivals) == len(result.places) == 2
+    best, other = result.places
     assert is_right(best, scan)
     assert (best.station, other.station) == (3, 8)
     assert best.ratio > other.ratio
-    assert found.second is other
-    np.testing.assert_array_equal(found.rivals.T_map_odom[0], best.T_map_odom)
-    assert found.rivals.scores.tolist() == pytest.approx([best.score, other.score])
+    assert result.second is other
+    np.testing.assert_array_equal(result.rivals.T_map_odom[0], best.T_map_odom)
+    assert result.rivals.scores.tolist() == pytest.approx([best.score, other.score])
 
 
 def test_probabilities_of_places_and_none_of_these_sum_to_one(scorer, scan):
-    found = scored(scorer, some_places(scan), scan)
-    probability = np.array([place.probability for place in found.places])
-    assert probability.sum() + found.none == pytest.approx(1.0, abs=1e-9)
+    result = scored(scorer, some_places(scan), scan)
+    probability = np.array([place.probability for place in result.places])
+    assert probability.sum() + result.none == pytest.approx(1.0, abs=1e-9)
     assert (np.diff(probability) <= 1e-12).all()
-    assert is_right(found.places[0], scan)
+    assert is_right(result.places[0], scan)
     # places beside the first from which registration leads to it may be no error; all others are
-    assert found.none <= found.error <= found.none + probability[1:].sum() + 1e-12
+    assert result.none <= result.error <= result.none + probability[1:].sum() + 1e-12
 
 
 def test_hint_is_found_again_among_the_places(world_map, scan):
@@ -121,9 +121,9 @@ def test_scan_without_structure_or_hypotheses_is_found_nowhere(scorer, scan, wor
     ground, settings = scan.cloud.points[~scan.cloud.above], LocalizerConfig().registration
     flat = ObservedScan.of(prepare_scan(ground, scan.body, settings), world_drive.clouds[0], scan.T_odom_body)
     scorer.clear()
-    found = scored(scorer, [hypothesis(ODOM)], flat)
-    assert found.rivals.scores.tolist() == [0.0]
-    assert found.error > 1e-2
+    result = scored(scorer, [hypothesis(ODOM)], flat)
+    assert result.rivals.scores.tolist() == [0.0]
+    assert result.error > 1e-2
 
 
 def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map, world_drive):
@@ -134,9 +134,9 @@ def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map,
     for scan in scans[:3]:
         scored(late, others, scan)
         scored(early, [right, *others], scan)
-    found = [scored(scorer, [right, *others], scans[3]).places[0] for scorer in (late, early)]
-    assert all(is_right(place, scans[3]) for place in found)
-    assert found[0].ratio == pytest.approx(found[1].ratio, rel=0.25)
+    result = [scored(scorer, [right, *others], scans[3]).places[0] for scorer in (late, early)]
+    assert all(is_right(place, scans[3]) for place in result)
+    assert result[0].ratio == pytest.approx(result[1].ratio, rel=0.25)
 
 
 def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):

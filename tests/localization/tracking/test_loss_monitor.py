@@ -26,7 +26,7 @@ RULE = AcceptanceConfig(risk=1e-4, max_doubt_s=10.0, max_blind_s=60.0)
 PRIOR = 1e-5  # of a view, 1 m driven
 
 
-def said(ratio, cause=None, reason="why"):
+def verdict_of(ratio, cause=None, reason="why"):
     """A verdict on a registration with a log-likelihood ratio for the place."""
     usual = RejectionReason.VERIFIED if ratio > 0 else RejectionReason.FITNESS
     return MatchVerdict(cause or usual, reason, None, None, Observation(ratio, np.zeros(NUISANCES)))
@@ -44,7 +44,7 @@ def monitor():
 
 def drive(monitor, ratios, start=0.0, speed=1.0):
     """Registrations 1 m apart."""
-    return [monitor.verify(said(ratio), (start + k) / speed, start + k) for k, ratio in enumerate(ratios)]
+    return [monitor.verify(verdict_of(ratio), (start + k) / speed, start + k) for k, ratio in enumerate(ratios)]
 
 
 def log_odds(ruling: Ruling) -> float:
@@ -52,29 +52,29 @@ def log_odds(ruling: Ruling) -> float:
 
 
 def test_what_speaks_against_the_place_adds_up_a_view_at_a_time(monitor):
-    found = [log_odds(ruling) for ruling in drive(monitor, [5.0, -1.0, -2.0, -4.0], speed=1e3)]
-    np.testing.assert_allclose(np.diff(found[1:]), [2.0, 4.0], atol=0.35)  # and what is driven
-    assert found[-1] == pytest.approx(math.log(PRIOR) + 7.0, abs=0.5)
+    outcome = [log_odds(ruling) for ruling in drive(monitor, [5.0, -1.0, -2.0, -4.0], speed=1e3)]
+    np.testing.assert_allclose(np.diff(outcome[1:]), [2.0, 4.0], atol=0.35)  # and what is driven
+    assert outcome[-1] == pytest.approx(math.log(PRIOR) + 7.0, abs=0.5)
 
 
 def test_newest_registration_of_a_view_counts(monitor):
-    monitor.verify(said(5.0), 0.0, 0.0)
-    first = monitor.verify(said(-6.0), 1.0, 1.0).wrong
-    assert [monitor.verify(said(-6.0), 1.0, 1.0).wrong for _ in range(20)] == pytest.approx([first] * 20)
-    assert monitor.verify(said(-1.0), 1.0, 1.4).wrong < 0.1 * first
-    assert monitor.verify(said(-6.0), 1.0, 1.99).wrong == pytest.approx(2 * first, rel=0.1)  # and a metre driven
-    assert monitor.verify(said(-6.0), 1.0, 2.0).wrong > 50 * first
+    monitor.verify(verdict_of(5.0), 0.0, 0.0)
+    first = monitor.verify(verdict_of(-6.0), 1.0, 1.0).wrong
+    assert [monitor.verify(verdict_of(-6.0), 1.0, 1.0).wrong for _ in range(20)] == pytest.approx([first] * 20)
+    assert monitor.verify(verdict_of(-1.0), 1.0, 1.4).wrong < 0.1 * first
+    assert monitor.verify(verdict_of(-6.0), 1.0, 1.99).wrong == pytest.approx(2 * first, rel=0.1)  # and a metre driven
+    assert monitor.verify(verdict_of(-6.0), 1.0, 2.0).wrong > 50 * first
 
 
 @pytest.mark.parametrize("metres", [0.2, 1.5, 20.0])
 def test_one_frame_of_garbage_costs_its_pose_and_two_views_of_it_the_place(monitor, metres):
     """However often the place has fitted: a robot that is carried while it stands is noticed as soon as any other."""
     for k in range(50):
-        assert monitor.verify(said(15.0), float(k), 4.0).believed
-    assert monitor.verify(said(-100.0), 50.0, 4.0).event is Event.MATCH_REJECTED
-    assert monitor.verify(said(15.0), 50.1, 4.0 + metres).believed
-    told = drive(monitor, [-100.0, -100.0], 60.0)
-    assert [ruling.event for ruling in told] == [Event.MATCH_REJECTED, Event.PLACE_GIVEN_UP]
+        assert monitor.verify(verdict_of(15.0), float(k), 4.0).believed
+    assert monitor.verify(verdict_of(-100.0), 50.0, 4.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(verdict_of(15.0), 50.1, 4.0 + metres).believed
+    reports = drive(monitor, [-100.0, -100.0], 60.0)
+    assert [ruling.event for ruling in reports] == [Event.MATCH_REJECTED, Event.PLACE_GIVEN_UP]
 
 
 def test_one_view_has_to_make_up_for_all_that_was_said_before(monitor):
@@ -84,59 +84,61 @@ def test_one_view_has_to_make_up_for_all_that_was_said_before(monitor):
     assert [(ruling.event, ruling.believed) for ruling in weak] == [(Event.MATCH_REJECTED, False)] * 3
     assert weak[-1].wrong > weak[0].wrong > RULE.risk
     assert weak[0].reason.startswith("it fits again: wrong 1 in ")
-    assert monitor.verify(said(9.0), 6.0, 6.0) == pytest.approx((Event.MATCH_VERIFIED, "why", 1e-5, True), abs=3e-5)
+    assert monitor.verify(verdict_of(9.0), 6.0, 6.0) == pytest.approx(
+        (Event.MATCH_VERIFIED, "why", 1e-5, True), abs=3e-5
+    )
     # and is forgiven
     assert drive(monitor, [1.0], 7.0)[0].believed
 
 
 def test_place_is_given_up_once_it_is_more_probable_than_not_that_it_is_wrong(monitor):
-    found = drive(monitor, [5.0, *[-2.5] * 6], speed=1e3)
-    given_up = [ruling.event is Event.PLACE_GIVEN_UP for ruling in found]
-    assert given_up == [ruling.wrong >= 0.5 for ruling in found]
-    assert any(0.1 < ruling.wrong < 0.5 for ruling in found)
-    assert found[given_up.index(True)].reason == "more probably elsewhere: why"
+    outcome = drive(monitor, [5.0, *[-2.5] * 6], speed=1e3)
+    given_up = [ruling.event is Event.PLACE_GIVEN_UP for ruling in outcome]
+    assert given_up == [ruling.wrong >= 0.5 for ruling in outcome]
+    assert any(0.1 < ruling.wrong < 0.5 for ruling in outcome)
+    assert outcome[given_up.index(True)].reason == "more probably elsewhere: why"
 
 
 def test_verification_that_is_required_begins_a_doubt_with_a_timeout(monitor):
     drive(monitor, [15.0])
     for _ in range(10_000):  # asked again, it changes nothing
         monitor.require_verification()
-    told = [monitor.verify(said(-0.1), 1.0 + seconds, 1.0).event for seconds in (0.0, 0.9 * RULE.max_doubt_s)]
-    assert told == [Event.MATCH_REJECTED] * 2
-    assert monitor.verify(said(-0.1), 1.0 + RULE.max_doubt_s, 1.0).event is Event.PLACE_GIVEN_UP
+    reports = [monitor.verify(verdict_of(-0.1), 1.0 + seconds, 1.0).event for seconds in (0.0, 0.9 * RULE.max_doubt_s)]
+    assert reports == [Event.MATCH_REJECTED] * 2
+    assert monitor.verify(verdict_of(-0.1), 1.0 + RULE.max_doubt_s, 1.0).event is Event.PLACE_GIVEN_UP
     monitor.begin(0.0)
     drive(monitor, [15.0])
     monitor.require_verification()
-    assert monitor.verify(said(9.0), 60.0, 1.0).believed
+    assert monitor.verify(verdict_of(9.0), 60.0, 1.0).believed
 
 
 @pytest.mark.parametrize("ratio", [-1e4, 1e4])
 def test_any_ratio_gives_a_probability(monitor, ratio):
-    found = monitor.verify(said(ratio), 0.0, 0.0)
-    assert 0.0 <= found.wrong <= 1.0
-    assert found.event is (Event.MATCH_VERIFIED if ratio > 0 else Event.MATCH_REJECTED)
+    outcome = monitor.verify(verdict_of(ratio), 0.0, 0.0)
+    assert 0.0 <= outcome.wrong <= 1.0
+    assert outcome.event is (Event.MATCH_VERIFIED if ratio > 0 else Event.MATCH_REJECTED)
 
 
 def test_little_that_speaks_against_the_place_costs_no_pose_and_corrects_nothing(monitor):
     drive(monitor, [5.0])
-    found = monitor.verify(said(-0.5), 1.0, 1.0)
-    assert (found.event, found.believed) == (None, False)
-    assert found.reason == "odometry alone: why"
-    assert PRIOR < found.wrong < RULE.risk
+    outcome = monitor.verify(verdict_of(-0.5), 1.0, 1.0)
+    assert (outcome.event, outcome.believed) == (None, False)
+    assert outcome.reason == "odometry alone: why"
+    assert PRIOR < outcome.wrong < RULE.risk
 
 
 def test_robot_on_odometry_alone_is_doubted_by_the_metre(monitor):
     drive(monitor, [5.0])
-    found = [monitor.verify(nothing(RejectionReason.OFF_MAP), 1.0, float(metres)) for metres in range(1, 21)]
-    posed = [ruling.event is None for ruling in found]
+    outcome = [monitor.verify(nothing(RejectionReason.OFF_MAP), 1.0, float(metres)) for metres in range(1, 21)]
+    posed = [ruling.event is None for ruling in outcome]
     assert posed == sorted(posed, reverse=True)
     assert posed.count(True) == pytest.approx(RULE.risk / PRIOR, abs=2)
-    np.testing.assert_allclose(np.diff([ruling.wrong for ruling in found]), PRIOR, rtol=0.01)
+    np.testing.assert_allclose(np.diff([ruling.wrong for ruling in outcome]), PRIOR, rtol=0.01)
 
 
 def test_robot_that_trusts_odometry_is_not_doubted_by_the_second(monitor):
     drive(monitor, [5.0])
-    wrong = [monitor.verify(said(-0.5), 1.0 + k, 1.0).wrong for k in range(100)]
+    wrong = [monitor.verify(verdict_of(-0.5), 1.0 + k, 1.0).wrong for k in range(100)]
     assert wrong == pytest.approx([wrong[0]] * 100)
 
 
@@ -144,10 +146,10 @@ def test_robot_that_trusts_odometry_is_not_doubted_by_the_second(monitor):
 @pytest.mark.parametrize("ratio", [20.0, None], ids=["fits", "nothing seen"])
 def test_some_causes_cost_the_pose_at_once_and_lose_no_place_while_driving(monitor, cause, ratio):
     drive(monitor, [15.0] * 3)
-    verdict = nothing(cause) if ratio is None else said(ratio, cause, "covered")
+    verdict = nothing(cause) if ratio is None else verdict_of(ratio, cause, "covered")
     for k in range(9):
         assert monitor.verify(verdict, 3.0 + k, 3.0 + 5.0 * k)[:2] == (Event.MATCH_REJECTED, "covered")
-    assert monitor.verify(said(15.0), 12.0, 44.0).event is Event.MATCH_VERIFIED
+    assert monitor.verify(verdict_of(15.0), 12.0, 44.0).event is Event.MATCH_VERIFIED
 
 
 @pytest.mark.parametrize("seconds", [10.0, 30.0])
@@ -157,15 +159,15 @@ def test_return_after_long_blindness_needs_more_evidence(monitor, seconds):
     for k in range(int(seconds) + 1):
         monitor.verify(nothing(), 1.0 + k, 0.0)
     enough = math.log((PRIOR + rates._PER_SECOND * seconds) / RULE.risk)
-    told = monitor.verify(said(enough - 0.5), 1.0 + seconds, 0.0)
-    assert (told.event, told.believed) == (Event.MATCH_REJECTED, False)
-    assert "it fits again" in told.reason
-    assert monitor.verify(said(enough + 0.5), 1.0 + seconds, 0.0).event is Event.MATCH_VERIFIED
+    reports = monitor.verify(verdict_of(enough - 0.5), 1.0 + seconds, 0.0)
+    assert (reports.event, reports.believed) == (Event.MATCH_REJECTED, False)
+    assert "it fits again" in reports.reason
+    assert monitor.verify(verdict_of(enough + 0.5), 1.0 + seconds, 0.0).event is Event.MATCH_VERIFIED
 
 
 @pytest.mark.parametrize(
     ("verdict", "longest"),
-    [(said(-3.0), 10.0), (said(20.0, RejectionReason.ODOMETRY), 10.0), (nothing(), 60.0)],
+    [(verdict_of(-3.0), 10.0), (verdict_of(20.0, RejectionReason.ODOMETRY), 10.0), (nothing(), 60.0)],
     ids=["against", "odometry", "blind"],
 )
 def test_doubt_while_standing_times_out(monitor, verdict, longest):
@@ -181,15 +183,15 @@ def test_time_that_the_sensor_was_blind_is_no_time_of_doubt(monitor):
     """What it sees then has the whole time to be doubted in."""
     for k in range(31):
         monitor.verify(nothing(), float(k), 0.0)
-    assert monitor.verify(said(-1.0), 30.0 + RULE.max_doubt_s - 0.1, 0.0).event is Event.MATCH_REJECTED
-    lost = monitor.verify(said(-1.0), 30.0 + RULE.max_doubt_s, 0.0)
+    assert monitor.verify(verdict_of(-1.0), 30.0 + RULE.max_doubt_s - 0.1, 0.0).event is Event.MATCH_REJECTED
+    lost = monitor.verify(verdict_of(-1.0), 30.0 + RULE.max_doubt_s, 0.0)
     assert (lost.event, lost.reason) == (Event.PLACE_GIVEN_UP, "in doubt for 40 s: why")
 
 
 def test_doubt_ends_with_the_first_registration_that_is_believed(monitor):
     """The next one begins a doubt of its own."""
     monitor.verify(nothing(), 0.0, 0.0)
-    assert monitor.verify(said(15.0), 9.0, 0.0).believed
+    assert monitor.verify(verdict_of(15.0), 9.0, 0.0).believed
     assert monitor.verify(nothing(), 11.0, 0.0).event is Event.MATCH_REJECTED
     assert monitor.verify(nothing(), 11.0 + RULE.max_blind_s - 0.1, 0.0).event is Event.MATCH_REJECTED
 
@@ -199,19 +201,19 @@ def test_place_begins_with_the_error_of_the_search(monitor, error):
     """What was said of the place before does not count, and what the search said does."""
     drive(monitor, [5.0, -5.0, -5.0])
     monitor.begin(error)
-    wrong = monitor.verify(said(-2.0), 3.0, 3.0).wrong
+    wrong = monitor.verify(verdict_of(-2.0), 3.0, 3.0).wrong
     assert wrong == pytest.approx(max(error, PRIOR) * math.exp(2.0), rel=0.01)
     monitor.begin(error)
-    assert monitor.verify(said(2.0), 3.0, 3.0).believed
+    assert monitor.verify(verdict_of(2.0), 3.0, 3.0).believed
 
 
 def test_risk_decides_what_is_believed():
     for risk in (1e-2, 1e-6):
         monitor = LossMonitor(AcceptanceConfig(risk=risk), TrackingConfig(distance=1.0))
         drive(monitor, [15.0])
-        found = monitor.verify(said(1.0), 1.0, 1.0)  # 1e-5 / e
-        assert found.believed == (risk == 1e-2)
-        assert found.event is (Event.MATCH_VERIFIED if found.believed else Event.MATCH_REJECTED)
+        outcome = monitor.verify(verdict_of(1.0), 1.0, 1.0)  # 1e-5 / e
+        assert outcome.believed == (risk == 1e-2)
+        assert outcome.event is (Event.MATCH_VERIFIED if outcome.believed else Event.MATCH_REJECTED)
 
 
 GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
@@ -227,7 +229,7 @@ def used():
 
 
 @pytest.mark.parametrize(
-    ("changes", "cause", "told"),
+    ("changes", "cause", "clause"),
     [
         ({"inside": 0.25}, RejectionReason.OFF_MAP, "only 25% of what is seen lies on the map"),
         ({"ground": 0.4}, RejectionReason.GROUND, "only 40% of the ground lies on the map's"),
@@ -236,10 +238,10 @@ def used():
     ],
 )
 @pytest.mark.parametrize("baseline", ["fresh", "used"])
-def test_share_that_is_poor_names_its_cause(changes, cause, told, baseline, used):
-    found, reason = (used if baseline == "used" else EvidenceBaseline()).explain(replace(GOOD, **changes))
-    assert found is cause
-    assert told in reason
+def test_share_that_is_poor_names_its_cause(changes, cause, clause, baseline, used):
+    outcome, reason = (used if baseline == "used" else EvidenceBaseline()).explain(replace(GOOD, **changes))
+    assert outcome is cause
+    assert clause in reason
     if cause is RejectionReason.FITNESS:
         assert ("80% usual here" in reason) == (baseline == "used")
 

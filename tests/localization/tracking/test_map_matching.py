@@ -40,8 +40,8 @@ def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) ->
     return MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, graph or belief)
 
 
-def off(found, truth):
-    return float(np.linalg.norm(boxminus(found, truth)[3:]))
+def off(match, truth):
+    return float(np.linalg.norm(boxminus(match, truth)[3:]))
 
 
 def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
@@ -55,11 +55,11 @@ def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
     arguments = (scan.cloud, prior.T_map_source, target, settings, settings.track)
     fused = register(*arguments, prior, scan.T_odom_body[:3, 3]).T_map_source @ scan.T_odom_body
     loose = matched(world_map, scan, Estimate(believed, LOOSE))
-    found = matched(world_map, scan, Estimate(believed, sure))
-    assert loose.verdict.cause is found.verdict.cause is RejectionReason.VERIFIED
+    match = matched(world_map, scan, Estimate(believed, sure))
+    assert loose.verdict.cause is match.verdict.cause is RejectionReason.VERIFIED
     assert off(loose.T_map_body, truth) < 0.01
     assert off(fused, truth) > 0.003
-    assert off(found.T_map_body, truth) < 0.5 * off(fused, truth)
+    assert off(match.T_map_body, truth) < 0.5 * off(fused, truth)
 
 
 def test_match_covariance_does_not_depend_on_prior_covariance(world_map, world_drive, scan):
@@ -89,12 +89,12 @@ def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_driv
     """Ten metres above everything."""
     truth = world_drive.T_map_body[4]
     belief = Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
-    found = matched(world_map, scan, belief)
-    assert not found.verdict.verified
-    assert found.verdict.cause in (RejectionReason.GROUND, RejectionReason.FITNESS)
-    assert found.verdict.innovation is None
-    assert found.innovation == 0.0
-    np.testing.assert_array_equal(found.T_map_body, belief.T_map_body)
+    match = matched(world_map, scan, belief)
+    assert not match.verdict.verified
+    assert match.verdict.cause in (RejectionReason.GROUND, RejectionReason.FITNESS)
+    assert match.verdict.innovation is None
+    assert match.innovation == 0.0
+    np.testing.assert_array_equal(match.T_map_body, belief.T_map_body)
 
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
@@ -102,15 +102,15 @@ def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_driv
 def test_singular_prior_or_registration_is_rejected(world_map, world_drive, scan, bad, part, monkeypatch):
     truth = world_drive.T_map_body[4]
     if part == "prior":
-        found = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
+        match = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
     else:
         monkeypatch.setattr(map_matching, "register", lambda *given: register(*given)._replace(information=bad))
-        found = matched(world_map, scan, Estimate(truth, TIGHT))
-    assert (found.verdict.evidence is None) == (part == "prior")  # a registration's is as good as ever
-    assert found.verdict.cause is RejectionReason.FITNESS
-    assert found.verdict.reason.startswith("registration failed: ")
-    assert found.verdict.innovation is None
-    np.testing.assert_array_equal(found.T_map_body, truth)
+        match = matched(world_map, scan, Estimate(truth, TIGHT))
+    assert (match.verdict.evidence is None) == (part == "prior")  # a registration's is as good as ever
+    assert match.verdict.cause is RejectionReason.FITNESS
+    assert match.verdict.reason.startswith("registration failed: ")
+    assert match.verdict.innovation is None
+    np.testing.assert_array_equal(match.T_map_body, truth)
 
 
 def held(world_map, scan, belief):
@@ -170,30 +170,30 @@ def rivals(world_map, first_scan, off, count=1):
 def test_right_place_is_the_best_rival_of_one_beside_it(world_map, first_scan, off, count):
     """From where registration alone does not come there."""
     x, y, degrees = off
-    found, T, place = rivals(world_map, first_scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
+    match, T, place = rivals(world_map, first_scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
     alone = register(
         first_scan[0].cloud, T, LocalMaps(world_map, 50.0).around(first_scan[1][:3, 3]), CONFIG.registration, (1.0, 0.5)
     )
     assert alone is None or pose_error(alone.T_map_source @ first_scan[0].T_odom_body, first_scan[1])[0] > 0.5
-    metres, turn = pose_error(found[0].T_map_odom @ first_scan[0].T_odom_body, first_scan[1])
+    metres, turn = pose_error(match[0].T_map_odom @ first_scan[0].T_odom_body, first_scan[1])
     assert metres < 0.05
     assert turn < 0.3
-    assert found[0].ratio > place.observe(first_scan[0], T).ratio + 5.0
+    assert match[0].ratio > place.observe(first_scan[0], T).ratio + 5.0
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_right_place_has_no_rival_that_comes_near_it(world_map, first_scan, count):
-    found, T, place = rivals(world_map, first_scan, np.eye(4), count)
-    assert len(found) <= count
-    for rival in found:
+    match, T, place = rivals(world_map, first_scan, np.eye(4), count)
+    assert len(match) <= count
+    for rival in match:
         assert rival.ratio < place.observe(first_scan[0], T).ratio - 3.0
 
 
 def test_rivals_are_apart_and_the_most_probable_first(world_map, first_scan):
-    found, T, _ = rivals(world_map, first_scan, pose_from(np.eye(3), [1.5, 1.5, 0.0]), 3)
-    ratios = [rival.ratio for rival in found]
+    match, T, _ = rivals(world_map, first_scan, pose_from(np.eye(3), [1.5, 1.5, 0.0]), 3)
+    ratios = [rival.ratio for rival in match]
     assert ratios == sorted(ratios, reverse=True)
-    poses = [each @ first_scan[0].T_odom_body for each in (T, *(rival.T_map_odom for rival in found))]
+    poses = [each @ first_scan[0].T_odom_body for each in (T, *(rival.T_map_odom for rival in match))]
     for k, one in enumerate(poses):
         assert all(matters(*off_by(one, other)) for other in poses[:k])
 

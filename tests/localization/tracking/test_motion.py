@@ -53,8 +53,8 @@ def test_noise_rates_are_estimated(factor):
     nominal = Drift.of(CONFIG)
     true = Drift(*(factor * rate for rate in vars(nominal).values()))
     noise = NOISE * min(1.0, factor**2)
-    found = [list(vars(driven(true, seed=seed, noise=noise).drift).values()) for seed in range(10)]
-    np.testing.assert_allclose(np.mean(found, axis=0), list(vars(true).values()), rtol=0.2)
+    estimate = [list(vars(driven(true, seed=seed, noise=noise).drift).values()) for seed in range(10)]
+    np.testing.assert_allclose(np.mean(estimate, axis=0), list(vars(true).values()), rtol=0.2)
 
 
 def test_registration_noise_is_hardly_taken_for_odometry_noise():
@@ -62,19 +62,19 @@ def test_registration_noise_is_hardly_taken_for_odometry_noise():
     perfect, nominal = Drift(0.0, 0.0, 0.0, 0.0, 0.0), Drift.of(CONFIG)
     for scale in (0.1, 1.0, 10.0):
         sigma = np.sqrt(scale * NOISE)
-        found = driven(perfect, 200.0, noise=scale * NOISE).drift
-        assert found.tilt < max(0.9 * sigma[0], 0.35 * nominal.tilt)
-        assert found.yaw < max(0.9 * sigma[2], 0.35 * nominal.yaw)
-        assert found.position < max(0.9 * sigma[3], 0.35 * nominal.position)
+        estimate = driven(perfect, 200.0, noise=scale * NOISE).drift
+        assert estimate.tilt < max(0.9 * sigma[0], 0.35 * nominal.tilt)
+        assert estimate.yaw < max(0.9 * sigma[2], 0.35 * nominal.yaw)
+        assert estimate.position < max(0.9 * sigma[3], 0.35 * nominal.position)
 
 
 def test_each_noise_rate_is_estimated_independently():
     true = Drift(position=0.1, height=0.001, tilt=1e-4, yaw=0.01, turn=0.0)
-    found = driven(true, 200.0).drift
-    assert found.position == pytest.approx(0.1, rel=0.3)
-    assert found.yaw == pytest.approx(0.01, rel=0.3)
-    assert found.height < 0.35 * CONFIG.height_drift
-    assert found.tilt < 0.5 * CONFIG.tilt_drift
+    estimate = driven(true, 200.0).drift
+    assert estimate.position == pytest.approx(0.1, rel=0.3)
+    assert estimate.yaw == pytest.approx(0.01, rel=0.3)
+    assert estimate.height < 0.35 * CONFIG.height_drift
+    assert estimate.tilt < 0.5 * CONFIG.tilt_drift
 
 
 def test_noise_starts_at_configured_rates():

@@ -130,9 +130,9 @@ def test_place_holds_against_the_better_of_chance_and_its_rival():
 
 def test_ratios_are_those_of_observations_around_the_first(world_map, place, scans):
     poses = np.stack([T_MAP_ODOM, moved(scans[1], 2.0)])
-    found = place.ratios(scans[1], poses)
-    assert found[0] == pytest.approx(place.observe(scans[1], T_MAP_ODOM).ratio)
-    assert found[1] < found[0]
-    np.testing.assert_array_equal(place.ratios(scans[1], poses), found)
+    result = place.ratios(scans[1], poses)
+    assert result[0] == pytest.approx(place.observe(scans[1], T_MAP_ODOM).ratio)
+    assert result[1] < result[0]
+    np.testing.assert_array_equal(place.ratios(scans[1], poses), result)
     other = place.ratios(scans[2], poses)  # another scan is not taken for the newest
     np.testing.assert_array_equal(PlaceEvidence(world_map).ratios(scans[2], poses), other)

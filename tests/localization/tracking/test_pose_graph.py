@@ -225,11 +225,11 @@ def test_newest_pose_equals_dense_solution(graph):
     way = drive(8, seed=2, every=2)
     way.seen[4] = boxplus(way.seen[4], np.array([0, 0, 0, 3.0, -2.0, 1.0]))
     T, covariance = dense(way)
-    found = run(graph, way, LOPSIDED_STEP, LOPSIDED_MATCH, LOPSIDED_START)[-1]
-    gap = np.abs(boxminus(found.T_map_body, T))
+    solution = run(graph, way, LOPSIDED_STEP, LOPSIDED_MATCH, LOPSIDED_START)[-1]
+    gap = np.abs(boxminus(solution.T_map_body, T))
     assert gap[:3].max() < 5e-4
     assert gap[3:].max() < 2e-3
-    assert relative(found.covariance, covariance) < 0.02
+    assert relative(solution.covariance, covariance) < 0.02
 
 
 # ---- the window
@@ -273,14 +273,14 @@ def test_long_drive_equals_unbounded_graph():
     """To a hundredth of a sigma and a millimetre, and memory does not grow."""
     way = drive(2000, seed=6, every=10, outliers=0.05)
     pose_graph = PoseGraph()
-    found, full = run(pose_graph, way), full_isam2(way)
-    gaps = np.abs([boxminus(e.T_map_body, T) for e, (T, _) in zip(found, full, strict=True)])
+    solution, full = run(pose_graph, way), full_isam2(way)
+    gaps = np.abs([boxminus(e.T_map_body, T) for e, (T, _) in zip(solution, full, strict=True)])
     sigmas = np.sqrt([np.diag(C) for _, C in full])
     assert (gaps / sigmas).max() < 0.01
     assert gaps[:, 3:].max() < 1e-3
-    covariances = np.array([np.diag(e.covariance) for e in found])
+    covariances = np.array([np.diag(e.covariance) for e in solution])
     assert np.abs(np.sqrt(covariances) / sigmas - 1.0).max() < 0.01
-    assert shift_errors(found, way.truth)[100:].mean() < 0.15
+    assert shift_errors(solution, way.truth)[100:].mean() < 0.15
     assert pose_graph.config.window <= len(pose_graph) <= pose_graph.config.restart
-    R = found[-1].T_map_body[:3, :3]
+    R = solution[-1].T_map_body[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)

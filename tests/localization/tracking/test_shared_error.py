@@ -39,10 +39,10 @@ def street(rng, off):
 def registered(seed, off):
     """Error (6,) of a registration, its clustered covariance, and the inverse Hessian's."""
     source, target = street(np.random.default_rng(seed), off)
-    found = register(source, np.eye(4), target, CONFIG, CONFIG.track, centre=PIVOT)
-    T_body = found.T_map_source @ pose_from(np.eye(3), PIVOT)
-    spread = clustered_covariance(source, found.T_map_source, target, PIVOT, CONFIG)
-    return boxminus(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(found.information)
+    fit = register(source, np.eye(4), target, CONFIG, CONFIG.track, centre=PIVOT)
+    T_body = fit.T_map_source @ pose_from(np.eye(3), PIVOT)
+    spread = clustered_covariance(source, fit.T_map_source, target, PIVOT, CONFIG)
+    return boxminus(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(fit.information)
 
 
 def nees(errors, covariances):

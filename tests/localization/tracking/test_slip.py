@@ -46,8 +46,8 @@ def at(metres):
 
 def settled(dispute, scan, seen, travelled):
     """Metres along x of the place that must be right; odometry leads to 0."""
-    found = dispute.settle(scan, at(0.0), [at(x) for x in seen], travelled, RISK)
-    return None if found is None else float(found[0, 3])
+    winner = dispute.settle(scan, at(0.0), [at(x) for x in seen], travelled, RISK)
+    return None if winner is None else float(winner[0, 3])
 
 
 def test_place_that_explains_the_scan_wins_and_the_other_way_round_loses(world_map, scan):
@@ -57,10 +57,10 @@ def test_place_that_explains_the_scan_wins_and_the_other_way_round_loses(world_m
     ratio = other - here
     assert ratio > 10.0
     for risk, slipped in ((1e-4, True), (1.01 * np.exp(-ratio), True), (0.99 * np.exp(-ratio), False)):
-        found = Dispute(place, 1.0).settle(seen, away, [truth], 0.0, risk)
-        assert (found is not None) == slipped
+        winner = Dispute(place, 1.0).settle(seen, away, [truth], 0.0, risk)
+        assert (winner is not None) == slipped
         if slipped:
-            np.testing.assert_allclose(found, truth, atol=1e-9)
+            np.testing.assert_allclose(winner, truth, atol=1e-9)
         assert Dispute(place, 1.0).settle(seen, truth, [away], 0.0, risk) is None
 
 

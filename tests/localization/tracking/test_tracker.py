@@ -266,10 +266,10 @@ def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     assert verdict.cause is RejectionReason.ODOMETRY
     assert not verdict.verified
     assert verdict.innovation > RULE.max_innovation
-    told = [float(word) for word in verdict.reason.split() if word[0].isdigit()]
+    numbers = [float(word) for word in verdict.reason.split() if word[0].isdigit()]
     # by the new way's end a wrong heading is a wrong place, too
-    assert told[0] == pytest.approx(metres, abs=0.03 + 0.2 * np.radians(degrees))
-    assert told[1] == pytest.approx(degrees, abs=0.2)
+    assert numbers[0] == pytest.approx(metres, abs=0.03 + 0.2 * np.radians(degrees))
+    assert numbers[1] == pytest.approx(degrees, abs=0.2)
     assert verdict.score > 0.8
     assert ride.error(truth[k])[0] < 0.03
     # it was hardly drift: far outside what drift allows, it counts as a step at the edge of that

@@ -42,8 +42,8 @@ def test_no_registration_is_needed_while_standing(world_map):
 
 @pytest.mark.parametrize(("patience", "metres"), [(1.0, 1.5), (3.0, 4.5)])
 def test_registration_is_needed_after_distance_and_later_when_deferred(world_map, patience, metres):
-    found = steps_until_due(world_map, straight(0.02, 300), patience, distance=1.5)
-    assert 0.02 * found == pytest.approx(metres, abs=0.021)
+    steps = steps_until_due(world_map, straight(0.02, 300), patience, distance=1.5)
+    assert 0.02 * steps == pytest.approx(metres, abs=0.021)
 
 
 def test_back_and_forth_driving_adds_up(world_map):
@@ -70,8 +70,8 @@ def test_turning_needs_registration_and_back_and_forth_adds_up(world_map):
 )
 def test_noisy_odometry_needs_registration_earlier_but_not_at_once(world_map, bad, metres):
     settings = {"distance": 1.0, "min_distance": 0.2, **bad}
-    found = steps_until_due(world_map, straight(0.01), **settings)
-    assert 0.01 * found == pytest.approx(metres, abs=0.0101)
+    steps = steps_until_due(world_map, straight(0.01), **settings)
+    assert 0.01 * steps == pytest.approx(metres, abs=0.0101)
     late = steps_until_due(world_map, straight(0.05), 3.0, **settings)
     if metres == 0.75**2:
         assert 0.05 * late == pytest.approx(3.0, abs=0.0501)  # 9 x 0.56 m would be later than the thrice 1 m

@@ -129,9 +129,9 @@ def test_true_station_and_shift_score_best(planted, known, stations, xy, shift):
     yaw = -2 * np.pi * shift / SECTORS
     vote = known.vote(planted.seen(xy, yaw, np.array([4.0, -7.0, 1.0])))
     scores = scores_of(vote, stations)
-    station, found = np.unravel_index(scores.argmin(), scores.shape)
+    station, result = np.unravel_index(scores.argmin(), scores.shape)
     np.testing.assert_allclose(stations[station, :2], xy)
-    assert found == shift
+    assert result == shift
     named, shifts = vote.candidates()
     assert (named[0], shifts[0]) == (station, shift)
     assert len(named) >= 64
@@ -313,16 +313,16 @@ def named(heights, peaks=5):
 def test_each_storey_is_a_hypothesis(gap):
     """At 3 m the consensus takes both for one place, at 8 m for two."""
     (single, *_), _ = named([0.0])
-    found, stations = named([0.0, gap])
-    at = [transform(each.T_map_odom, np.zeros((1, 3)))[0] for each in found]
+    result, stations = named([0.0, gap])
+    at = [transform(each.T_map_odom, np.zeros((1, 3)))[0] for each in result]
     assert [tuple(xy) for xy in np.round(at, 3)[:2, :2].tolist()] == [HERE, HERE]
     assert sorted(round(z, 3) for _, _, z in at[:2]) == [0.0, gap]
-    for each, place in zip(found[:4], at, strict=False):
+    for each, place in zip(result[:4], at, strict=False):
         np.testing.assert_allclose(stations[each.station], place, atol=1e-5)
         assert each.shift == SHIFT
         assert each.learned
-    assert [each.score for each in found[:2]] == pytest.approx([single.score] * 2, rel=0.01)
-    assert len({(each.station, each.shift) for each in found}) == len(found)
+    assert [each.score for each in result[:2]] == pytest.approx([single.score] * 2, rel=0.01)
+    assert len({(each.station, each.shift) for each in result}) == len(result)
 
 
 def test_storey_hypotheses_are_bounded():
