@@ -96,28 +96,23 @@ def tail(sample: Sample, part: int) -> tuple[float, float]:
     return float(np.exp(best[0])), float(np.clip(np.exp(best[1]), _HEAVIEST, _LIGHTEST))
 
 
-class Beyond(NamedTuple):
-    """One time that poses were given beyond the alert limit: how long until they were withdrawn or right again."""
+def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[tuple[float, float]]:
+    """Return for each time beyond the alert limit the seconds and metres until its poses were withdrawn or right.
 
-    seconds: float
-    metres: float
-
-    @property
-    def misleading(self) -> bool:
-        """Whether that took longer, or led further, than allowed."""
-        return self.seconds > TO_ALERT[0] or self.metres > TO_ALERT[1]
-
-
-def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[Beyond]:
-    """Return the times that poses were given beyond the alert limit; (N,) metres ``driven`` at each frame."""
+    Of (N,) metres ``driven`` at each frame.
+    """
     beyond = track.tracking & ((error.metres > ALERT_METRES) | (error.degrees > ALERT_DEGREES))
     edges = np.diff(np.r_[False, beyond, False].astype(int))
     out = []
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
         last = min(end, len(driven) - 1)  # where it is withdrawn, or the drive's end
-        seconds, metres = track.stamps[last] - track.stamps[begin], driven[last] - driven[begin]
-        out.append(Beyond(float(seconds), float(metres)))
+        out.append((float(track.stamps[last] - track.stamps[begin]), float(driven[last] - driven[begin])))
     return out
+
+
+def misleading(beyond: list[tuple[float, float]]) -> int:
+    """Count the times that took longer, or led further, than :data:`TO_ALERT` allows."""
+    return sum(seconds > TO_ALERT[0] or metres > TO_ALERT[1] for seconds, metres in beyond)
 
 
 def level_table(samples: Mapping[str, Sample]) -> str:
@@ -208,7 +203,7 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
         error = errors(track, drive.truth)
         sample = Sample.of(track, error, drive.driven)
         about = {"kind": world.kind, "variant": variant, "driven_m": float(drive.driven[-1])}
-        about["misleading"] = sum(each.misleading for each in beyond_alert_limit(track, error, drive.driven))
+        about["misleading"] = misleading(beyond_alert_limit(track, error, drive.driven))
         return about | {"sample": sample.to_json()}
 
     return remembered(below / "protection-results" / f"{world.name}-{variant}.json", spec, work)
