@@ -53,18 +53,19 @@ def rows(asked: Namespace) -> Iterator[Row]:
     endpoint = f"tcp/127.0.0.1:{port}"
     router = Helper(route, port)
     words = ("--no-state", "--fleet", "bench", "--robot", *names, "--connect", endpoint)
+    recorder = Recorder(endpoint)
     nodes: list[Node] = []
-    with Recorder(endpoint) as recorder:
-        try:
-            nodes += [Node(site, folder() / f"fleet{k}.log", *words) for k in range(NODES)]
-            if not wait_until(lambda: all(map(recorder.alive, names)), _READY):
-                raise RuntimeError(f"the nodes did not announce all robots; see {nodes[0].log}")
-            time.sleep(_SETTLE)
-            yield from _play(recorder, nodes, world, names, clouds, 10.0 if asked.quick else 20.0)
-        finally:
-            for node in nodes:
-                _kill(node)
-            router.kill()
+    try:
+        nodes += [Node(site, folder() / f"fleet{k}.log", *words) for k in range(NODES)]
+        if not wait_until(lambda: all(map(recorder.alive, names)), _READY):
+            raise RuntimeError(f"the nodes did not announce all robots; see {nodes[0].log}")
+        time.sleep(_SETTLE)
+        yield from _play(recorder, nodes, world, names, clouds, 10.0 if asked.quick else 20.0)
+    finally:
+        for node in nodes:
+            _kill(node)
+        recorder.session.close()
+        router.kill()
 
 
 def _play(

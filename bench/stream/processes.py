@@ -283,12 +283,6 @@ class Recorder:
         self._held = [self.session.declare_subscriber(key, direct) for key in ("coview/*/out/*", METRONOME, *keys)]
         self._held.append(self.session.liveliness().declare_subscriber("coview/*/alive", token, history=True))
 
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.session.close()
-
     def _of(self, key: str, begin: float, end: float) -> list[tuple[float, str, bytes, str]]:
         return [row for row in self.arrived.copy() if row[1] == key and begin <= row[0] < end]
 
