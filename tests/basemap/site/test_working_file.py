@@ -8,7 +8,6 @@ import pytest
 from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
-from coview_stream.basemap.site.assemble import PARAMETER
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import earlier_file, working_file
@@ -95,11 +94,3 @@ def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
     assert earlier_file(site) != first
     next((cache / "parts").glob("*.last")).write_text('"../../elsewhere.coview"')
     assert earlier_file(site) is None
-
-
-def test_parameters_name_the_tiles(site, cache):
-    loaded = file_format.open_file(working_file(site))
-    rows = loaded.parameters[PARAMETER]
-    assert len({state for state, *_ in rows}) == len(rows) == 4
-    assert sum(count for _, _, count, _, _ in rows) == len(loaded.arrays["stations"])
-    assert sum(count for *_, count in rows) == len(loaded.arrays["field.tiles"])
