@@ -53,7 +53,7 @@ class RegistrationConfig:
     Points above the ground and points on it are trimmed apart, else the ground, which fits anywhere, pushes out the
     facades that fix the position (once on KITTI 04: 0.25 m median error against 0.05 m).
 
-    ``inflation``, the floors and the ``shared`` sigmas are calibrated by ``python -m bench tracking --seeds 5100``: how
+    ``inflation`` and ``shared`` are calibrated by ``python -m bench tracking --seeds 5100``: how
     often the truth lies within 1, 2 and 3 sigma. A real map's own error comes on top. The rest is set by hand.
 
     Attributes:
@@ -66,20 +66,10 @@ class RegistrationConfig:
         source_voxel: metres; one point of the scan is kept in each cube of this size.
         source_points: at most so many of them, chosen at random.
         source_range: metres from the sensor within which the scan's points are used.
-        residual_scale: width of the Cauchy weights on the last scale, metres; of trimmed ICP alone.
         inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
-        sigma_floor: metres, added to the sigma that registration claims of each position.
-        sigma_floor_angle: radians, likewise of each angle.
         shared: times the clustered sigma of the error that neighbouring registrations have in common, because a
             scanned map's points lie off its surfaces.
-        shared_position: metres of x and of y of that error which the pairs do not show.
-        shared_height: metres of z, likewise.
-        shared_tilt: radians of roll and of pitch, likewise.
-        shared_yaw: radians of the heading, likewise.
         gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
-        weak_lever: metres; an angle counts like the shift that it makes at this distance.
-        weak_from: metres; a direction that is known less well is one that the map hardly shows: its sigma is widened.
-        weak_sigma: metres, the largest sigma that this gives.
     """
 
     method: RegistrationMethod = "trimmed-icp"
@@ -90,19 +80,9 @@ class RegistrationConfig:
     source_voxel: float = 0.5
     source_points: int = 5000
     source_range: float = 50.0
-    residual_scale: float = 0.1
     inflation: float = 3.0
-    sigma_floor: float = 0.002
-    sigma_floor_angle: float = math.radians(0.004)
     shared: float = 1.3
-    shared_position: float = 0.001
-    shared_height: float = 0.001
-    shared_tilt: float = math.radians(0.03)
-    shared_yaw: float = math.radians(0.001)
     gravity_sigma: float = math.radians(1.0)
-    weak_lever: float = 10.0
-    weak_from: float = 0.05
-    weak_sigma: float = 10.0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -218,9 +198,6 @@ class TrackingConfig:
     Attributes:
         distance: metres driven.
         seconds: of sensor time.
-        min_distance: metres; no uncertainty makes a registration due before.
-        max_position_sigma: metres by which odometry may have drifted, each of x and y.
-        max_yaw_sigma: radians, likewise.
         window: metres; no frame older than this is added once there are ``min_points``.
         min_points: see above.
         max_points: no frame is added once there are so many.
@@ -231,14 +208,10 @@ class TrackingConfig:
         yaw_drift: radians.
         turn_drift: radians of yaw per radian turned.
         drift_prior: metres of driving that these rates count like beside the measured ones.
-        drift_memory: metres over which measured drift is forgotten.
     """
 
     distance: float = 1.0
     seconds: float = 1.0
-    min_distance: float = 0.3
-    max_position_sigma: float = 0.03
-    max_yaw_sigma: float = math.radians(0.2)
     window: float = 0.01
     min_points: int = 2500
     max_points: int = 50_000
@@ -249,7 +222,6 @@ class TrackingConfig:
     yaw_drift: float = math.radians(0.15)
     turn_drift: float = 0.02
     drift_prior: float = 6.0
-    drift_memory: float = 40.0
 
     def __post_init__(self) -> None:
         check_types(self)

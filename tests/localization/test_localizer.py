@@ -17,12 +17,13 @@ from small_world import pose_error
 from trackers import follow, garbage
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, RegistrationConfig
+from coview_stream.config import AcceptanceConfig
 from coview_stream.errors import CloudError, ConfigError, InputError, MapError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import State
+from coview_stream.localization.tracking.shared_error import UNCLUSTERED
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
@@ -68,12 +69,10 @@ def test_covariance_is_symmetric_positive_and_translation_first(world_fixes):
     assert np.linalg.eigvalsh(covariance).min() > 0
     sigma = np.sqrt(np.diag(covariance))
     # metres come first: millimetres to decimetres; then radians: tenths of a degree; map points lie off their surfaces
-    shared = RegistrationConfig()
-    assert (sigma[:2] > shared.shared_position).all()
-    assert sigma[2] > shared.shared_height
+    assert (sigma[:3] > UNCLUSTERED[3:]).all()
     assert (sigma[:3] < 0.3).all()
     assert (sigma[3:] < np.radians(1.0)).all()
-    assert (sigma[3:] > shared.shared_yaw).all()
+    assert (sigma[3:] > UNCLUSTERED[2]).all()
 
 
 def test_confidence_is_the_probability_that_the_search_found(world_fixes):

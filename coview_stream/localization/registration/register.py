@@ -18,6 +18,19 @@ from coview_stream.geometry.transforms import Pose, boxminus, boxplus, skew
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
+RESIDUAL_SCALE = 0.1
+"""Metres: width of the Cauchy weights on the last scale of trimmed ICP."""
+
+# calibrated on the simulated drives of `python -m bench tracking --seeds 5100`, as RegistrationConfig.inflation
+SIGMA_FLOOR = np.array([np.radians(0.004)] * 3 + [0.002] * 3)
+"""Sigmas (6,) over (rx, ry, rz, x, y, z) that are added to each registration: radians, metres."""
+WEAK_FROM = 0.05
+"""Metres: the map hardly shows a direction of a larger sigma, which is widened."""
+WEAK_SIGMA = 10.0
+"""Metres: the sigma of a direction without any information."""
+WEAK_LEVER = 10.0
+"""Metres: an angle counts as the shift that it makes at this distance."""
+
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _MIN_SHARE = 0.01  # least share of the information on a direction; below it the minimum of the pairs is noise
 _STOP_SHIFT = 2e-3  # metres: below the map's noise, and the next step would be a third of it
@@ -63,7 +76,7 @@ def register(
     steps = [
         kernels.Scale(
             scale,
-            max(config.residual_scale, _WIDTH_SHARE * scale),
+            max(RESIDUAL_SCALE, _WIDTH_SHARE * scale),
             _STOP_SHIFT if k == last else max(_STOP_SHIFT, _COARSE_SHIFT * scale),
             _STOP_TURN if k == last else max(_STOP_TURN, _COARSE_TURN * scale),
             1 if k == last else stride,
@@ -136,13 +149,13 @@ def registration_covariance(information: Floats, config: RegistrationConfig) -> 
 
     The inverse Hessian is optimistic, as neighbouring points are not independent: its sigma is multiplied by
     ``inflation``. Where the map hardly shows a direction (along a tunnel, on a bare field) the Hessian comes from noise
-    in the normals. In comparable units, metres and metres at a lever arm of ``weak_lever``, a direction's sigma s
-    becomes s sqrt(1 + (s / w)^2), w = ``weak_from``: it stays well below w, and grows with its square far above, up to
-    ``weak_sigma``, the sigma without any information. Finally ``sigma_floor`` and ``sigma_floor_angle`` are added.
+    in the normals. In comparable units, metres and metres at a lever arm of ``WEAK_LEVER``, a direction's sigma s
+    becomes s sqrt(1 + (s / w)^2), w = ``WEAK_FROM``: it stays well below w, and grows with its square far above, up to
+    ``WEAK_SIGMA``, the sigma without any information. Finally ``SIGMA_FLOOR`` is added.
 
     Args:
         information: (6, 6) of the pairs alone (:func:`remove_prior`), before inflation.
-        config: inflation, floors, and the limits of weak directions.
+        config: its inflation.
 
     Raises:
         InputError: ``information`` is not a finite (6, 6) matrix.
@@ -150,15 +163,14 @@ def registration_covariance(information: Floats, config: RegistrationConfig) -> 
     A = np.asarray(information, dtype=np.float64)
     if A.shape != (6, 6) or not np.isfinite(A).all():
         raise InputError(f"information has shape {A.shape} or is not finite; expected (6, 6)")
-    unit = np.array([1.0 / config.weak_lever] * 3 + [1.0] * 3)  # radians that move by a metre, metres
+    unit = np.array([1.0 / WEAK_LEVER] * 3 + [1.0] * 3)  # radians that move by a metre, metres
     balanced = unit[:, None] * (0.5 * (A + A.T)) * unit / config.inflation**2
     strength, directions = np.linalg.eigh(balanced)
-    widest = config.weak_sigma**2
+    widest = WEAK_SIGMA**2
     variance = 1.0 / np.maximum(strength, 1.0 / widest)
-    variance = np.minimum(variance * (1.0 + variance / config.weak_from**2), widest)
+    variance = np.minimum(variance * (1.0 + variance / WEAK_FROM**2), widest)
     spread = unit[:, None] * directions
-    floor = np.array([config.sigma_floor_angle] * 3 + [config.sigma_floor] * 3) ** 2
-    return np.asarray((spread * variance) @ spread.T + np.diag(floor))
+    return np.asarray((spread * variance) @ spread.T + np.diag(SIGMA_FLOOR**2))
 
 
 def propagate(covariance: Floats, shift: Floats) -> Floats:

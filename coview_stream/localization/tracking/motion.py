@@ -25,6 +25,7 @@ _OWN_NOISE = 0.4  # independent share of two neighbouring registrations' varianc
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
 _MIN_FACTOR = 0.3  # of the configured rates
 _MAX_FACTOR = 20.0  # likewise: a scale error is no random walk, and looks like a high rate
+_MEMORY = 40.0  # metres over which measured drift is forgotten
 _OUTLIER = 16.0  # variances; a larger slip counts as this, as rates should grow step by step
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
@@ -66,7 +67,6 @@ class DriftEstimator:
     """Estimator of the drift's rates: a prior at the configured ones, and measurements that fade by the metre."""
 
     def __init__(self, config: TrackingConfig) -> None:
-        self._config = config
         self._nominal = Drift.of(config)
         self._metres = np.full(len(_GROUPS), config.drift_prior)
         self._sums = self._metres.copy()
@@ -99,7 +99,7 @@ class DriftEstimator:
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
             # a registration with a large variance in a direction hardly informs its drift
             weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
-            fade = exp(-weight / self._config.drift_memory)
+            fade = exp(-weight / _MEMORY)
             ratio = float((squares[rows] / nominal[rows]).mean())
             self._sums[group] = fade * self._sums[group] + weight * ratio
             self._metres[group] = fade * self._metres[group] + weight

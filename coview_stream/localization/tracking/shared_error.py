@@ -16,6 +16,13 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.register import RESIDUAL_SCALE
+
+UNCLUSTERED = np.array([*np.radians([0.03, 0.03, 0.001]), 0.001, 0.001, 0.001])
+"""Sigmas (6,) over (rx, ry, rz, x, y, z) of the shared error that the pairs do not show: radians, metres.
+
+Calibrated on the simulated drives of ``python -m bench tracking --seeds 5100``.
+"""
 
 _CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 give similar results
 _EVERY = 2  # of the points: more change nothing
@@ -47,11 +54,8 @@ class SharedErrorModel:
 
         The main one of these: odometry's roll and pitch tremble from frame to frame.
         """
-        c = self._config
-        tilt, position = c.shared_tilt, c.shared_position
-        rest = np.square([tilt, tilt, c.shared_yaw, position, position, c.shared_height])
         clustered = np.zeros((6, 6)) if self._clustered is None else self._clustered
-        return np.asarray(c.shared**2 * clustered + np.diag(rest))
+        return np.asarray(self._config.shared**2 * clustered + np.diag(UNCLUSTERED**2))
 
 
 def clustered_covariance(
@@ -71,7 +75,7 @@ def clustered_covariance(
     chosen = np.flatnonzero(weights)
     gap, (n, planarity) = moved[chosen] - target.points[partner[chosen]], target.planes(partner[chosen])
     residual = np.einsum("ij,ij->i", gap, n).astype(np.float64)
-    weight = weights[chosen] * planarity / (1.0 + (residual / config.residual_scale) ** 2)
+    weight = weights[chosen] * planarity / (1.0 + (residual / RESIDUAL_SCALE) ** 2)
     arm = moved[chosen] - transform(T_map_source, pivot[None])[0].astype(np.float32)
     J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
     cell = np.floor(moved[chosen, :2] / _CELL).astype(np.int64)  # structure apart from ground
@@ -82,7 +86,7 @@ def clustered_covariance(
     gradient = J * (weight * residual)[:, None]
     A = (J * weight[:, None]).T @ J + 1e-6 * np.eye(6)
     loose = weights[chosen] * (1.0 - planarity)
-    loose /= kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / config.residual_scale**2
+    loose /= kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / RESIDUAL_SCALE**2
     for axis in np.eye(3, dtype=np.float32):  # points without a surface constrain all three directions
         J = np.concatenate([np.cross(arm, axis), np.broadcast_to(axis, arm.shape)], axis=1).astype(np.float64)
         gradient += J * (loose * (gap @ axis))[:, None]

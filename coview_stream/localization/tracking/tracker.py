@@ -31,6 +31,9 @@ from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
+_MIN_DISTANCE = 0.3  # metres; no uncertainty needs a registration sooner
+_MAX_SIGMA = 0.03  # metres of odometry's drift in x and in y that need a registration
+_MAX_YAW_SIGMA = math.radians(0.2)  # likewise of its heading
 _STANDING_DRIVE = 0.2  # metres of driving that standing still until the next registration counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 """Covariance of a place that the search has accepted and whose registration may not have converged."""
@@ -93,11 +96,10 @@ class Tracker:
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
             return True
-        if driven < patience * settings.min_distance:
+        if driven < patience * _MIN_DISTANCE:
             return False
         variances = self.odometry.drift.variances(driven, turned)
-        yaw, position = patience * settings.max_yaw_sigma, patience * settings.max_position_sigma
-        return bool(variances[2] > yaw**2 or variances[3] > position**2)
+        return bool(variances[2] > (patience * _MAX_YAW_SIGMA) ** 2 or variances[3] > (patience * _MAX_SIGMA) ** 2)
 
     def looks_displaced(self, T_odom_body: Pose) -> bool:
         """Whether the newest frame fits the map so much less than usual that it needs a registration."""

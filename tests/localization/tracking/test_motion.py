@@ -20,7 +20,6 @@ CONFIG = TrackingConfig(
     yaw_drift=np.radians(0.15),
     turn_drift=0.02,
     drift_prior=10.0,
-    drift_memory=40.0,
 )
 NOISE = np.square([3e-4, 3e-4, 2e-4, 0.004, 0.004, 0.002])
 RATES = Drift(position=0.1, height=0.05, tilt=0.01, yaw=0.02, turn=0.05)

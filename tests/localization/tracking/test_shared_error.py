@@ -10,7 +10,7 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import boxminus, pose_from
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.register import register
-from coview_stream.localization.tracking.shared_error import SharedErrorModel, clustered_covariance
+from coview_stream.localization.tracking.shared_error import UNCLUSTERED, SharedErrorModel, clustered_covariance
 
 CONFIG = RegistrationConfig()
 PIVOT = np.array([0.0, 0.0, 1.5])
@@ -72,10 +72,8 @@ def test_too_few_clusters_give_no_covariance():
 
 
 def test_shared_error_is_scaled_recent_covariance_plus_floor():
-    config = RegistrationConfig(
-        shared=2.0, shared_position=0.03, shared_height=0.02, shared_tilt=0.002, shared_yaw=0.001
-    )
-    rest = np.square([0.002, 0.002, 0.001, 0.03, 0.03, 0.02])
+    config = RegistrationConfig(shared=2.0)
+    rest = UNCLUSTERED**2
     shared = SharedErrorModel(config)
     np.testing.assert_allclose(shared.covariance, np.diag(rest))
     source, target = street(np.random.default_rng(0), 0.03)

@@ -61,15 +61,15 @@ def test_turning_needs_registration_and_back_and_forth_adds_up(world_map):
 @pytest.mark.parametrize(
     ("bad", "metres"),
     [
-        ({"position_drift": 0.04, "max_position_sigma": 0.03}, 0.75**2),
-        ({"yaw_drift": 0.004, "max_yaw_sigma": 0.003}, 0.75**2),
-        ({"position_drift": 0.4, "max_position_sigma": 0.03, "min_distance": 0.25}, 0.25),
-        ({"yaw_drift": 0.4, "max_yaw_sigma": 0.003, "min_distance": 0.25}, 0.25),
-        ({"position_drift": 0.01, "max_position_sigma": 0.03}, 1.0),
+        ({"position_drift": 0.04}, 0.75**2),
+        ({"yaw_drift": np.radians(0.2) / 0.75}, 0.75**2),
+        ({"position_drift": 0.4}, 0.3),
+        ({"yaw_drift": 0.4}, 0.3),
+        ({"position_drift": 0.01}, 1.0),
     ],
 )
 def test_noisy_odometry_needs_registration_earlier_but_not_at_once(world_map, bad, metres):
-    settings = {"distance": 1.0, "min_distance": 0.2, **bad}
+    settings = {"distance": 1.0, **bad}
     steps = steps_until_due(world_map, straight(0.01), **settings)
     assert 0.01 * steps == pytest.approx(metres, abs=0.0101)
     late = steps_until_due(world_map, straight(0.05), 3.0, **settings)
