@@ -53,7 +53,7 @@ BENCHMARKS = {
     "city": Benchmark("speed.city", "a city of 4 km2 as a directory: build, open, find robots, memory"),
     "start": Benchmark("speed.start", "import, first run, ready to serve", _ANY),
     "peers": Benchmark("peers.peers", "other libraries on the same queries", _ANY),
-    "accuracy": Benchmark("accuracy.accuracy", "errors, runs localised and false fixes in held-out worlds"),
+    "accuracy": Benchmark("accuracy.accuracy", "errors, runs localized and false fixes in held-out worlds"),
     "conditions": Benchmark("accuracy.conditions", "real runs: leaning sensor, bad odometry, airborne-like maps"),
     "odometry": Benchmark("accuracy.odometry", "lidar odometry of whole runs: jitter in roll and pitch, lean, steps"),
     "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),

@@ -13,13 +13,16 @@ import enum
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import coview_stream
 from coview_stream import config
 from coview_stream.cli import PROGRAM, build_parser
 from coview_stream.cli.options import documented_fields, role_free
+from coview_stream.cli.serve import NOT_IN_TABLES, TABLES
+from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
 
 HERE = Path(__file__).resolve().parent
 _NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
@@ -33,6 +36,12 @@ def cell(text: str) -> str:
 def code(text: str) -> str:
     """Return a text as code in a cell of a table."""
     return f"`{text}`".replace("|", "\\|") if text else ""
+
+
+def table_of(titles: str, rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table; ``titles`` are parted by bars."""
+    lines = [f"|{titles}|", "|---" * (titles.count("|") + 1) + "|", *(f"|{'|'.join(row)}|" for row in rows)]
+    return "\n".join(lines)
 
 
 def options_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str, str]]:
@@ -53,21 +62,22 @@ def options_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str, str]
 
 def commands() -> Iterator[str]:
     """Yield a section for each command, and one for the options that several commands share."""
-    found = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    parsers = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
     users: dict[tuple[str, str, str], list[str]] = {}
-    for name, parser in found.choices.items():
+    for name, parser in parsers.items():
         for option in options_of(parser):
             users.setdefault(option, []).append(name)
-    common = {option for option, by in users.items() if len(by) > 1 and option[2] != "likewise"}
-    for name, parser in found.choices.items():
-        rows = [option for option, by in users.items() if name in by]
-        own = [f"| {written} | {text} |" for option, written, text in rows if (option, written, text) not in common]
+    common = {option for option, by in users.items() if len(by) > 1}
+    for name, parser in parsers.items():
+        rows = list(options_of(parser))
+        table = "\n\n" + table_of("|", (option[1:] for option in rows if option not in common))
+        table = "" if common.issuperset(rows) else table
         shared = [code(option[0]) for option in rows if option in common]
-        table = "\n\n| | |\n|---|---|\n" + "\n".join(own) if own else ""
-        also = "\n\n" + textwrap.fill(f"[Shared](#shared-options): {', '.join(shared)}", 118) if shared else ""
+        line = textwrap.fill(f"[Shared](#shared-options): {', '.join(shared)}", 118, break_on_hyphens=False)
+        also = f"\n\n{line}" if shared else ""
         yield f"## {PROGRAM} {name}\n\n{cell(parser.description or '')}{table}{also}"
-    table = [f"| {option[1]} | {option[2]} | {', '.join(by)} |" for option, by in users.items() if option in common]
-    yield "## Shared options\n\n| | | commands |\n|---|---|---|\n" + "\n".join(table)
+    table = table_of("||commands", ((*option[1:], ", ".join(by)) for option, by in users.items() if option in common))
+    yield f"## Shared options\n\n{table}"
 
 
 def default_of(field: dataclasses.Field[object]) -> str:
@@ -84,19 +94,29 @@ def default_of(field: dataclasses.Field[object]) -> str:
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
 
 
+def tables_of(name: str, value: object) -> dict[type, str]:
+    """Return the table of ``serve --config`` for a configuration, and those for its fields that are configurations."""
+    tables = {type(value): name}
+    for field in dataclasses.fields(value):
+        if dataclasses.is_dataclass(inner := getattr(value, field.name)) and field.name not in NOT_IN_TABLES:
+            tables |= tables_of(f"{name}.{field.name}", inner)
+    return tables
+
+
 def settings() -> Iterator[str]:
     """Yield a section for each configuration class."""
-    for name in config.__all__:
-        kind = getattr(config, name)
-        if not dataclasses.is_dataclass(kind):
-            continue
+    values = {"node": NodeConfig(), "localizer": config.LocalizerConfig(), "lidar_odometry": LidarOdometryConfig()}
+    tables = {kind: table for name in TABLES for kind, table in tables_of(name, values[name]).items()}
+    public = {kind for name in config.__all__ if dataclasses.is_dataclass(kind := getattr(config, name))}
+    for kind in sorted(public | set(tables), key=lambda kind: kind.__name__):
         texts = documented_fields(kind)
-        rows = [
-            f"| `{f.name}` | {code(default_of(f))} | {role_free(cell(texts.get(f.name, '')))} |"
+        rows = (
+            (code(f.name), code(default_of(f)), role_free(cell(texts.get(f.name, ""))))
             for f in dataclasses.fields(kind)
-        ]
+        )
         first = role_free(" ".join(inspect.getdoc(kind).split("\n\n")[0].split()))
-        yield f"### {name}\n\n{first}\n\n| field | default | |\n|---|---|---|\n" + "\n".join(rows)
+        table = f" Table `[{tables[kind]}]`." if kind in tables else ""
+        yield f"### {kind.__name__}\n\n{first}{table}\n\n{table_of('field|default|', rows)}"
 
 
 def options_page() -> str:
@@ -107,8 +127,9 @@ def options_page() -> str:
         "Written by `python docs/write_reference.py`; do not edit.",
         *commands(),
         "## Configuration in Python",
-        "Frozen dataclasses of `coview_stream.config`. A value out of its range raises `ConfigError`,\n"
-        "which names the field. Lengths in metres, angles in radians.",
+        "Frozen dataclasses of `coview_stream.config`, `.node` and `.odometry`. A value out of its range raises\n"
+        "`ConfigError`, which names the field. Lengths in metres, angles in radians. `serve --config` takes the\n"
+        f"tables named here, without {' and '.join(f'`{name}`' for name in NOT_IN_TABLES)}.",
         *settings(),
     ]) + "\n"  # fmt: skip
 
@@ -117,8 +138,8 @@ def names_table() -> str:
     """Return the public names of ``coview_stream`` with the first sentence of each docstring."""
     names = sorted((name for name in coview_stream.__all__ if not name.startswith("_")), key=str.casefold)
     sentences = [inspect.getdoc(getattr(coview_stream, name)).split("\n\n")[0] for name in names]
-    rows = [f"| `{name}` | {role_free(cell(text))} |" for name, text in zip(names, sentences, strict=True)]
-    return "| | |\n|---|---|\n" + "\n".join(rows) + "\n"
+    rows = [(code(name), role_free(cell(text))) for name, text in zip(names, sentences, strict=True)]
+    return table_of("|", rows) + "\n"
 
 
 def python_page(text: str) -> str:

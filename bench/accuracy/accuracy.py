@@ -1,4 +1,4 @@
-"""Errors, runs localised and false fixes in held-out worlds, clean and with dirt.
+"""Errors, runs localized and false fixes in held-out worlds, clean and with dirt.
 
 Localizes a run in each held-out world, then runs on the map of another world of the same kind, where the only right
 answer is no pose; then the same drives clean, with each kind of dirt, and with all of it. Results stay in ``--work``.
@@ -150,7 +150,7 @@ def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
     inside, outside = [r for r in runs if not r["outside"]], [r for r in runs if r["outside"]]
     succeeded, false = (sum(r[key] for r in inside) for key in ("success", "false_frames"))
     text = f"{succeeded} of {len(inside)}"
-    yield judged("accuracy/runs localised", text, "all", succeeded == len(inside), succeeded)
+    yield judged("accuracy/runs localized", text, "all", succeeded == len(inside), succeeded)
     yield judged("accuracy/false frames", str(false), "0", false == 0, false)
     for key, unit, most in (("translation", "m", MOST_TRANSLATION), ("rotation", "deg", MOST_ROTATION)):
         means = [r[key]["mean"] for r in inside if r.get(key)] or [np.inf]

@@ -48,7 +48,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for scene, sensor, seed in chosen:
             plain = SimulationConfig(scene, sensor, seed, size=130.0, length=100.0, speed=3.0)
             figures = measure(configured(plain, condition), "hole" in condition)
-            text = ", ".join(f"{way} {figures[way]['rmse']}" for way in _WAYS) if figures else "not localised"
+            text = ", ".join(f"{way} {figures[way]['rmse']}" for way in _WAYS) if figures else "not localized"
             details = {"world": f"{scene}, {sensor}", "condition": condition, **figures}
             yield Row(f"joint/{condition}, {scene}", text=text, details=details)
 
@@ -80,7 +80,7 @@ def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
 
 
 def measure(config: SimulationConfig, hole: bool) -> dict[str, Any]:
-    """Simulate two drives, localize, adjust and compare; nothing if a run was not localised."""
+    """Simulate two drives, localize, adjust and compare; nothing if a run was not localized."""
     places = [_simulated(replace(config, drive_seed=drive)) for drive in (0, 1)]
     cloud = read_cloud(places[0] / "base.laz")
     points = np.asarray(cloud.points, dtype=np.float64)

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.laz", help="cloud to write")
     parser.add_argument("--density", type=float, default=8.0, help="pulses per square metre (8)")
     parser.add_argument("--swath", type=float, default=26.0, help="scan angle to either side, degrees (26)")
-    parser.add_argument("--noise", type=float, default=0.025, help="of the range, metres, one sigma (0.025)")
+    parser.add_argument("--noise", type=float, default=0.025, help="noise of the range, metres, one sigma (0.025)")
     parser.add_argument("--porosity", type=float, default=0.5, help="probability to pass a layer of foliage (0.5)")
     parser.add_argument("--misaligned", type=float, default=0.0, help="shift of strips, metres, one sigma (0)")
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal clouds (1)")

@@ -36,7 +36,7 @@ _MAX_WORKERS = 8  # by default: each may take 2 GB
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    kinds = "las, laz, e57, ply, pcd, xyz, pts, npy, bin"
+    kinds = "las, laz, copc, e57, ply, pcd, xyz, pts, asc, txt, csv, npy, bin"
     parser.add_argument(
         "maps", nargs="+", metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them, http(s):// addresses"
     )
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, metavar="N", help="processes that build tiles (as many as cores, 8 at most)"
     )
     tiles.add_argument(
-        "--dask", metavar="HOST:PORT", help="have the workers of this Dask scheduler do it (local: start some here)"
+        "--dask", metavar="HOST:PORT", help="have this Dask scheduler's workers build them (local: start some here)"
     )
     tiles.add_argument("--keep-going", action="store_true", help="leave out, and name, sources and tiles that fail")
 

@@ -40,7 +40,7 @@ _STEPS = 4
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; names and ranges are checked by SimulationConfig."""
-    parser.add_argument("--out", type=Path, default=Path("coview-demo"), metavar="DIR", help="(coview-demo)")
+    parser.add_argument("--out", type=Path, default="coview-demo", metavar="DIR", help="folder to write (coview-demo)")
     add_world(parser, 180.0, 40.0)
     parser.add_argument("--offline", action="store_true", help="frames straight from file to localizer, no zenoh")
     add_web(parser)

@@ -29,19 +29,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="robots to listen to")
     recorded = parser.add_argument_group("a recorded run")
     recorded.add_argument(
-        "--run", type=Path, dest="run_path", metavar="RUN", help="judge it, and search the map for it"
+        "--run", type=Path, dest="run_path", metavar="RUN", help="recorded run to judge, and to search for on the map"
     )
-    recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="of the run, as for locate (auto)")
+    recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry, as for locate (auto)")
     add_shared(recorded, "--mount", "--cloud-topic", "--odometry-topic")
     add_network(parser, "not checked, but with --robot --connect tcp/127.0.0.1:7447")
-    parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="to listen to robots (3)")
+    parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="seconds to listen to robots (3)")
     keys = parser.add_argument_group("keys and encodings, as for serve")
     add_shared(keys, "--preset")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
-    keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's")
-    keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
-    keys.add_argument("--cloud-encoding", metavar="CODEC", help="for all frames")
-    keys.add_argument("--odometry-encoding", metavar="CODEC", help="likewise")
+    keys.add_argument("--cloud-key", metavar="KEY", help="key of clouds (the preset's)")
+    keys.add_argument("--odometry-key", metavar="KEY", help="key of odometry (the preset's)")
+    keys.add_argument("--cloud-encoding", metavar="CODEC", help="encoding of all clouds")
+    keys.add_argument("--odometry-encoding", metavar="CODEC", help="encoding of all odometry")
     add_shared(parser, "--json")
 
 

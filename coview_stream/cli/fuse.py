@@ -20,15 +20,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FUSED.laz", help="las, laz, ply, pcd, npy")
     parser.add_argument("--voxel", type=float, metavar="M", help="metres from point to point, at least (the map's)")
-    parser.add_argument("--min-range", type=float, default=1.5, metavar="M", help="nearer is the robot itself (1.5)")
-    parser.add_argument("--max-range", type=float, default=50.0, metavar="M", help="farther is left out (50)")
+    parser.add_argument("--min-range", type=float, default=1.5, metavar="M", help="nearer points are left out (1.5)")
+    parser.add_argument("--max-range", type=float, default=50.0, metavar="M", help="farther points are left out (50)")
     parser.add_argument("--keep-moving", action="store_true", help="keep people and cars that drove")
     parser.add_argument("--changes", action="store_true", help="tag new and gone points")
     parser.add_argument(
         "--joint", action="store_true", help="adjust the runs' poses to each other and to the map first"
     )
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it from above")
-    parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as `locate` was given (auto)")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the cloud from above")
+    parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as given to `locate` (auto)")
     add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic", "--verify-key", "--progress")
 
 

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--odometry",
         default="auto",
         metavar="auto|FILE|kiss-icp",
-        help="the run's, a file's, or made of the clouds (auto)",
+        help="odometry of the run, of a file, or made of the clouds (auto)",
     )
     add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic")
     parser.add_argument(

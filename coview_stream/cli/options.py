@@ -163,7 +163,7 @@ ROBOT, KISS_ICP = "robot", "kiss-icp"
 SHARED: dict[str, dict[str, Any]] = {
     "run_path": {"type": Path, "metavar": "RUN", "help": "run directory, cloud file, or rosbag2, mcap, bag"},
     "--cloud-topic": {"metavar": "TOPIC", "help": "clouds of a recording with several such topics"},
-    "--odometry-topic": {"metavar": "TOPIC", "help": "its odometry, likewise"},
+    "--odometry-topic": {"metavar": "TOPIC", "help": "odometry of a recording with several such topics"},
     "--preset": {"default": "native", "help": "keys: native, ros2dds, rmw_zenoh or keelson (native)"},
     "--progress": {"action": "store_true", "help": "draw progress bars even without a terminal"},
     "--json": {"action": "store_true", "help": "print JSON"},
@@ -171,7 +171,7 @@ SHARED: dict[str, dict[str, Any]] = {
     "--registration": {
         "choices": ("trimmed-icp", "gicp"),
         "default": "trimmed-icp",
-        "help": "of scans to the map while tracking; gicp is slower, extra gicp (trimmed-icp)",
+        "help": "how scans are registered while tracking; gicp is slower, extra gicp (default: trimmed-icp)",
     },
     "--reloc": {
         "choices": ("auto", "coview", "learned"),
@@ -194,7 +194,7 @@ SHARED: dict[str, dict[str, Any]] = {
     },
     "--gravity": {
         "metavar": "ground|level|X,Y,Z",
-        "help": "for kiss-icp: down is where the ground says, or the body's -z, or a vector in its frame, as in "
+        "help": "for kiss-icp, down: by the ground, along the body's -z, or a vector in its frame, as in "
         "--gravity=-0.1,0,-9.8 (ground)",
     },
 }
@@ -341,7 +341,7 @@ def add_state(parser: argparse.ArgumentParser) -> None:
     """Declare ``--state`` and ``--no-state``."""
     either = parser.add_mutually_exclusive_group()
     either.add_argument(
-        "--state", metavar="DIR", help="directory of the robots' last poses, tried first at the next start (the user's)"
+        "--state", metavar="DIR", help="last poses, tried at the next start (default: $XDG_STATE_HOME/coview-stream)"
     )
     either.add_argument("--no-state", action="store_true", help="keep nothing, read nothing")
 

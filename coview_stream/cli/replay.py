@@ -17,7 +17,7 @@ _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by ReplayConfig."""
     add_shared(parser, "run_path")
-    parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
+    parser.add_argument("--robot", required=True, metavar="NAME", help="name of the robot")
     add_network(parser)
     add_shared(parser, "--preset")
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)")
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
     add_shared(parser, "--mount", "--cloud-topic", "--odometry-topic")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)")
+    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait for a node to subscribe (10)")
     add_shared(parser, "--progress")
     parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 

@@ -59,8 +59,11 @@ _LIMITS = {
 }
 """Fields of NodeConfig that are options, with their units."""
 
-_TABLES = ("node", "localizer", "lidar_odometry")
+TABLES = ("node", "localizer", "lidar_odometry")
 """Tables of ``--config``: fields of NodeConfig, LocalizerConfig and LidarOdometryConfig; all other keys are options."""
+
+NOT_IN_TABLES = {"sensor_leans": ("localizer", "odometry decides it"), "mount": ("node", "set it above")}
+"""Fields that a table may not set, with the reason."""
 
 _DEFAULTS = {
     "preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "registration": None, "reloc": None,
@@ -99,18 +102,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument(
         "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
     )
-    keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's; {base} and {robot} are filled in")
-    keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
-    keys.add_argument("--pose-key", metavar="KEY", help="likewise")
-    keys.add_argument("--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, for all frames")
-    keys.add_argument("--odometry-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson, likewise")
-    keys.add_argument("--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)")
+    keys.add_argument("--cloud-key", metavar="KEY", help="key of clouds, {base} and {robot} filled in (the preset's)")
+    keys.add_argument("--odometry-key", metavar="KEY", help="key of odometry, written as --cloud-key (the preset's)")
+    keys.add_argument("--pose-key", metavar="KEY", help="key of poses, written as --cloud-key (the preset's)")
+    keys.add_argument("--cloud-encoding", metavar="CODEC", help="of all clouds: xyz, xyzi, cdr, foxglove or keelson")
+    keys.add_argument("--odometry-encoding", metavar="CODEC", help="of all odometry: json, cdr, foxglove or keelson")
+    keys.add_argument("--pose-encoding", metavar="CODEC", help="of poses: json, cdr, foxglove, keelson (the preset's)")
     keys.add_argument(
         "--geo", nargs="?", const="json", choices=("json", "cdr", "foxglove"),
         help="publish latitude, longitude and height as well: JSON, NavSatFix or foxglove.LocationFix (json)",
     )  # fmt: skip
     parser.add_argument(
-        "--odometry", choices=(ROBOT, KISS_ICP), help="from the robot, or computed from its clouds (robot)"
+        "--odometry", choices=(ROBOT, KISS_ICP), help="by the robot, or computed from its clouds (robot)"
     )
     add_shared(parser, "--gravity")
     limits = parser.add_argument_group("rates and limits")
@@ -177,12 +180,12 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     Raises:
         ConfigError: the file has a mistake, or map or robots are missing in both.
     """
-    tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
+    tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     args.from_file = set()
     if args.config is not None:
         declared = argparse.ArgumentParser()
         add_arguments(declared)
-        tables |= fill_from_file(args, args.config, declared, _TABLES)
+        tables |= fill_from_file(args, args.config, declared, TABLES)
         for option, (table, *path) in _TWICE.items():
             field: Any = tables[table]
             for name in path:
@@ -215,20 +218,15 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
     verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
-    for name, key, remedy in (("localizer", "sensor_leans", "odometry decides it"), ("node", "mount", "set it above")):
+    for key, (name, remedy) in NOT_IN_TABLES.items():
         if key in tables[name]:
             raise ConfigError(f"{args.config}: [{name}]: {key} cannot be set here: {remedy}")
     localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
-    localizer = replace(
-        localizer,
-        registration=localizer.registration
-        if args.registration is None
-        else replace(localizer.registration, method=args.registration),
-        acceptance=localizer.acceptance
-        if args.risk is None
-        else replace(localizer.acceptance, risk=acceptance_config(args.risk).risk),
-        reloc=args.reloc or localizer.reloc,
-    )
+    localizer = replace(localizer, reloc=args.reloc or localizer.reloc)
+    if args.registration is not None:
+        localizer = replace(localizer, registration=replace(localizer.registration, method=args.registration))
+    if args.risk is not None:
+        localizer = replace(localizer, acceptance=replace(localizer.acceptance, risk=acceptance_config(args.risk).risk))
     node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")
     node = replace(
         node,

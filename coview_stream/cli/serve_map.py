@@ -16,8 +16,8 @@ HELP = "serve maps (directories of tiles) to nodes, over zenoh"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("directories", nargs="+", type=Path, metavar="SITE/", help="that `build -o SITE/` made")
-    parser.add_argument("--name", help="of the site in its keys (the directory's name)")
+    parser.add_argument("directories", nargs="+", type=Path, metavar="SITE/", help="directories of tiles")
+    parser.add_argument("--name", help="name of the site in its keys (the directory's name)")
     add_network(parser, f"--listen {MAP_SERVER_ENDPOINT}")
     add_shared(parser, "--quiet")
 

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--drive-seed", type=int, default=0, help="others give other runs through the same world, for `fuse` (0)"
     )
     parser.add_argument("--density", type=float, default=20.0, help="airborne pulses per square metre (20)")
-    parser.add_argument("--speed", type=float, default=1.5, help="of the robot, metres per second (1.5)")
+    parser.add_argument("--speed", type=float, default=1.5, help="speed of the robot, metres per second (1.5)")
     parser.add_argument(
         "--changed", type=float, default=0.0, help="share of trees, cars and poles changed since the map (0)"
     )

@@ -16,9 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; the defaults are those of the weights in the package."""
     parser.add_argument("out", type=Path, metavar="OUT", help="directory for the weights, card and training data")
     parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (62; smoke: 3)")
-    parser.add_argument("--first-world", type=int, default=10_000, metavar="SEED", help="their first seed (10000)")
+    parser.add_argument("--first-world", type=int, default=10_000, metavar="SEED", help="first world's seed (10000)")
     parser.add_argument("--steps", type=int, metavar="N", help="batches to train on (600; smoke: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of the weights' start and the batches (0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the weights' start and the batches (0)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes that simulate (2)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="threads that train (PyTorch's choice)")
     parser.add_argument(

@@ -37,13 +37,13 @@ def add_view(parser: argparse._ActionsContainer) -> None:
     add_web(parser)
     parser.add_argument(
         "--foxglove", nargs="?", const=_FOXGLOVE, type=host_port("--foxglove", _FOXGLOVE), metavar="HOST:PORT",
-        help=f"serve the same to Foxglove ({_FOXGLOVE}; extra foxglove)",
+        help=f"show map and robots in Foxglove ({_FOXGLOVE} if no address is named; extra foxglove)",
     )  # fmt: skip
     parser.add_argument(
         "--record", action="append", default=[], type=Path, metavar="FILE",
-        help="record the same: F.mcap (extra foxglove), F.rrd (extra viz); repeat for both",
+        help="record map and robots: F.mcap (extra foxglove), F.rrd (extra viz); repeat for both",
     )  # fmt: skip
-    parser.add_argument("--rerun", action="store_true", help="show the same in rerun (extra viz)")
+    parser.add_argument("--rerun", action="store_true", help="show map and robots in rerun (extra viz)")
 
 
 def open_sinks(args: argparse.Namespace) -> list[Sink]:

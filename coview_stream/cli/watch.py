@@ -34,13 +34,13 @@ _MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)")
+    parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="robots (default: all of the base)")
     add_network(parser)
     add_shared(parser, "--preset", "--json")
     add_view(parser)
-    parser.add_argument("--map", metavar="SITE", help="the map to show, path or address (the node is asked for one)")
+    parser.add_argument("--map", metavar="SITE", help="map to show, path or address (default: the node's)")
     parser.add_argument("--no-clouds", action="store_true", help="show no scans: clouds are most of the traffic")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long (at a signal)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after S seconds (default: at a signal)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -16,22 +16,22 @@ class NodeConfig:
     """Limits and rates of the node, in seconds, metres, Hz and bytes.
 
     Attributes:
-        pose_rate: of the poses, while TRACKING.
-        status_rate: of the statuses, besides one at every change of state.
+        pose_rate: rate of the poses, while TRACKING.
+        status_rate: rate of the statuses; every change of state sends one more.
         odometry_timeout: without odometry for this long (local time) there is no pose: LOST.
         dead_reckoning_timeout: without a usable frame for this long poses go on by odometry alone, then LOST.
         pairing_wait: a frame waits this long (local time) for the odometry around its stamp.
         odometry_history: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.
         max_outage: a longer pause of odometry (sensor time) is a new beginning: the robot may have been carried.
-        max_network_outage: the same where nothing was connected to the node meanwhile, which explains the pause.
-        max_speed: faster motion between two odometry samples is a jump; see :mod:`coview_stream.odometry.buffer`.
-        max_turn_rate: likewise for headings, radians per second, and 20 degrees.
+        max_network_outage: the same while nothing is connected to the node, as that explains the pause.
+        max_speed: metres per second; faster motion between two odometry samples is a jump.
+        max_turn_rate: radians per second; a faster turn of more than 20 degrees is a jump.
         max_payload: a larger message is counted as oversized and not decoded.
-        max_points: of a larger frame only every n-th point is used, so that no robot holds up the others.
-        restart_after: stamps that run on steadily, but not from where they were, are a restarted clock after this.
+        max_points: a larger frame is thinned to every n-th point: no robot holds up the others.
+        restart_after: a jump of the stamps is a restarted clock once they have run on steadily for this long.
         deskew: move points to the frame's stamp where the sender gives each point's time.
-        mount: where the robots' lidars sit: clouds are taken from there into the body frame as they come in.
+        mount: pose of the robots' lidars on the body; clouds are moved into the body frame on arrival.
     """
 
     pose_rate: float = 10.0

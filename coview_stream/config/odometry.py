@@ -24,20 +24,20 @@ class LidarOdometryConfig:
     """Lidar odometry; set by hand.
 
     Attributes:
-        gravity: see :data:`Gravity`. An accelerometer at rest points up, a gravity vector points down.
-        min_range: metres; nearer points are the robot itself, or what covers the sensor.
+        gravity: direction of down: of the ``ground``, ``level`` (the body's -z), or a vector in the body frame; an
+            accelerometer at rest points up, not down.
+        min_range: metres; nearer points are the robot itself, or a cover of the sensor.
         max_range: metres; farther points are left out.
-        voxel: of the local map, metres.
-        min_points: between the two ranges; a frame with fewer cannot be placed.
-        max_gap: seconds without a usable frame after which the local map is begun anew, where the last frame was:
-            how far the robot went meanwhile is not known.
-        max_speed: metres per second; what says more is refused, and the local map begun anew.
-        max_turn_rate: radians per second, likewise; a faster turn is registration that spins with its own prediction.
-        keep_level: keep roll and pitch from drifting, and from registration's errors, by the walls and the ground
-            around.
-        threads: of kiss-icp.
-        convergence: step, metres and radians, below which its registration ends.
-        iterations: after which it ends at the latest.
+        voxel: edge of the local map's voxels, metres.
+        min_points: points between the two ranges; a frame with fewer is not placed.
+        max_gap: seconds without a usable frame after which a new local map begins at the last frame's pose: the motion
+            since is unknown.
+        max_speed: metres per second; a faster registration is refused, and a new local map begins.
+        max_turn_rate: radians per second, likewise; registration may spin with its own prediction.
+        keep_level: correct drift and registration's errors of roll and pitch by the walls and the ground around.
+        threads: threads of kiss-icp.
+        convergence: step, metres and radians, below which registration ends.
+        iterations: iterations at most.
     """
 
     gravity: Gravity = "ground"

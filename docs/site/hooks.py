@@ -11,7 +11,7 @@ _OUTSIDE = re.compile(r"\[([^\]]*)\]\((\.\./[^)]*)\)")
 _COMMENT = re.compile(r"^(<!--.*-->)\n(?=\S)", re.MULTILINE)
 _ITEM = re.compile(r"^(?![*\-|>#\s]|\d+\. |```)(.+)\n(?=[*-] \S)", re.MULTILINE)
 _NAMES = re.compile(r"<!-- names -->\n.*?<!-- end -->", re.DOTALL)
-_NAME = re.compile(r"^\| `(\w+)` ", re.MULTILINE)
+_NAME = re.compile(r"^\| ?`(\w+)`", re.MULTILINE)
 _ROLE = re.compile(r":\w+:(<code>)~?\.?(?:coview_\w+\.(?:\w+\.)*)?")
 
 

@@ -61,7 +61,7 @@ def test_outside_runs_are_on_the_map_of_another_world_of_the_same_kind():
     ("rows", "targets"),
     [
         ([made_up(), outside()], set()),
-        ([made_up(success=False), outside()], {"runs localised"}),
+        ([made_up(success=False), outside()], {"runs localized"}),
         ([made_up(false_frames=1), outside()], {"false frames"}),
         ([made_up(translation={"mean": 0.09}), outside()], {"mean translation error, m"}),
         ([made_up(rotation={"mean": 0.31}), outside()], {"mean rotation error, deg"}),
@@ -80,7 +80,7 @@ def test_a_crash_costs_one_row(tmp_path):
 
     row = accuracy.run_one(tmp_path, TINY, TINY, crash)
     assert row["error"] == "MemoryError: too large"
-    assert "runs localised" in missed([row])
+    assert "runs localized" in missed([row])
     assert accuracy.figures(row)["name"] == "town-os64-1!"
 
 

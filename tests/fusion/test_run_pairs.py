@@ -78,7 +78,7 @@ def test_damaged_results_are_refused(world_run, world_map, results, text):
         LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
 
 
-def test_a_run_that_was_not_localised_is_refused(world_run, world_map, tmp_path):
+def test_a_run_that_was_not_localized_is_refused(world_run, world_map, tmp_path):
     write_tum(tmp_path / "trajectory.tum", [], [])
     with pytest.warns(UserWarning, match="which map"), pytest.raises(InputError, match="not localized"):
         LocalizedRun(parse_pair(f"{world_run}:{tmp_path}"), world_map, opened)

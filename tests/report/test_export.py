@@ -62,7 +62,7 @@ def test_stamps_that_are_no_times_of_day_are_none():
     assert "<time>" not in FORMATS["gpx"][1](found)
 
 
-def test_nothing_localised_gives_whole_and_empty_files(tmp_path):
+def test_nothing_localized_gives_whole_and_empty_files(tmp_path):
     empty = trajectory_of("run", [], [], GeoReference("EPSG:25832"))
     for path in export(empty, tmp_path, tuple(FORMATS)):
         assert path.exists()
