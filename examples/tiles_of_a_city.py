@@ -30,4 +30,6 @@ def main(world: Path, directory: Path, workers: int = 2) -> BaseMap:
 
 
 if __name__ == "__main__":  # workers import this file: without this line they would begin anew
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]))

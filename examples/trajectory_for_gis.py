@@ -36,4 +36,6 @@ def main(world: Path, folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     print(*main(Path(sys.argv[1]), Path(sys.argv[2])))

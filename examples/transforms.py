@@ -32,4 +32,6 @@ async def main(robot: str, endpoint: str | None = None, count: int = 100, **opti
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     asyncio.run(main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None))

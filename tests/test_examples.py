@@ -102,6 +102,15 @@ def test_example_carried_away(world, capsys):
     assert "carried back: found after" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+def test_example_without_arguments_has_defaults_or_prints_its_usage(path, monkeypatch):
+    if "sys.argv[1] if" in path.read_text(encoding="utf-8"):
+        return
+    monkeypatch.setattr("sys.argv", [str(path)])
+    with pytest.raises(SystemExit, match=f"python examples/{path.name}"):
+        runpy.run_path(str(path), run_name="__main__")
+
+
 @pytest.mark.slow
 def test_example_map_of_arrays(world, tmp_path, capsys):
     base_map = example("map_of_arrays.py")(world, tmp_path / "site.coview")

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from coview_stream.errors import ConfigError, MapError
+
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import VerifyKey
     from coview_stream.basemap.site.fetch import Mirror
@@ -53,14 +55,15 @@ def local_map(
 
     Raises:
         ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.
-        MapError: a damaged or unsigned site, or no tile in the circle.
+        MapError: a missing map, a damaged or unsigned site, or no tile in the circle.
     """
     if around is None and "://" not in name:
+        if not Path(name).exists():
+            raise MapError(f"{name}: cannot read the map (No such file or directory); check the path")
         return LocalMap(Path(name))  # without the modules below: most maps are files
 
     from coview_stream.basemap.site.fetch import is_site_address
     from coview_stream.basemap.site.manifest import Around, Manifest, is_site, part_file, tiles_around
-    from coview_stream.errors import ConfigError
 
     circle = None if around is None else Around.parse(around)
     if is_site_address(name):

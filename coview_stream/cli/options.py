@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from coview_stream.errors import ConfigError, CoViewError, InputError
+from coview_stream.errors import ConfigError, CoViewError, InputError, MapError
 
 if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
@@ -117,6 +117,8 @@ def blaming_file(args: argparse.Namespace) -> Iterator[None]:
     try:
         yield
     except CoViewError as error:
+        if isinstance(error, MapError) and "map" in args.from_file:
+            raise MapError(f"{args.config}: site: {error}") from error
         subject = re.match(r"(?:--)?([a-z][a-z_-]*)", str(error))
         if subject is None or subject[1].replace("-", "_") not in args.from_file:
             raise
@@ -136,6 +138,8 @@ def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
         kind = action.type if callable(action.type) else str
         if isinstance(item, dict | list | bool):
             raise ConfigError(f"{where} is {value!r}; write {'texts' if several else 'one value'}")
+        if action.dest == "map" and not isinstance(item, str):
+            raise ConfigError(f"{where} is {item!r} ({type(item).__name__}); write the map as a text")
         try:
             out.append(kind(str(item)))
         except (argparse.ArgumentTypeError, ValueError) as error:
@@ -255,7 +259,7 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
 
     if text is None:
         if within is not None:
-            raise ConfigError("--within: it is metres around --initial; give that, too")
+            raise ConfigError("--within needs --initial: it is a radius around that place")
         return None
     if within is not None and not MIN_WITHIN <= within < MAX_COORDINATE:
         raise ConfigError(f"--within {within:g}: give metres, {MIN_WITHIN:g} or more")

@@ -212,6 +212,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import CodecOptions, NetworkOptions, ServeOptions
     from coview_stream.stream.transport.keys import check_chunk, node_keys, robot_keys
+    from coview_stream.stream.transport.zenoh_config import compose
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
@@ -250,6 +251,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     # nodes of a fleet have the same robots
     default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
     by_default = not (args.connect or args.listen or args.zenoh_config)
+    compose(args.connect or (), args.listen or (), args.zenoh_config)  # mistakes before anything is fetched or written
     opened = open_map_argument(args)
     options = ServeOptions(
         map_path=opened.path,

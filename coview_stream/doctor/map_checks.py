@@ -80,6 +80,7 @@ _APART = 1.0  # metres between frames, about
 _STANDING_STRIDE = 5  # frames, where odometry does not move
 _MIN_RATE, _MAX_RATE = 0.2, 100.0  # Hz; frames of lidars come 1 to 30 times a second
 _SEARCHED = 60  # frames
+_ENOUGH = 20.0  # metres: most robots are found within ten
 
 
 def run_findings(run: Run, base_map: BaseMap | None = None) -> Iterator[Finding]:
@@ -135,7 +136,7 @@ def seen_frames(run: Run) -> list[SeenFrame]:
 
 
 def place_finding(run: Run, base_map: BaseMap) -> Finding:
-    """Search the map for the beginning of the run."""
+    """Search the map for the beginning of the run; FAIL where no place stands out after enough metres."""
     try:
         from coview_stream.localization.localizer import Localizer
         from coview_stream.localization.state import State
@@ -165,4 +166,5 @@ def place_finding(run: Run, base_map: BaseMap) -> Finding:
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres, "
         "and has the site not changed? docs/reasons.md"
     )
-    return Finding("warn", "place", found, remedy)
+    sure = driven >= _ENOUGH and localizer.state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
+    return Finding("FAIL" if sure else "warn", "place", found, remedy)

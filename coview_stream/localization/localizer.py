@@ -19,7 +19,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.hints import PlaceGuess, has_ground
+from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search_requests import NoSearch, SearchRequests
@@ -276,12 +276,8 @@ class Localizer:
         """
         if not isinstance(guess, PlaceGuess):
             raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
-        if check and not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
-            around = guess.within or guess.distance
-            raise InputError(
-                f"guess {guess.x:.1f}, {guess.y:.1f}: the map has no ground within {around:g} m of it; "
-                "give coordinates of the frame of the map's sources (coview-stream info)"
-            )
+        if check:
+            require_ground(guess, self.base_map)
         if not self.state.has_place:
             self._requests.guess(guess)
 

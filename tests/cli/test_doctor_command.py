@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+import small_world
 from sockets import free_endpoint
 
 from coview_stream.cli import main
@@ -128,6 +129,15 @@ def test_doctor_without_robot_checks_machine_and_map(world_file, tmp_path, capsy
     assert [f["what"] for f in found] == ["machine", "map", "map sha256", "map features", "map memory"]
     assert code == (found[-1]["verdict"] == "FAIL")
     assert main(["doctor", str(tmp_path / "none.coview")]) == 1
+
+
+@pytest.mark.slow
+def test_run_of_another_site_fails_after_enough_metres(world_file, world_run, elsewhere_run, tmp_path, capsys):
+    far = small_world.write_run(tmp_path / "far", small_world.record(small_world.boxes(seed=77), frames=14), 14)
+    for run, verdict in ((world_run, "ok"), (elsewhere_run, "warn"), (far, "FAIL")):
+        code, found = findings_of(capsys, str(world_file), "--run", str(run))
+        assert found[-1]["verdict"] == verdict, found
+        assert code == (verdict == "FAIL")
 
 
 @pytest.mark.parametrize(

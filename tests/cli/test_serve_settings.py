@@ -77,6 +77,7 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robot = "a"\n[node]\npose_rte = 3\n', "[node]: unknown key 'pose_rte'; did you mean 'pose_rate'?"),
         ('robot = "a"\n[localizer.keyframe]\ndistance = -1\n', "distance is -1"),
         ("[node]\n", "--robot is missing"),
+        ("robot = 3\nsite = 3\n", "site is 3 (int); write the map as a text"),
         ('robot = "a"\n[localizer]\nsensor_leans = false\n', "sensor_leans cannot be set here"),
         ('robot = "a"\n[node.mount]\nroll = 3\n', "mount cannot be set here: set it above"),
         ('robot = "a"\n[lidar_odometry]\nnonsense = 3\n', "unknown key 'nonsense'"),
@@ -88,7 +89,7 @@ def test_mistakes_are_named(text, message, world_file, tmp_path):
     path = tmp_path / "node.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
-        options_of(world_file, "--config", path, "--no-state")
+        options_of(*[] if "site" in text else [world_file], "--config", path, "--no-state")
     assert message in str(error.value)
 
 
@@ -99,13 +100,15 @@ def test_mistakes_are_named(text, message, world_file, tmp_path):
         ("risk = 0.7\n", ["--risk", "low"], "--risk low: give the probability"),
         ('pose-key = "a/*"\n', [], "{path}: pose-key 'a/*' has a wildcard"),
         ("coast = -3\n", [], "{path}: dead_reckoning_timeout is -3.0"),
+        ('site = "none.coview"\n', None, "{path}: site: none.coview: cannot read the map"),
         ('listen = "nonsense"\n', [], "{path}: listen 'nonsense' is not <protocol>/<address>"),
     ],
 )
 def test_a_refused_value_of_the_file_is_reported_with_file_and_key(text, given, message, world_file, tmp_path, capsys):
     path = tmp_path / "node.toml"
     path.write_text(text)
-    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", "--config", str(path), *given]) == 2
+    site = [str(world_file), *given] if given is not None else []
+    assert main(["serve", "--robot", "r1", "--no-state", "--config", str(path), *site]) == 2
     assert capsys.readouterr().err.startswith(f"coview-stream: error: {message.format(path=path)}")
 
 

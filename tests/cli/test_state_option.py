@@ -58,9 +58,18 @@ def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, refused)
         (str(tmp_path / "file" / "in"), "Not a directory"),
         ("", "''"),
     ):
-        said = refused("serve", world_file, "--robot", "r1", "--listen", "x", "--state", name)
+        said = refused("serve", world_file, "--robot", "r1", "--listen", "tcp/127.0.0.1:0", "--state", name)
         assert "--state" in said
         assert text in said
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--connect", "foo"], ["--listen", "foo"], ["--zenoh-config", "none.json5"], ["none.coview"]]
+)
+def test_nothing_is_made_or_logged_before_the_other_options_are_right(world_file, tmp_path, refused, wrong):
+    site = [] if wrong == ["none.coview"] else [world_file]
+    assert wrong[-1] in refused("serve", *site, *wrong, "--state", tmp_path / "state", "--robot", "r1")
+    assert not (tmp_path / "state").exists()
 
 
 def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, caplog):

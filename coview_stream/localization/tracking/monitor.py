@@ -32,7 +32,7 @@ _NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: about the last fi
 
 
 class RejectionReason(StrEnum):
-    """Reason of a verdict on a registration while tracking; docs/tracking.md has the remedies."""
+    """Reason of a verdict on a registration while tracking; docs/reasons.md has the remedies."""
 
     VERIFIED = "verified"
     """Nothing speaks against the place."""

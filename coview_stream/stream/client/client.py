@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from coview_stream.errors import InputError, MessageError, TransportError
+from coview_stream.errors import MessageError, TransportError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import decode_pose
@@ -195,20 +195,23 @@ class RobotClient:
                 this is trusted, a quarter wider than given, and grows with the distance driven.
 
         Returns:
-            The reply; ``taken`` is False while the place is known.
+            The reply; ``taken`` is False where the guess is refused, and ``note`` says why: the place is known, or the
+            map has no ground there.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
-            InputError: a value is no number.
+            InputError: a value is no number, or out of its range.
         """
+        from coview_stream.stream.node.last_place import guess_of_fields  # few clients need it
+
         self._check_open()
-        given = {"x": x, "y": y, "distance": distance} | ({} if yaw is None else {"yaw": yaw})
-        given |= {} if within is None else {"within": within}
-        try:
-            parameters = {name: repr(float(value)) for name, value in given.items()}
-        except (TypeError, ValueError) as error:
-            raise InputError(f"suggest: {error}; give numbers, metres and radians") from error
-        parameters |= {} if map is None else {"map": map}
+        given = {"x": x, "y": y, "yaw": yaw, "distance": distance, "map": map, "within": within}
+        guess_of_fields(given)
+        parameters = {
+            name: str(value) if name == "map" else repr(float(value))
+            for name, value in given.items()
+            if value is not None
+        }
         return self._transport.query(self.keys.suggest, parameters, timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:

@@ -149,10 +149,14 @@ class RobotEndpoints:
 
     def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/suggest``; InputError, which is replied, where it names no place."""
-        guess = guess_of_fields(parameters)
-        taken = [session.guess_place(guess) for session in self._sessions]
-        note = "" if any(taken) else "the place is known, the guess is ignored; ask rpc/relocalize first"
-        return self._answer() | {"taken": any(taken), "note": note}
+        guess, notes = guess_of_fields(parameters), []
+        for session in self._sessions:
+            try:
+                taken = session.guess_place(guess)
+                notes.append("" if taken else "the place is known, the guess is ignored; ask rpc/relocalize first")
+            except InputError as error:
+                notes.append(str(error))
+        return self._answer() | {"taken": "" in notes, "note": "" if "" in notes else notes[0]}
 
     def _answer(self) -> dict[str, Any]:
         self._reporter.changed.set()

@@ -269,6 +269,7 @@ def _opened(options: ServeOptions, base_map: BaseMap, engines: Mapping[str, Engi
             parts=parts,
             lidar=options.lidar,
             site_sha256=str(base_map.parameters.get("site") or base_map.sha256),
+            base_map=base_map,
         )
         for keys in options.keys
     ]

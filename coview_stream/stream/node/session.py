@@ -9,12 +9,13 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.map_parts import MapParts
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MessageError
 from coview_stream.localization.search.acceptance import SearchResult
-from coview_stream.localization.search.hints import PlaceGuess
+from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.state import State
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.node.counters import Counters, ErrorLog
@@ -44,6 +45,7 @@ class Session:
         parts: the maps of which the map is joined; None of one map.
         lidar: how odometry is computed from the clouds; None if the robot sends it.
         site_sha256: of the state of a site, common to all parts of it; None: the map is a single file.
+        base_map: refuses guesses where it has no ground; None refuses none.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Session:
         parts: MapParts | None = None,
         lidar: LidarOdometryConfig | None = None,
         site_sha256: str | None = None,
+        base_map: BaseMap | None = None,
     ) -> None:
         self.keys = keys
         self.map_sha256, self.site_sha256 = map_sha256, site_sha256 or map_sha256
@@ -63,6 +66,7 @@ class Session:
         self.lock = threading.RLock()  # held while several attributes are read together
         self._codecs = codecs
         self._lidar = lidar
+        self._base_map = base_map
         self._epoch = 0  # number of the odometry frame, counted through all resets
         self.reset(forget=False)
 
@@ -165,12 +169,14 @@ class Session:
     def guess_place(self, guess: PlaceGuess) -> bool:
         """Have the search try somebody's guess; return False, and do nothing, while a place is known.
 
-        InputError: one of several maps has to be named, and none of that name is there.
+        InputError: one of several maps has to be named, and none of that name is there, or it has no ground there.
         """
         if self.parts is not None:
             part = self.parts.named(guess.map)
             x, y = guess.x + part.shift[0], guess.y + part.shift[1]
             guess = replace(guess, x=x, y=y, map=None, begin=part.begin, end=part.end)
+        if self._base_map is not None:
+            require_ground(guess, self._base_map)
         with self.lock:
             if self.robot_state.correction is not None:
                 return False

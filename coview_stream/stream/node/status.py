@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,7 @@ MAX_STATUS = 3500
 _JSON = "application/json"
 _MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
 _TEXT, _SHORT_TEXT = 300, 100  # characters
+_LOG_INTERVAL = 10.0  # seconds between lines about one robot whose state stays and whose reason changes
 
 
 class Reporter:
@@ -47,6 +49,7 @@ class Reporter:
         self._started = time.monotonic()
         self._connection = ConnectionMonitor()
         self._reported: dict[str, tuple[str, bool]] = {}  # state, and whether it was published
+        self._logged: dict[str, tuple[str, float]] = {}  # reason without its numbers, and local time
         self._publishers: dict[str, Publisher] = {}
         self._hypotheses: dict[str, Publisher] = {}
 
@@ -104,7 +107,10 @@ class Reporter:
         state, reason = session.state()
         before, _ = self._reported.get(robot, ("", False))
         self._reported[robot] = state.reported, robot in self.served  # even if it fails: not tried again at once
-        if state.reported != before and not closing:
+        kind, (logged, at) = re.sub(r"[\d.,]+", "", reason), self._logged.get(robot, ("", now))
+        new_reason = kind != logged and now - at >= _LOG_INTERVAL and not state.has_place
+        if (state.reported != before or new_reason) and not closing:
+            self._logged[robot] = kind, now
             name = map_name(session)
             log.info("%s: %s%s (%s)", robot, state.reported, "" if name is None else f" on {name}", reason)
         if robot not in self.served:

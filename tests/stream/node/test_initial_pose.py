@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import math
+
 import numpy as np
 import pytest
 from fake_robot import KEYS, Robot, unknown
@@ -13,7 +16,13 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.stream.client.client import RobotClient
 from coview_stream.stream.node.last_place import decode_guess, guess_of_fields
+from coview_stream.stream.node.robot_endpoints import RobotEndpoints
+from coview_stream.stream.node.status import Reporter
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import NodeIdentity
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 
 def sample(payload):
@@ -82,6 +91,24 @@ def test_questions_and_messages_reach_the_session(pair):
     session = pair.sessions["r1"]
     pair.net.publish(sample(b'{"x": 5.0}'))
     assert any("initial poses of no use" in text for text in session.errors.texts)
+
+
+def test_guess_where_the_map_has_no_ground_is_refused_with_a_note(world_map):
+    net, robot = MemoryTransport(), Robot(base_map=world_map)
+    reporter = Reporter([robot.session], net, RateLimitedErrors(logging.getLogger()), NodeIdentity())
+    endpoints = RobotEndpoints(robot.session, net, reporter, lambda session: None)
+    endpoints.begin_serving()
+    client = RobotClient("r1", transport=net)
+    x, y = world_map.origin[:2]
+    for within in (60.0, None):
+        reply = client.suggest(x + 5000.0, y, within=within)
+        assert not reply["taken"]
+        assert f"the map has no ground within {within or 5:g} m" in reply["note"]
+    assert (client.suggest(x, y, within=60.0)["taken"], net.raised) == (True, [])
+    for wrong in ({"x": math.nan}, {"within": 5}, {"distance": 50}, {"yaw": "north"}, {"map": 3}):
+        with pytest.raises(InputError, match="initial pose"):
+            client.suggest(**{"x": 0.0, "y": 0.0, **wrong})
+    assert net.raised == []
 
 
 def test_guess_is_told_again_to_an_engine_that_begins_anew():

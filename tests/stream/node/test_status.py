@@ -172,6 +172,22 @@ def test_a_new_odometry_frame_forgets_them(site, searched):
     assert hypotheses(searched) is None
 
 
+def test_another_kind_of_reason_is_logged_but_not_each_number(site, caplog):
+    caplog.set_level(logging.INFO, "coview_stream.node")
+    reasons = iter(["no place fits", "14 places would fit", "13 places would fit", "no place fits"])
+    site.engine.answer = lambda job: unknown(job, reason=next(reasons))
+    now, lines = time.monotonic(), []
+    site.node.reporter.publish(now)
+    for k in range(4):
+        site.frame("r1", 0.1 * k)
+        for later in (1.0, 19.0):
+            caplog.clear()
+            site.node.reporter.publish(now + 20.0 * k + later)
+            lines.append(caplog.messages)
+    first, other = ["r1: SEARCHING (no place fits)"], ["r1: SEARCHING (14 places would fit)"]
+    assert lines == [[], first, [], other, [], [], first, []]
+
+
 def test_a_map_view_is_of_the_map_that_is_served(site, world_file):
     served = [BaseMap.load(world_file).sha256]
     key = site.keys["r1"].map_view
