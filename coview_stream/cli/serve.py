@@ -129,13 +129,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     operation.add_argument("--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet")
     operation.add_argument(
-        "--metrics",
-        nargs="?",
-        const=METRICS_ADDRESS,
-        type=host_port("--metrics", METRICS_ADDRESS),
-        metavar="HOST:PORT",
-        help=f"serve GET /metrics and /health ({METRICS_ADDRESS} if no address is named)",
-    )
+        "--metrics", nargs="?", const=METRICS_ADDRESS, type=host_port("--metrics", METRICS_ADDRESS),
+        metavar="HOST:PORT", help=f"serve GET /metrics and /health ({METRICS_ADDRESS} if no address is named)",
+    )  # fmt: skip
     add_view(operation)
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
     add_shared(operation, "--quiet")

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config.checks import require
 from coview_stream.errors import InputError
@@ -19,9 +19,6 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Circle, Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.localization.search.consensus import Hypothesis
-
-if TYPE_CHECKING:
-    from coview_stream.basemap.basemap import BaseMap
 
 # poses of a guess: scoring moves a hypothesis by up to three metres and seven degrees
 _SPACING = 3.0  # metres
@@ -138,11 +135,8 @@ def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) 
 
 def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
     """Raise InputError where a map has no ground near a guess, or within its circle if it has one."""
-    area, origin = guess.area(base_map.origin), base_map.origin
-    if area is not None:
-        ground = area.holds(base_map.stations)
-    else:
-        ground = base_map.station_grid.levels_at(guess.poses()[:, :2] - origin[:2]) >= 0
+    area, places = guess.area(base_map.origin), guess.poses()[:, :2] - base_map.origin[:2]
+    ground = base_map.station_grid.levels_at(places) >= 0 if area is None else area.holds(base_map.stations)
     if not ground.any():
         raise InputError(
             f"guess: the map has no ground within {guess.within or guess.distance:g} m of it; "

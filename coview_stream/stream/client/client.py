@@ -207,11 +207,7 @@ class RobotClient:
         self._check_open()
         given = {"x": x, "y": y, "yaw": yaw, "distance": distance, "map": map, "within": within}
         guess_of_fields(given)
-        parameters = {
-            name: str(value) if name == "map" else repr(float(value))
-            for name, value in given.items()
-            if value is not None
-        }
+        parameters = {k: str(v) if k == "map" else repr(float(v)) for k, v in given.items() if v is not None}
         return self._transport.query(self.keys.suggest, parameters, timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:

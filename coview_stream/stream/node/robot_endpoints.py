@@ -38,14 +38,9 @@ class RobotEndpoints:
     """
 
     def __init__(
-        self,
-        session: Session,
-        transport: Transport,
-        reporter: Reporter,
-        wake_engines: Callable[[Session], None],
-        pose_format: str | None = None,
-        geo: GeoOutput | None = None,
-    ) -> None:
+        self, session: Session, transport: Transport, reporter: Reporter, wake_engines: Callable[[Session], None],
+        pose_format: str | None = None, geo: GeoOutput | None = None,
+    ) -> None:  # fmt: skip
         self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
         self._switching = threading.Lock()  # no pose of the session before is published after the switch
         self._transport = transport

@@ -260,17 +260,10 @@ def _opened(options: ServeOptions, base_map: BaseMap, engines: Mapping[str, Engi
     from coview_stream.stream.node.session import Session
 
     parts = MapParts.of(base_map.parameters)
+    codecs = options.codecs.cloud, options.codecs.odometry
+    site = str(base_map.parameters.get("site") or base_map.sha256)
     sessions = [
-        Session(
-            keys,
-            base_map.sha256,
-            options.node,
-            (options.codecs.cloud, options.codecs.odometry),
-            parts=parts,
-            lidar=options.lidar,
-            site_sha256=str(base_map.parameters.get("site") or base_map.sha256),
-            base_map=base_map,
-        )
+        Session(keys, base_map.sha256, options.node, codecs, parts, options.lidar, site, base_map)
         for keys in options.keys
     ]
     return OpenedMap(base_map.sha256, engines, sessions, base_map.path or options.map_path)

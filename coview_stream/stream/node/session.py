@@ -49,16 +49,10 @@ class Session:
     """
 
     def __init__(
-        self,
-        keys: RobotKeys,
-        map_sha256: str,
-        config: NodeConfig | None = None,
-        codecs: tuple[str | None, str | None] = (None, None),
-        parts: MapParts | None = None,
-        lidar: LidarOdometryConfig | None = None,
-        site_sha256: str | None = None,
-        base_map: BaseMap | None = None,
-    ) -> None:
+        self, keys: RobotKeys, map_sha256: str, config: NodeConfig | None = None,
+        codecs: tuple[str | None, str | None] = (None, None), parts: MapParts | None = None,
+        lidar: LidarOdometryConfig | None = None, site_sha256: str | None = None, base_map: BaseMap | None = None,
+    ) -> None:  # fmt: skip
         self.keys = keys
         self.map_sha256, self.site_sha256 = map_sha256, site_sha256 or map_sha256
         self.config = config or NodeConfig()
@@ -196,9 +190,8 @@ class Session:
             with self.lock:  # as other sessions of the robot, which know nothing of each other
                 self.inputs.continue_from(old.inputs)
         with self.lock:
-            self.hints.offer_guess(
-                None if guess is None else replace(guess, within=None)
-            )  # the circle is the old map's
+            # without its circle, which is the old map's
+            self.hints.offer_guess(None if guess is None else replace(guess, within=None))
             self.hints.forgotten = forgotten
             if T_map_body is not None:
                 self.hints.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
