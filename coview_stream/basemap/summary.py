@@ -134,15 +134,6 @@ def summary(base_map: SummarizedMap) -> MapSummary:
     )
 
 
-def _dense(density: float | None) -> str | None:
-    if density is None or density >= _THIN:
-        return None
-    return (
-        f"{density:.2g} points/m2 are few: on {_THIN:.0f} and less the first pose may come after 100 m of driving, or "
-        "not at all; use a denser survey if there is one"
-    )
-
-
 def _upright(base_map: SummarizedMap) -> str | None:
     """Compare how many surfaces face each axis, and how far the points extend along it."""
     packed = base_map.arrays["normals"]

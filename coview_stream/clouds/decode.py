@@ -22,18 +22,20 @@ from coview_stream.errors import CloudError
 
 _MAX_END_S = 5.0  # for a child to end by itself
 _MAX_LINE = 1 << 20  # bytes of an answer's line; a reference system's text is the longest
+_IDLE_S = 10.0  # an idle child, which holds 90 MB, ends after that
 _LIMITS = {  # threads' stacks and heaps count against the child's memory limit
     "RAYON_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2",
 }  # fmt: skip
 
 
 class DecodingChild:
-    """A child that answers requests one at a time; started when needed, ended at exit."""
+    """A child that answers requests one at a time; started when needed, ended when idle or at exit."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._owner = 0
+        self._idle = threading.Timer(_IDLE_S, self.close)
         atexit.register(self.close)
 
     def ask(self, request: dict[str, Any], builder: CloudBuilder | None = None) -> dict[str, Any]:
@@ -43,11 +45,15 @@ class DecodingChild:
             CloudError: the file is damaged, or asked for more memory than a file of its size can need.
         """
         with self._lock:
+            self._idle.cancel()
             try:
                 answer = self._exchange(request, builder)
             except BaseException:
                 self._end(kill=True)  # its next bytes would belong to this request
                 raise
+            self._idle = threading.Timer(_IDLE_S, self.close)
+            self._idle.daemon = True
+            self._idle.start()
         if "error" in answer:
             raise CloudError(answer["error"])
         return answer

@@ -36,9 +36,7 @@ _POINTS_PER_BYTE = 4  # surveys take 2 to 6 bytes a point, a plane without noise
 def require_laspy() -> Any:
     """Return laspy; DependencyError if it or its decoder is not installed."""
     require_library("lazrs", "lazrs>=0.6", "LAS and LAZ files")
-    laspy = require_library("laspy", "laspy[lazrs]>=2.5", "LAS and LAZ files")
-    logging.getLogger("laspy").setLevel(logging.ERROR)  # it warns of records that this module judges itself
-    return laspy
+    return require_library("laspy", "laspy[lazrs]>=2.5", "LAS and LAZ files")
 
 
 @contextlib.contextmanager
@@ -110,9 +108,20 @@ def _reader(path: Path) -> Iterator[Any]:
         size = path.stat().st_size
         with _damage_of(path):
             _check_sizes(stream, size)
-            reader = laspy.open(stream, closefd=False)
+            with _quiet(logging.getLogger("laspy")):  # it warns of records that this module judges itself
+                reader = laspy.open(stream, closefd=False)
             _check_points(path, reader.header, stream, size)
         yield reader
+
+
+@contextlib.contextmanager
+def _quiet(logger: logging.Logger) -> Iterator[None]:
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _chunks(path: Path, reader: Any) -> Iterator[tuple[Floats, npt.NDArray[np.uint8], int]]:

@@ -85,10 +85,11 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
 def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[int, ...], number: int) -> Floats:
     """Return (N, 3) of lines, without blank lines, comments, and a PTS file's numbers of points."""
     counted = path.suffix.lower() == ".pts"
+    # not stripped: an empty first cell of a row of tabs is a column, too
     rows = [
-        "" if (text := row.strip()).startswith(_COMMENTS) or (counted and text.isdecimal()) else text for row in rows
+        "" if (text := row.strip()).startswith(_COMMENTS) or (counted and text.isdecimal()) else row for row in rows
     ]
-    points = [row for row in rows if row]
+    points = [row for row in rows if row.strip()]
     try:
         if separator is None or not any("  " in row for row in points[:1]):
             out: Floats = np.loadtxt(
@@ -99,11 +100,11 @@ def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[
         pass
     cells = []
     for at, row in enumerate(rows):
-        if not row:
+        if not row.strip():
             continue
-        words = [cell.strip().strip('"') for cell in row.split(separator)]
+        words = [cell.strip().strip('"') for cell in row.strip("\r\n ").split(separator)]
         if len(words) <= max(columns) or not all(_is_number(words[k]) for k in columns):
-            raise CloudError(f"{path}:{number + at}: {row[:60]!r} is no point; write x y z, in metres")
+            raise CloudError(f"{path}:{number + at}: {row.strip()[:60]!r} is no point; write x y z, in metres")
         cells.append([float(words[k]) for k in columns])
     return np.array(cells, dtype=np.float64).reshape(-1, 3)
 

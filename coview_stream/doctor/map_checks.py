@@ -69,7 +69,7 @@ def node_memory(base_map: BaseMap) -> float:
     """
     surveyed = int((base_map.survey.values > 0).sum()) * base_map.config.block**2
     needed = MIN_MEMORY + len(base_map) * _INDEX_MEMORY + surveyed * _FIELD_MEMORY
-    if base_map.learned is not None and base_map.require_features("auto") is None:
+    if base_map.require_features("auto") is None and base_map.learned is not None:
         needed += _NETWORK_MEMORY + base_map.learned.box_area * _FEATURE_MEMORY
     return needed
 

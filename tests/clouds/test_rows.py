@@ -29,6 +29,7 @@ def lines(points, mark=" ", more=""):
         ("a.txt", "  " + lines(POINTS).replace("\n", "\r\n")),
         ("a.pts", f"{len(POINTS)}\n" + lines(POINTS, " ", " -1200 128 128 128")),
         ("a.pts", f"200\n{lines(POINTS[:200])}200\n{lines(POINTS[200:])}"),
+        ("a.txt", "name\tx\ty\tz\tclass\n\t" + lines(POINTS, "\t", "\t9").replace("\n", "\n\t")),
         ("a.xyz", "\n".join(f"{x:.9e} {y:.9e} {z:.3f}" for x, y, z in POINTS)),
     ],
 )  # fmt: skip

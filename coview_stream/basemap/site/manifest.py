@@ -291,13 +291,15 @@ class Around:
     y: float
     radius: float
 
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
+            raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
+
     @classmethod
     def parse(cls, text: str) -> Around:
         """Parse ``X,Y,RADIUS``; ConfigError if it is something else."""
         try:
             x, y, radius = map(float, text.split(","))
-            if not all(map(math.isfinite, (x, y, radius))) or radius < 0:
-                raise ValueError("no circle")
         except ValueError:
             raise ConfigError(f"around {text!r}: give X,Y,RADIUS in the map's coordinates, metres") from None
         return cls(x, y, radius)

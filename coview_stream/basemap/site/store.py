@@ -145,8 +145,8 @@ def evict(folder: Path, *keep: Path) -> None:
         raise ConfigError(f"COVIEW_CACHE_GB={text}: is no size in GB")
     files = []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
-        parts = [path, *path.rglob("*")]  # of a mirror its files
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # another process may delete it meanwhile
+            parts = [path, *path.rglob("*")]  # of a mirror its files
             used = [at.stat().st_mtime for at in (path, path.with_suffix(_MARK)) if at.exists()]
             files.append((max(used, default=0.0), sum(part.stat().st_size for part in parts if part.is_file()), path))
     total = sum(size for _, size, _ in files)

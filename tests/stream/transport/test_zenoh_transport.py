@@ -18,9 +18,10 @@ from zenoh_routers import Router, RouterProcess
 
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Transport
 from coview_stream.stream.transport.zenoh_config import compose, reason
-from coview_stream.stream.transport.zenoh_io import THREADS
+from coview_stream.stream.transport.zenoh_io import THREADS, Inboxes
 from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
 
 ROOT = Path(__file__).parents[3]
@@ -32,6 +33,21 @@ def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
     endpoint = free_endpoint()
     with closing(open_transport(listen=[endpoint])) as node, closing(open_transport([endpoint])) as robot:
         yield node, robot
+
+
+def test_closed_inbox_handles_nothing() -> None:
+    inboxes = Inboxes(RateLimitedErrors(logging.getLogger("test")))
+    worker = threading.Thread(target=inboxes.run)
+    handled: list[int] = []
+    closed = inboxes.open("a", handled.append, 10)
+    closed.close()
+    closed.put(1)
+    inboxes.open("b", handled.append, 10).put(2)
+    worker.start()
+    until(lambda: bool(handled))
+    inboxes.end()
+    worker.join(5.0)
+    assert handled == [2]
 
 
 @pytest.mark.parametrize("selector", ["**", "coview/**", "coview/*/rpc/*", "coview/@node/**", "*/r1/rpc/reset"])
