@@ -53,7 +53,7 @@ def test_real_run_is_localized(located):
     assert verdict.success
     assert verdict.false_frames == 0
     assert verdict.unmatched == 0
-    assert verdict.share_localized > 0.7
+    assert verdict.share_localised > 0.7
     assert verdict.translation.mean < 0.08
     assert verdict.rotation.mean < 0.3
     assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
@@ -81,7 +81,7 @@ def test_real_run_is_localized_on_an_airborne_like_map(tmp_path):
     verdict = evaluate(read_tum(tmp_path / "out" / "trajectory.tum"), read_tum(folder / "truth.tum"))
     assert verdict.success
     assert verdict.false_frames == 0
-    assert verdict.share_localized > 0.8
+    assert verdict.share_localised > 0.8
     assert verdict.translation.mean < 0.1
     assert verdict.rotation.mean < 0.3
 

@@ -52,7 +52,7 @@ class Tiles(Protocol):
 
 
 class MemoryArrays:
-    """Arrays by name that grow tile by tile, here in memory (files: :class:`~coview_stream.basemap.site.array_files.ArrayFiles`)."""
+    """Arrays by name that grow tile by tile, in memory."""
 
     def __init__(self) -> None:
         self._parts: dict[str, list[npt.NDArray[Any]]] = {}

@@ -45,7 +45,7 @@ def table(evaluation: Evaluation) -> str:
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     rows = [
         ("success", "yes" if evaluation.success else "no"),
-        ("localized", f"{evaluation.share_localized:.1%} of {evaluation.frames} frames"),
+        ("localized", f"{evaluation.share_localised:.1%} of {evaluation.frames} frames"),
         ("false frames", f"{evaluation.false_frames} of {evaluation.posed} poses"),
         ("first pose", first),
     ]

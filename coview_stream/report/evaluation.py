@@ -68,7 +68,7 @@ class Evaluation:
         frames: true poses.
         posed: estimated poses that have a true one within ``MAX_STAMP_GAP``.
         unmatched: estimated poses that have none.
-        share_localized: share of the frames with a right pose, 0 to 1.
+        share_localised: share of the frames with a right pose, 0 to 1.
         false_frames: wrong poses; the number that has to be zero.
         first_fix_m: metres driven before the first pose; None if there is none.
         success: the first pose is right, and more than 95 % of all.
@@ -83,7 +83,7 @@ class Evaluation:
     frames: int
     posed: int
     unmatched: int
-    share_localized: float
+    share_localised: float
     false_frames: int
     first_fix_m: float | None
     success: bool
@@ -145,7 +145,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Po
         frames=frames,
         posed=posed,
         unmatched=len(estimate[0]) - posed,
-        share_localized=len(np.unique(errors.index[right])) / frames,
+        share_localised=len(np.unique(errors.index[right])) / frames,
         false_frames=int((~right).sum()),
         first_fix_m=float(errors.distance[0]) if posed else None,
         success=bool(posed and right[0] and right.mean() > MIN_RIGHT_SHARE),

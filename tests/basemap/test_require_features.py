@@ -146,7 +146,7 @@ def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_pat
     class Recorded(serve.EngineProcess):
         def __init__(self, *given, **named):
             super().__init__(*given, **named)
-            relocs.append(self.opening.config.reloc)
+            relocs.append(given[3].reloc)
 
         def start(self):
             raise TransportError("that is enough")

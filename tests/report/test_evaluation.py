@@ -34,7 +34,7 @@ def test_perfect_trajectory_has_zero_error():
     verdict = evaluate(straight_truth(), straight_truth())
     assert verdict.success
     assert (verdict.frames, verdict.posed, verdict.false_frames) == (20, 20, 0)
-    assert verdict.share_localized == 1.0
+    assert verdict.share_localised == 1.0
     assert verdict.first_fix_m == 0.0
     assert verdict.translation.max == 0.0
     assert verdict.rotation.max < 1e-6
@@ -67,13 +67,13 @@ def test_success_thresholds(error, right):
     verdict = evaluate(shifted(**error), straight_truth())
     assert verdict.success is right
     assert verdict.false_frames == (0 if right else 20)
-    assert verdict.share_localized == (1.0 if right else 0.0)
+    assert verdict.share_localised == (1.0 if right else 0.0)
 
 
 def test_no_estimates_is_not_localized():
     verdict = evaluate(NOTHING, straight_truth())
     assert not verdict.success
-    assert (verdict.posed, verdict.false_frames, verdict.share_localized) == (0, 0, 0.0)
+    assert (verdict.posed, verdict.false_frames, verdict.share_localised) == (0, 0, 0.0)
     assert verdict.first_fix_m is None
     assert verdict.translation is None
     assert json.loads(verdict.to_json())["first_fix_m"] is None
@@ -82,7 +82,7 @@ def test_no_estimates_is_not_localized():
 def test_distance_driven_before_first_pose():
     verdict = evaluate(shifted(first=6), straight_truth())
     assert verdict.first_fix_m == pytest.approx(12.0)
-    assert verdict.share_localized == pytest.approx(14 / 20)
+    assert verdict.share_localised == pytest.approx(14 / 20)
     assert verdict.success
 
 
