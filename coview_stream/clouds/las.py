@@ -108,20 +108,15 @@ def _reader(path: Path) -> Iterator[Any]:
         size = path.stat().st_size
         with _damage_of(path):
             _check_sizes(stream, size)
-            with _quiet(logging.getLogger("laspy")):  # it warns of records that this module judges itself
+            logger = logging.getLogger("laspy")
+            level = logger.level
+            logger.setLevel(logging.ERROR)  # it warns of records that this module judges itself
+            try:
                 reader = laspy.open(stream, closefd=False)
+            finally:
+                logger.setLevel(level)
             _check_points(path, reader.header, stream, size)
         yield reader
-
-
-@contextlib.contextmanager
-def _quiet(logger: logging.Logger) -> Iterator[None]:
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def _chunks(path: Path, reader: Any) -> Iterator[tuple[Floats, npt.NDArray[np.uint8], int]]:
