@@ -112,9 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--geo", nargs="?", const="json", choices=("json", "cdr", "foxglove"),
         help="publish latitude, longitude and height as well: JSON, NavSatFix or foxglove.LocationFix (json)",
     )  # fmt: skip
-    parser.add_argument(
-        "--odometry", choices=(ROBOT, KISS_ICP), help="by the robot, or computed from its clouds (robot)"
-    )
+    parser.add_argument("--odometry", choices=(ROBOT, KISS_ICP), help="made by the robot, or of its clouds (robot)")
     add_shared(parser, "--gravity")
     limits = parser.add_argument_group("rates and limits")
     add_fields(limits, NodeConfig, _LIMITS)
@@ -124,9 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operate.md)")
-    operation.add_argument(
-        "--node", dest="node_name", metavar="NAME", help="name of the node in its keys (the first robot's)"
-    )
+    operation.add_argument("--node", dest="node_name", metavar="NAME", help="node's name in keys (the first robot's)")
     operation.add_argument("--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet")
     operation.add_argument(
         "--metrics", nargs="?", const=METRICS_ADDRESS, type=host_port("--metrics", METRICS_ADDRESS),
