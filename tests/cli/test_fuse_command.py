@@ -89,7 +89,7 @@ def test_joint_writes_trajectories_and_says_what_it_kept(site, world_run, tmp_pa
     ("arguments", "why"),
     [
         (["-o", "fused.txt"], "name a cloud"),
-        (["-o", "nowhere/fused.laz"], "in a directory that is there"),
+        (["-o", "nowhere/fused.laz"], "in an existing directory"),
         (["-o", "fused.laz", "--voxel", "0"], "voxel"),
         (["-o", "fused.laz", "--min-range", "60"], "range_min"),
     ],

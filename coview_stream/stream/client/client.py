@@ -26,8 +26,7 @@ from coview_stream.stream.transport.zenoh_transport import open_client
 
 _log = logging.getLogger(__name__)
 
-MAX_UNREAD_POSES = 100  # ten seconds of them
-_MAX_UNREAD_STATUSES = 100
+MAX_UNREAD_POSES = 100  # ten seconds of them; as many statuses
 
 
 class RobotClient:
@@ -88,7 +87,7 @@ class RobotClient:
         self._owned = transport is None
         self._transport = transport if transport is not None else open_client(endpoint, listen, config)
         self._poses: LatestQueue[PoseMessage] = LatestQueue(MAX_UNREAD_POSES)
-        self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(_MAX_UNREAD_STATUSES)
+        self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(MAX_UNREAD_POSES)
         self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
         self._closed = False
         try:

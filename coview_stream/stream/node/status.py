@@ -177,12 +177,12 @@ def hypotheses(session: Session) -> HypothesesMessage | None:
         if considered is None or session.robot_state.state.has_place:
             return None
     stamp_ns, robot, places = round(considered.stamp * 1e9), session.keys.robot, considered.places
-    if session.parts is None:
-        return HypothesesMessage(stamp_ns, robot, places, considered.none, session.map_sha256)
-    parts = [session.parts.at(place[:3]) for place in places]
-    places = places.copy()
-    places[:, :3] -= np.array([part.shift for part in parts]).reshape(-1, 3)
-    names = tuple(part.name for part in parts)
+    names: tuple[str, ...] = ()
+    if session.parts is not None:
+        parts = [session.parts.at(place[:3]) for place in places]
+        places = places.copy()
+        places[:, :3] -= np.array([part.shift for part in parts]).reshape(-1, 3)
+        names = tuple(part.name for part in parts)
     return HypothesesMessage(stamp_ns, robot, places, considered.none, session.map_sha256, maps=names)
 
 
