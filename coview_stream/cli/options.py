@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from coview_stream.config.odometry import LidarOdometryConfig
     from coview_stream.localization.search.hints import PlaceGuess
 
-
 _SHORT = {"dead_reckoning_timeout": "coast"}
 """Options that are called otherwise than their field."""
 
@@ -162,7 +161,6 @@ def host_port(option: str, example: str) -> Callable[[str], str]:
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
-
 
 SHARED: dict[str, dict[str, Any]] = {
     "run_path": {"type": Path, "metavar": "RUN", "help": "run directory, cloud file, or rosbag2, mcap, bag"},
