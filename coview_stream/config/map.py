@@ -21,13 +21,13 @@ class DescriptorConfig:
 
     Attributes:
         radius: metres that a descriptor reaches; the paper's.
-        rings: bins along it.
+        rings: bins along it; at most 100,000 in all sectors.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together. ``scan_context`` is the maximum height of every bin, ``coview`` keeps
             the bins that both views can see (eqs 1-3: horizontally visible, or dense). Unlike views (an airborne map)
             favour co-visibility, like views Scan Context, and the two together are right on both;
             ``python -m bench ablation`` compares them on simulated worlds.
-        voxel: metres; one point is kept in each cube of this size first.
+        voxel: metres; one point is kept in each cube of it.
         ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
             the sensor. ``python -m bench ablation`` compares the two.
     """
