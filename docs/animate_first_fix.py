@@ -19,7 +19,7 @@ import numpy as np
 from coview_stream import BaseMap, Fix, Localizer, LocalizerConfig
 from coview_stream.cli import main as coview_stream
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import Considered
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.recordings import open_run

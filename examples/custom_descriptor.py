@@ -18,7 +18,7 @@ from coview_stream.clouds import read_tum
 from coview_stream.config import Channel, KeyframeConfig
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.clouds import voxelized
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import exact_distances
 from coview_stream.recordings import open_run

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coview_stream.geometry.transforms import transform
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 
 def plane(corner, a, b, spacing=0.25):

@@ -13,8 +13,7 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transfo
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan, voxelized
 from coview_stream.localization.tracking.tracker import Tracker
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])

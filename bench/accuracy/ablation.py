@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.offline import locate
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.clouds import voxelized
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.recordings.open_run import open_run

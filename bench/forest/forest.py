@@ -37,8 +37,7 @@ from coview_stream.geometry.transforms import (
     transform,
 )
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan, voxelized
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex

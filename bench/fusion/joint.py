@@ -25,7 +25,7 @@ from coview_stream.fusion.constraints import Registrar, overlapping, submaps_of
 from coview_stream.fusion.joint import adjust
 from coview_stream.fusion.localized_run import LocalizedRun, RunPair
 from coview_stream.localization.offline import locate, write
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import OdometryConfig, SimulationConfig, simulate
 

@@ -18,7 +18,7 @@ from coview_stream.config import KeyframeConfig, MapConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rotation_angle, to_local
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.clouds import voxelized
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
 from coview_stream.recordings.open_run import open_run

@@ -23,7 +23,7 @@ from bench.integrity.plan import Site, plan
 from bench.integrity.run import drive_of, map_of
 from coview_stream import BaseMap, Localizer
 from coview_stream.config import LocalizerConfig
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
 
 RECORDED = 5  # keyframes of a search

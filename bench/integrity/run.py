@@ -21,7 +21,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, pose_from, rotation_angle
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex

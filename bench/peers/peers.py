@@ -34,8 +34,7 @@ from coview_stream.errors import CoViewError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, pose_from, rot_z
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence

@@ -33,8 +33,7 @@ from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, rotation_angle, to_local, transform
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
+from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
 from coview_stream.sim import SimulationConfig
 

@@ -23,7 +23,7 @@ from bench.harness.rows import Row, bounded, informs, reached
 from bench.harness.worlds import prepare
 from coview_stream import BaseMap, Localizer, LocalizerConfig
 from coview_stream.config import AcceptanceConfig
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest

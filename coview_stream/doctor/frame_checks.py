@@ -201,8 +201,7 @@ def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[_P
         return [], ""
     try:
         from coview_stream.localization.calibration.frame_motion import surface_points
-        from coview_stream.localization.registration.local_map import LocalMap
-        from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+        from coview_stream.localization.registration.clouds import LocalMap, prepare_scan, voxelized
         from coview_stream.localization.registration.register import register
     except ImportError as error:
         return [], f"{error.name} is not installed"

@@ -19,8 +19,7 @@ from coview_stream.errors import InputError
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, along_body, boxminus, inverse, pose_from, yaw_of
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
+from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 

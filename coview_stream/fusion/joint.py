@@ -34,7 +34,7 @@ from coview_stream.fusion.fuse import Progress
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, along_body, along_map, boxminus, interpolate, inverse
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
 
 # chosen by hand

@@ -15,7 +15,7 @@ from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.frame import FramePreparation, PreparedFrame
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch

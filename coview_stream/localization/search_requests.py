@@ -11,7 +11,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import RangeImage
 from coview_stream.localization.frame import FramePreparation, PreparedFrame
-from coview_stream.localization.registration.prepare_scan import thinned
+from coview_stream.localization.registration.clouds import thinned
 from coview_stream.localization.search.hints import PlaceGuess, PoseHints, robot_position
 from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest

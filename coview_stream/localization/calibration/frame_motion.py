@@ -27,8 +27,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
 from coview_stream.localization.registration.register import register
 
 # set by hand

@@ -17,8 +17,7 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points, Pose, transform
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 # set by hand on a simulated town and campus with their ground lifted by -0.2, 0 and 0.3 m, and checked on three real
 # runs and a real forest plot changed likewise (docs/tracking.md); no command prints it

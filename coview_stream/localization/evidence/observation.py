@@ -23,7 +23,7 @@ import coview_kernels as kernels
 from coview_kernels import Move
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, Pose, norms
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import RegistrationCloud
 
 _FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
 _PATCH = 4.0  # metres: neighbouring points are looked up in turn, as they lie in the same memory

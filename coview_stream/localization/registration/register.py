@@ -15,8 +15,7 @@ from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, boxminus, boxplus, skew
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 RESIDUAL_SCALE = 0.1
 """Metres: width of the Cauchy weights on the last scale of trimmed ICP."""

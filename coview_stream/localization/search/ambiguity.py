@@ -21,7 +21,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, norms, pose_from, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
 from coview_stream.localization.search.scoring import AROUND, PlaceScorer, Scored

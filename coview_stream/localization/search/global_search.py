@@ -13,8 +13,7 @@ from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
 from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.search.acceptance import Considered, SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position

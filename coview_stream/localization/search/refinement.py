@@ -20,7 +20,7 @@ from coview_stream.geometry.transforms import Pose, boxminus, pose_from, rot_z, 
 from coview_stream.localization.evidence.background import observe_with_background
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.registration.register import gravity_information, register
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place

@@ -15,7 +15,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.evidence.observation import Evidence, ObservedScan
-from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.registration.register import (
     gravity_information,
     register,

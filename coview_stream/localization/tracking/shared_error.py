@@ -14,8 +14,7 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, transform
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import RESIDUAL_SCALE
 
 UNCLUSTERED = np.array([*np.radians([0.03, 0.03, 0.001]), 0.001, 0.001, 0.001])

@@ -18,7 +18,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, transform
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
 

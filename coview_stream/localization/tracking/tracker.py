@@ -16,8 +16,7 @@ from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import (
     propagate,
     registration_covariance,

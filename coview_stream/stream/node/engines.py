@@ -19,7 +19,7 @@ from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.localization.calibration.ground_offset import GroundOffset
-from coview_stream.localization.registration.local_map import LocalMap
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 
 def site(rng, canopies=True, count=24):

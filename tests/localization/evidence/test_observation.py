@@ -13,7 +13,7 @@ from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import ObservedScan, RangeImage, ScanPart, Share, surroundings
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import prepare_scan
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 CONFIG = LocalizerConfig().registration

@@ -20,8 +20,7 @@ from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import boxminus, boxplus, exp_so3, pose_from, rot_z, transform
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import State

@@ -15,8 +15,7 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import boxminus, boxplus, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import (
     SIGMA_FLOOR,
     WEAK_FROM,

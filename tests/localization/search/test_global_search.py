@@ -17,8 +17,7 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.clouds import LocalMaps, voxelized
 from coview_stream.localization.search import global_search
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch

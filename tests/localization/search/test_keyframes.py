@@ -10,7 +10,7 @@ from small_world import ODOM_FAR
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
-from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.registration.clouds import voxelized
 from coview_stream.localization.search.keyframes import _PATIENCE, KeyframeBuffer, OdometryCheck
 
 CONFIG = KeyframeConfig(distance=2.0, capacity=4, voxel=0.25)

@@ -13,7 +13,7 @@ from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.transforms import inverse, pose_from, transform, yaw_of
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher

@@ -15,7 +15,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search import refinement
 from coview_stream.localization.search.refinement import Modes, find_modes
 from coview_stream.localization.search.request import SearchRequest

@@ -15,7 +15,7 @@ from coview_stream.config import DescriptorConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import Circle, pose_from
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search import retrieval
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, PoseHints

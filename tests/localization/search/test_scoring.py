@@ -12,7 +12,7 @@ from trackers import observed
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.scoring import PlaceScorer
 

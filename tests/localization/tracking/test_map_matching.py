@@ -13,7 +13,7 @@ from coview_kernels import Prior
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking import map_matching
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, _beside, find_rivals

@@ -8,7 +8,7 @@ from courtyard import courtyard, local_map, source_of
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import boxminus, pose_from
-from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking.shared_error import UNCLUSTERED, SharedErrorModel, clustered_covariance
 

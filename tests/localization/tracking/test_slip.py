@@ -10,7 +10,7 @@ from trackers import observed, on_the_way, refused
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxplus, inverse, pose_from, rot_z, transform
-from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate

@@ -26,7 +26,7 @@ from trackers import (
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, RegistrationConfig, TrackingConfig
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.registration.register import registration_covariance, swap_rotation_translation
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.shared_error import SharedErrorModel

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import RegistrationConfig
-from coview_stream.localization.registration.prepare_scan import height_above_lowest, prepare_scan, thinned
+from coview_stream.localization.registration.clouds import height_above_lowest, prepare_scan, thinned
 
 
 def ground(slope=0.0, half=30.0, z=5.0):
