@@ -183,6 +183,7 @@ def test_ground_error_on_delft_data(method: str) -> None:
     assert (label != mask).mean() < 0.035
 
 
+@pytest.mark.slow
 def test_outermost_point_that_float32_rounds_up_has_a_cell():
     """A point just inside of 90 m is 180.0 m from one at -90 m in float32, which is the next cell."""
     rng = np.random.default_rng(7)

@@ -60,6 +60,7 @@ def test_signature_does_not_change_the_hash_of_the_content(path, tmp_path):
     assert file_format.signer(unsigned) is None
 
 
+@pytest.mark.slow
 def test_every_flipped_byte_is_refused(path, key):
     """Of the header as well, of its padding and its signature: nothing in the file is unsigned."""
     whole = path.read_bytes()

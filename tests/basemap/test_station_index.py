@@ -39,6 +39,7 @@ def test_scores_are_near_those_of_the_exact_distances(world_map, query):
     np.testing.assert_array_equal(index.at(asked, [40, -1, 3], [7, 7, 0]), [single[40 * 60 + 7], 0.0, single[3 * 60]])
 
 
+@pytest.mark.slow
 def test_index_of_a_file_is_that_of_the_descriptors(world_map, query, tmp_path):
     world_map.save(tmp_path / "site.coview")
     loaded = BaseMap.load(tmp_path / "site.coview")
@@ -52,6 +53,7 @@ def test_index_of_a_file_is_that_of_the_descriptors(world_map, query, tmp_path):
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 def test_index_of_other_shapes_is_made_anew_or_refused(world_map, query):
     arrays = world_map.arrays
     expected = world_map.station_index.best(world_map.station_index.query(query))

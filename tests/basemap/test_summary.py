@@ -56,6 +56,7 @@ def test_survey_with_a_fault_has_a_warning(town, tmp_path, spoil, says):
     assert any(re.search(says, warning) for warning in found.warnings), found
 
 
+@pytest.mark.slow
 def test_tiles_far_apart_are_told_when_a_map_is_built(town, tmp_path):
     np.save(tmp_path / "a.npy", town)
     np.save(tmp_path / "b.npy", np.add(town, (1500.0, 0.0, 0.0)))

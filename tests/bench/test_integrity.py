@@ -137,12 +137,14 @@ def test_altered_worlds_are_mirrored_scaled_or_tilted():
     assert np.degrees(np.arccos(R[2, 2])) == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 def test_no_pose_is_right_in_a_mirrored_world_or_on_the_map_of_another_site():
     run = Run("reported", "ordinary village", "yard", 6, 0, "vlp16")
     cases = (run, replace(run, family="mirrored"), replace(run, driven="rows"))
     assert [drive_of(case).truth is None for case in cases] == [False, True, True]
 
 
+@pytest.mark.slow
 def test_the_survey_is_the_same_whatever_changes_later():
     for kind in ("yard", "rows", "suburb"):
         before, after = (draw(kind, 6, changed) for changed in (0.0, 1.0))

@@ -150,6 +150,7 @@ def test_one_pose_counts_of_each_ten_metres_with_its_reported_level():
     np.testing.assert_array_equal(Sample.joined([sample.to_json()]).trace, sample.trace)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "freedom"), [(1.0, 4.0), (0.7, 3.0), (1.5, 12.0)])
 def test_the_tail_of_drawn_errors_is_recovered(factor, freedom):
     sample = drawn(20_000, factor, freedom)

@@ -21,6 +21,7 @@ def survey(tmp_path):
     return tmp_path / "base.laz"
 
 
+@pytest.mark.slow
 def test_a_survey_becomes_an_airborne_like_cloud(survey, tmp_path, capsys):
     out = tmp_path / "air.laz"
     assert main(["airborne", str(survey), "-o", str(out), "--density", "4"]) == 0

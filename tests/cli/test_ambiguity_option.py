@@ -29,6 +29,7 @@ def made_up(base_map, drive, wrong=False):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_option_prints_a_sentence_and_draws(world_file, tmp_path, capsys):
     picture = tmp_path / "ambiguity.png"
     assert main(["info", str(world_file), "--ambiguity", "-o", str(picture)]) == 0

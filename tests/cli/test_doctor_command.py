@@ -106,6 +106,7 @@ def test_wrong_robot_name_suggests_the_right_one(capsys):
     )
 
 
+@pytest.mark.slow
 def test_no_robot_on_the_network(capsys):
     endpoint = free_endpoint()
     code, found = findings_of(capsys, "--robot", "r1", "--connect", endpoint)

@@ -10,6 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 
 
+@pytest.mark.slow
 def test_info_prints_map_facts_and_draws_the_map(world_file, tmp_path, capsys):
     base_map = BaseMap.load(world_file)
     assert main(["info", str(world_file), "--plot", str(tmp_path / "map.png")]) == 0

@@ -13,6 +13,7 @@ from coview_stream.cli import main
 from coview_stream.clouds.trajectory import read_tum, write_tum
 
 
+@pytest.mark.slow
 def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["locate", str(world_file), str(world_run), "-o", str(out)]) == 0

@@ -37,6 +37,7 @@ def turned_run(world_run, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_run_of_a_turned_lidar_is_localized_as_that_of_the_body(world_file, world_run, turned_run, tmp_path, capsys):
     command = ["locate", str(world_file)]
     assert main([*command, str(world_run), "-o", str(tmp_path / "a"), "--no-pictures"]) == 0

@@ -47,6 +47,7 @@ def test_map_that_is_not_to_be_trusted_is_one_line_and_exit_code_2(site, refused
     assert str(site / (key if "key" in said and "another" not in said else map_name)) in line
 
 
+@pytest.mark.slow
 def test_build_signs_and_info_tells(map_cloud_file, site, capsys):
     target = site / "built.coview"
     options = ["--radius", "30", "--no-learned", "--sign", str(site / "ours.key")]

@@ -42,6 +42,7 @@ def decoded(child: DecodingChild, path: Path) -> int:
     return len(builder.finish("cloud"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the child by Linux's /proc")
 def test_decoder_that_dies_costs_one_error_and_the_next_file_is_read(tmp_path):
     write_cloud(tmp_path / "a.laz", np.tile(POINTS, (40_000, 1)))  # several chunks, more than a pipe holds
@@ -54,6 +55,7 @@ def test_decoder_that_dies_costs_one_error_and_the_next_file_is_read(tmp_path):
     child.close()
 
 
+@pytest.mark.slow
 def test_file_given_up_half_way_leaves_nothing_for_the_next(tmp_path):
     write_cloud(tmp_path / "a.laz", np.tile(POINTS, (40_000, 1)))
     write_cloud(tmp_path / "b.laz", POINTS)
@@ -64,6 +66,7 @@ def test_file_given_up_half_way_leaves_nothing_for_the_next(tmp_path):
     child.close()
 
 
+@pytest.mark.slow
 def test_the_process_that_decodes_laz_imports_nothing_from_the_current_directory(tmp_path):
     write_cloud(tmp_path / "a.laz", POINTS)
     (tmp_path / "laspy.py").write_text("open('executed', 'w')")

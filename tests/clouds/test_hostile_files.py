@@ -17,6 +17,7 @@ AXES = "property float x\nproperty float y\nproperty float z\n"
 ROWS = np.arange(6, dtype="<f4").tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "at", "number", "reason"),
     [

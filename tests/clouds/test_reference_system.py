@@ -122,6 +122,7 @@ def test_covariance_turns_with_the_axes():
     np.testing.assert_allclose(np.trace(found), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("crs", "says"), [(None, "build it with --crs"), ("nonsense", "no place on Earth")])
 def test_map_without_a_place_on_earth_says_so(crs, says):
     with pytest.raises(InputError, match=says):

@@ -66,11 +66,13 @@ def frames(scene):
     return [SeenFrame(0.5 * k, cloud, pose) for k, (cloud, pose) in enumerate(pairs)]
 
 
+@pytest.mark.slow
 def test_unspoilt_drive_is_ok(frames):
     assert [(f.what, f.verdict) for f in frame_findings(frames)] == [("ground", "ok"), ("motion", "ok")]
 
 
 # this drive is nearly straight: there an inverse is told as a lidar that is turned on the body
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "inverse"])
 def test_fault_is_found(frames, fault):
     spoil, words = FAULTS[fault]
@@ -84,6 +86,7 @@ def test_standing_robot_is_told_to_drive(frames):
     assert "drive" in motion.remedy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "words"), [(4, "too few frames"), (7, "too few frames"), (10, "odometry follows")])
 def test_three_motions_that_agree_are_sure_and_two_are_not(frames, count, words):
     motion = next(f for f in frame_findings(frames[:count]) if f.what == "motion")
@@ -91,6 +94,7 @@ def test_three_motions_that_agree_are_sure_and_two_are_not(frames, count, words)
     assert motion.found.startswith(words)
 
 
+@pytest.mark.slow
 def test_remedy_of_an_upside_down_lidar_is_its_mount(frames):
     spoil, _ = FAULTS["upside down"]
     (finding,) = frame_findings([spoil(f) for f in frames])

@@ -95,6 +95,7 @@ def test_robots_on_the_network_are_listed_without_robot_option():
     assert [f.verdict for f in findings(MemoryTransport(), [], keys=[])] == ["warn"]
 
 
+@pytest.mark.slow
 def test_fault_of_one_robot_does_not_affect_another():
     other = robot_keys("native", "coview", "r2")
     found = findings(MemoryTransport(), DRIVE, keys=[KEYS, other])

@@ -25,6 +25,7 @@ def assert_same(ours, plain):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @given(clouds(), st.integers(0, 2**32 - 1), st.sampled_from([2.0, 30.0, 500.0]))
 def test_kernel_agrees_with_numpy(cloud, seed, radius):
     rng = np.random.default_rng(seed)

@@ -74,6 +74,7 @@ def assert_same(ours, plain, pivot):
     assert ours.rmse == pytest.approx(plain.rmse, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]),

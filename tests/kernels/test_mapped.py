@@ -68,6 +68,7 @@ def test_rows_are_copied_in_the_order_asked_for_and_missing_ones_refused(windowe
             take_rows(given, np.array([3, len(array)]))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_single_codes_of_a_large_file_take_little_memory(tmp_path, monkeypatch, windows):
     rng = np.random.default_rng(8)

@@ -65,6 +65,7 @@ def test_docs_have_the_transition_table_and_every_state():
 # ---- a localizer
 
 
+@pytest.mark.slow
 def test_localizer_moves_only_along_the_table(world_map, world_drive):
     """Searched for and found, asked to verify, covered, seeing garbage, lost and found again."""
     localizer, states = Localizer(world_map), [State.SEARCHING]

@@ -194,6 +194,7 @@ def test_reset_starts_a_new_odometry_frame(cloud):
     assert np.allclose(odometry.step(cloud, None, 3.0), np.eye(4))
 
 
+@pytest.mark.slow
 def test_walls_correct_drifting_tilt(cloud):
     tilt = np.eye(4)
     tilt[:3, :3] = [[np.cos(2e-4), 0, np.sin(2e-4)], [0, 1, 0], [-np.sin(2e-4), 0, np.cos(2e-4)]]

@@ -229,6 +229,7 @@ def test_segment_around_a_sweep():
 stamps = st.one_of(st.integers(0, 60).map(lambda k: 0.05 * k), st.floats(-10.0, 10.0), st.floats(-9e8, 9e8))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(stamps, st.floats(0.0, 0.7), st.floats(-3.0, 3.0)), max_size=60))
 def test_buffer_stays_sorted_for_random_stamps(samples):

@@ -36,6 +36,7 @@ def under(points, half):
     return (np.abs(points[:, :2]) < half).all(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [4.0, 8.0, 20.0])
 def test_roof_and_ground_remain_with_the_density_asked_for(house, density):
     seen = airborne_survey(house, Survey(density=density))
@@ -45,6 +46,7 @@ def test_roof_and_ground_remain_with_the_density_asked_for(house, density):
     assert ground.sum() / (60.0**2 - (2 * SIZE + 12.0) ** 2) == pytest.approx(density, rel=0.3)
 
 
+@pytest.mark.slow
 def test_facades_and_the_floor_under_the_roof_go(house):
     seen = airborne_survey(house, Survey(density=8.0))
     between = (seen[:, 2] > 0.5) & (seen[:, 2] < HEIGHT - 0.7)
@@ -65,6 +67,7 @@ def test_walls_without_a_roof_keep_their_tops_only():
     assert above[:, 2].min() > HEIGHT - 1.0
 
 
+@pytest.mark.slow
 def test_foliage_lets_pulses_through_and_solid_surfaces_do_not():
     rng = np.random.default_rng(5)
     x, y = sheet((-15.0, 15.0), (-15.0, 15.0))
@@ -81,6 +84,7 @@ def test_foliage_lets_pulses_through_and_solid_surfaces_do_not():
         assert (under(seen, 5.0) & (seen[:, 2] > 4.0)).sum() / 100.0 > 6.0
 
 
+@pytest.mark.slow
 def test_noise_is_along_the_ray_and_strips_can_be_misaligned(house):
     far = ~under(house, SIZE + 8.0)
     exact = house[far] * [1.0, 1.0, 0.0]

@@ -39,6 +39,7 @@ def test_simulated_files_follow_the_run_layout(world):
     assert truth[0, 2, 2] > 0.98
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_bytes_and_others_another_world(world, tmp_path):
     simulate(tmp_path / "b", TINY)
     names = sorted(path.relative_to(world) for path in world.rglob("*") if path.is_file())
@@ -127,6 +128,7 @@ def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_another_drive_seed_is_another_run_through_the_same_world():
     from coview_stream.sim.simulate import scene_of, trajectories
 

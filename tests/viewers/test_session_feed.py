@@ -106,6 +106,7 @@ def test_everything_comes_decoded_and_a_broken_sink_silences_no_other(net, kept)
     assert kept.closed
 
 
+@pytest.mark.slow
 def test_a_sink_that_hangs_holds_up_no_publisher(net, kept):
     going_on = threading.Event()
     kept.pose = lambda pose: going_on.wait(20.0)
@@ -160,6 +161,7 @@ def test_a_scan_comes_with_the_pose_of_its_time_and_mounted(net, kept):
     assert np.allclose(scan.T_map_body[:3, 3], [1.0, 0.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_scan_of_a_robot_without_a_pose_comes_without(net, kept):
     with feed(net, kept):
         net.publish(cloud(0.0))

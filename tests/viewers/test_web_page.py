@@ -126,6 +126,7 @@ def test_a_page_that_reads_nothing_is_dropped_and_holds_up_nobody(served):
     assert longest < 0.2  # far below the time that the page was waited for by its own thread
 
 
+@pytest.mark.slow
 def test_more_connections_than_allowed_are_hung_up_on(served):
     with contextlib.ExitStack() as stack:
 

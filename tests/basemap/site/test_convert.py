@@ -29,6 +29,7 @@ def test_each_cube_keeps_the_point_nearest_to_its_mean():
     assert len(one_of_each_cube(points[:0])) == 0
 
 
+@pytest.mark.slow
 def test_light_copy_is_a_site_of_fewer_points_with_the_same_cells(site, cache, tmp_path):
     before = Manifest.load(site)
     light = lighten(site, tmp_path / "light")
@@ -50,6 +51,7 @@ def test_light_copy_is_a_site_of_fewer_points_with_the_same_cells(site, cache, t
         lighten(tmp_path / "light", tmp_path / "lighter")
 
 
+@pytest.mark.slow
 def test_robot_is_found_on_a_light_copy(site, cache, tmp_path, world_drive):
     lighten(site, tmp_path / "light")
     fixes = follow(Localizer(BaseMap.load(tmp_path / "light")), world_drive, 8)

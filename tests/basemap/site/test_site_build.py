@@ -57,6 +57,7 @@ class Interrupted(Executor):
             yield number, result
 
 
+@pytest.mark.slow
 def test_order_of_the_files_changes_nothing(site, halves, tmp_path):
     built = build_site([halves / "b.las", halves / "a.las"], tmp_path / "other", CONFIG)
     assert built.manifest == Manifest.load(site)
@@ -77,6 +78,7 @@ def test_number_of_workers_changes_nothing(site, halves, tmp_path):
     }  # nothing else is left
 
 
+@pytest.mark.slow
 def test_build_that_was_broken_off_goes_on(site, halves, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         build_site(halves, tmp_path / "other", CONFIG, executor=Interrupted(3))
@@ -105,6 +107,7 @@ def test_new_survey_of_a_part_builds_only_what_is_near(halves, map_points, tmp_p
     assert len(first.manifest.hashes() & second.manifest.hashes()) >= 4  # of the first world's far side
 
 
+@pytest.mark.slow
 def test_source_that_cannot_be_read_is_named_and_left_out_if_that_is_wanted(halves, tmp_path):
     (tmp_path / "broken.laz").write_bytes((halves / "a.las").read_bytes()[:5000])
     sources = [halves / "a.las", halves / "b.las", tmp_path / "broken.laz"]
@@ -123,6 +126,7 @@ class Failing(Executor):
             yield number, MapError("broken") if broken else result
 
 
+@pytest.mark.slow
 def test_tile_that_fails_is_named_and_left_out_if_that_is_wanted(halves, tmp_path):
     with pytest.raises(MapError, match="tile 0, 0: broken"):
         build_site(halves, tmp_path / "site", CONFIG, executor=Failing())
@@ -147,6 +151,7 @@ def test_directories_and_sources_that_no_site_can_be_built_of(halves, tmp_path):
         build_site(tmp_path / "few.las", tmp_path / "y", CONFIG)
 
 
+@pytest.mark.slow
 def test_site_is_as_good_a_map_as_one_file(site, world_map, world_drive, cache):
     base_map = BaseMap.load(site)
     assert base_map.crs == world_map.crs
@@ -164,6 +169,7 @@ def test_site_is_as_good_a_map_as_one_file(site, world_map, world_drive, cache):
     assert np.linalg.norm(error) < 0.1
 
 
+@pytest.mark.slow
 def test_codes_are_those_of_the_descriptors(site, cache):
     """Made tile by tile, as if all had been described at once; stations beside a tile's edge see across it."""
     from coview_stream.basemap.station_index import StationIndex
@@ -176,6 +182,7 @@ def test_codes_are_those_of_the_descriptors(site, cache):
     np.testing.assert_allclose(*found, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_working_file_is_made_once_and_again_where_the_site_changes(site, cache, tmp_path):
     first, again = BaseMap.load(site), BaseMap.load(site)
     assert first.path == again.path
@@ -183,6 +190,7 @@ def test_working_file_is_made_once_and_again_where_the_site_changes(site, cache,
     assert [path.suffix for path in sorted(cache.iterdir()) if path.is_file()] == [".checked", ".coview", ".lock"]
 
 
+@pytest.mark.slow
 def test_working_file_is_compared_with_its_checksum_once_and_made_again_where_it_is_damaged(site, cache):
     path = BaseMap.load(site).path
     whole = path.read_bytes()
@@ -197,6 +205,7 @@ def test_working_file_is_compared_with_its_checksum_once_and_made_again_where_it
     assert path.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not(site, cache, tmp_path):
     base_map = BaseMap.load(site)
     assert isinstance(base_map.field.layers.bits, np.memmap)
@@ -208,6 +217,7 @@ def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not
         np.testing.assert_array_equal(stored, made)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("station_codes.StationCodes.MAX_STATIONS", 100), ("field._MAX_TABLE", 2)])
 def test_site_that_is_too_large_for_one_map_is_to_be_opened_in_parts(site, cache, monkeypatch, name, most):
     monkeypatch.setattr(f"coview_kernels.{name}", most)
@@ -216,6 +226,7 @@ def test_site_that_is_too_large_for_one_map_is_to_be_opened_in_parts(site, cache
     assert not list(cache.glob("*.coview"))
 
 
+@pytest.mark.slow
 def test_damaged_and_swapped_layers_are_named(site, cache, tmp_path):
     manifest = Manifest.load(site)
     store = TileStore(tmp_path)
@@ -235,6 +246,7 @@ def test_damaged_and_swapped_layers_are_named(site, cache, tmp_path):
     assert len(BaseMap.load(tmp_path))
 
 
+@pytest.mark.slow
 def test_map_in_one_file_becomes_a_site_and_one_file_again(world_map, learned_map, tmp_path, cache):
     for number, base_map in enumerate((world_map, learned_map)):
         directory = tmp_path / f"site{number}"

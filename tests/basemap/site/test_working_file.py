@@ -24,6 +24,7 @@ def keys_of(site):
     return [(tile.column, tile.row) for tile in Manifest.load(site).tiles]
 
 
+@pytest.mark.slow
 def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, taken, monkeypatch, tmp_path):
     monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
     some = set(keys_of(site)[1:3])
@@ -44,6 +45,7 @@ def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, 
     np.testing.assert_array_equal(part["station_codes"], whole["station_codes"][own])
 
 
+@pytest.mark.slow
 def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, monkeypatch):
     monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 10**6)
     some = set(keys_of(site)[:2])
@@ -53,6 +55,7 @@ def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, m
     assert not np.array_equal(part["station_codes.basis"], whole["station_codes.basis"])
 
 
+@pytest.mark.slow
 def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken, monkeypatch):
     monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
     working_file(site, keys=set(keys_of(site)[:1]))
@@ -69,6 +72,7 @@ def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, tak
     assert right >= 0.9 * len(wanted)
 
 
+@pytest.mark.slow
 def test_tile_whose_neighbour_was_not_there_is_made_again(site, cache, taken, tmp_path):
     manifest = Manifest.load(site)
     mirror, there = tmp_path / "mirror", manifest.tiles[0]
@@ -84,6 +88,7 @@ def test_tile_whose_neighbour_was_not_there_is_made_again(site, cache, taken, tm
     assert taken() == [0]
 
 
+@pytest.mark.slow
 def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
     first = working_file(site, keys=set(keys_of(site)[:2]))
     with first.open("r+b") as file:

@@ -68,6 +68,7 @@ def test_structure_that_stands_as_it_did_speaks_against_growth():
     assert offset.metres == pytest.approx(0.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_offset_is_corrected_once_it_is_probable_and_its_end_is_followed_smoothly():
     """Grass that ends is no step in height."""
     offset = GroundOffset()

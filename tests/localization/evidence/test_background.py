@@ -158,6 +158,7 @@ def test_chance_places_lie_around_at_all_sides():
     assert np.abs(around[:, 3] - 0.2).min() > 0.0
 
 
+@pytest.mark.slow
 def test_background_is_what_the_places_around_the_first_pose_explain(world_map, seen):
     away = T_MAP_ODOM.copy()
     away[:2, 3] += [0.9, -0.7]

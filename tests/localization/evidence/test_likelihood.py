@@ -231,6 +231,7 @@ def too_often(draw, searches, times=1.0):
     return {error: count for error, count in counts.items() if count > binom.ppf(0.999, searches, error)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("draw", "searches"),
     [

@@ -149,6 +149,7 @@ def test_no_place_is_nothing():
     assert Considered.of(Scored(Rivals(), []), search_request(), np.zeros(3)) is None
 
 
+@pytest.mark.slow
 def test_a_search_brings_the_right_place_along(world_map, world_drive):
     localizer = Localizer(world_map)
     results = []

@@ -27,6 +27,7 @@ def rows_map(tmp_path_factory):
     return BaseMap.build(path, radius=30.0)
 
 
+@pytest.mark.slow
 def test_distinct_buildings_are_told_apart_and_equal_rows_are_not(world_map, rows_map):
     distinct, equal = (ambiguity(each, count=PLACES) for each in (world_map, rows_map))
     assert np.median(distinct.lead) > 2.0 * np.median(equal.lead)
@@ -49,6 +50,7 @@ def test_changes_and_a_smaller_risk_make_places_harder_to_tell_apart(world_map):
     assert not np.isfinite(none.drive).any()
 
 
+@pytest.mark.slow
 def test_same_map_gives_the_same_and_progress_counts_to_the_end(world_map):
     calls = []
     first = ambiguity(world_map, count=4, progress=lambda done, total: calls.append((done, total)))
@@ -77,6 +79,7 @@ def seen(base_map, eye, changed=0.0):
     return scan
 
 
+@pytest.mark.slow
 def test_walls_hide_what_is_behind_them(tmp_path_factory):
     wall = Box(np.array([8.0, 0.0]), np.array([1.0, 20.0, 6.0]), 0.0)
     behind = Box(np.array([16.0, 0.0]), np.array([3.0, 3.0, 4.0]), 0.0)
@@ -91,6 +94,7 @@ def test_walls_hide_what_is_behind_them(tmp_path_factory):
     assert (high[:, 0] > -15.5).all()  # nor the far side of a building
 
 
+@pytest.mark.slow
 def test_changes_are_the_same_from_wherever_they_are_seen(world_map):
     eyes = [(-12.0, -4.0, EYE), (-10.0, -4.0, EYE)]
     before, after = (seen(world_map, eyes[0], changed).cloud for changed in (0.0, 0.5))

@@ -98,6 +98,7 @@ def twin_map(map_points, tmp_path_factory):
     return BaseMap.build(path, radius=30.0)
 
 
+@pytest.mark.slow
 def test_identical_places_never_fix(twin_map, world_drive):
     assert Localizer(twin_map).step(world_drive.clouds[2], world_drive.T_odom_body[2], 0.0).T_map_body is None
     search = searching(twin_map)

@@ -263,6 +263,7 @@ def counted(monkeypatch):
     return made
 
 
+@pytest.mark.slow
 def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch):
     localizer = misled(Localizer(world_map), world_drive)
     made = counted(monkeypatch)
@@ -271,6 +272,7 @@ def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch)
     assert made == [1] * hints._TRIES + [0] * 4 + [1]
 
 
+@pytest.mark.slow
 def test_hint_outside_the_map_is_not_refuted(world_map, world_drive, monkeypatch):
     localizer = voteless(Localizer(world_map))
     made = counted(monkeypatch)

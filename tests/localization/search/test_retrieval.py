@@ -255,6 +255,7 @@ def test_circle_without_ground_is_searched_by_nothing(world_map, world_drive):
     assert result.fix.state is State.SEARCHING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lifted", [False, True])
 def test_result_of_a_search_from_before_the_circle_is_not_taken(world_map, world_drive, lifted):
     localizer = Localizer(world_map)

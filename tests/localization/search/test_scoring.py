@@ -164,6 +164,7 @@ def test_keyframes_far_apart_are_kept(world_map, world_drive):
     assert sum(held) < len(held) - 4
 
 
+@pytest.mark.slow
 def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_drive):
     """An open field first: what is kept of each keyframe stays that keyframe's when the oldest are forgotten."""
     for k in range(3):

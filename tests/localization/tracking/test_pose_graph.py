@@ -220,6 +220,7 @@ def dense(way):
     return X[-1], np.linalg.inv(H)[-6:, -6:]
 
 
+@pytest.mark.slow
 def test_newest_pose_equals_dense_solution(graph):
     """With an outlier of metres among the corrections; residuals here are along the map's axes, not the body's."""
     way = drive(8, seed=2, every=2)

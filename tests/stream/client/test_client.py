@@ -279,6 +279,7 @@ def test_malformed_endpoint_is_refused():
         RobotClient("r1", "nonsense")
 
 
+@pytest.mark.slow
 def test_client_over_real_sockets():
     endpoint = free_endpoint()
     clouds, odometry = [], []

@@ -79,6 +79,7 @@ def test_metrics_are_prometheus_text(site):
     assert len(samples) == len({line.rpartition(" ")[0] for line in samples})
 
 
+@pytest.mark.slow
 def test_health_is_published_and_answered(site):
     health = NodeHealth(site.node)
     health.answer(KEYS)
@@ -145,6 +146,7 @@ def test_bad_address_is_refused(address):
         metrics_server(address, dict)
 
 
+@pytest.mark.slow
 def test_telling_goes_on_after_something_could_not_be_told(site):
     calls = []
 

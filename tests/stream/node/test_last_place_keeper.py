@@ -267,6 +267,7 @@ def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, caplog):
     assert "unforeseen" in caplog.text
 
 
+@pytest.mark.slow
 def test_running_node_saves_periodically_and_at_close(tmp_path):
     site = Site("r1")
     site.node.start({"last-pose": LastPlaceKeeper(tmp_path, list(site.sessions.values()), interval=0.5).run})

@@ -73,6 +73,7 @@ def test_dead_track_engine_loses_all_robots(pair):
         assert pair.status(name)["state"] == "TRACKING"
 
 
+@pytest.mark.slow
 def test_engine_that_died_while_idle_is_reported(pair, caplog):
     pair.frame("r1", 0.0)
 
@@ -93,6 +94,7 @@ def test_engine_that_died_while_idle_is_reported(pair, caplog):
 REPLACED = "site.coview: has been replaced by another map; start the node (serve) again"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["track", "search"])
 def test_repeated_engine_restart_reason_is_reported(pair, engine, caplog):
     def die(text):
@@ -170,6 +172,7 @@ def test_search_engine_failure_is_reported(site):
     assert site.status("r1")["counters"]["searches"] == 1
 
 
+@pytest.mark.slow
 def test_repeated_failures_are_rate_limited_in_the_log(site, caplog):
     site.engine.failing["r1"] = ValueError("bad frame")
     for k in range(50):

@@ -6,6 +6,7 @@ import json
 import time
 
 import numpy as np
+import pytest
 from fake_node import STEP, declared
 from fake_robot import SHA, T_MAP_ODOM, message, ns
 from small_world import pose_error
@@ -18,6 +19,7 @@ from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 from coview_stream.stream.transport.rmw import NO_HASH, gid_of
 
 
+@pytest.mark.slow
 def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
     site = declared("r1", engines=(TrackEngine(world_map), SearchEngine(world_map)))
     right = []

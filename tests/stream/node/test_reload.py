@@ -120,6 +120,7 @@ def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
     assert hints[1] is None  # told once
 
 
+@pytest.mark.slow
 def test_robot_that_begins_anew_after_a_change_that_it_slept_through_has_poses_again(changes):
     change = changes("r1", max_handover=0.1)
     change.step = 5000

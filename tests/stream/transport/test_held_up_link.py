@@ -66,6 +66,7 @@ def test_odometry_goes_before_clouds_on_a_thin_link():
         node.close()
 
 
+@pytest.mark.slow
 def test_odometry_that_waits_is_sent_before_a_client_closes():
     with Router() as router:
         robot = RobotClient("r1", router.endpoint)
