@@ -117,9 +117,12 @@ class KeyframeBuffer:
         self._in_part += 1
 
     def recent(self, count: int) -> Points:
-        """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since."""
+        """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since.
+
+        The newest come first: thinning keeps the first point of a voxel, and old ones are off by odometry's drift.
+        """
         scans = [*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending]
-        parts = [scan.levelled(self.calibration) for scan in scans]
+        parts = [scan.levelled(self.calibration) for scan in reversed(scans)]
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
@@ -148,8 +151,8 @@ class KeyframeBuffer:
         self._in_part = 0
 
     def _merged(self, newest: RawScan) -> RawScan:
-        """Return all frames since the newest keyframe as one."""
-        frames = [scan.levelled(self.calibration) for scan in self._pending]
+        """Return all frames since the newest keyframe as one, the newest first."""
+        frames = [scan.levelled(self.calibration) for scan in reversed(self._pending)]
         return RawScan(self._unique(np.concatenate(frames)), newest.T_odom_body, self.calibration)
 
     def _unique(self, points: Points, voxel: float | None = None) -> Points:

@@ -57,6 +57,18 @@ def test_points_between_keyframes_go_into_the_next_one():
     assert len(points_of(keyframe)) == 2
 
 
+def test_newest_points_come_first_so_that_thinning_keeps_them():
+    """Odometry has drifted by a centimetre at every frame: the newest sees the corner where it is from its own pose."""
+    buffer, drifted = KeyframeBuffer(CONFIG), [9.01, 9.02, 9.03]
+    for x, metres in zip(drifted, (0.0, 1.0, 2.5), strict=True):
+        buffer.add(RawScan(np.array([[x, 0.1, 0.1]], np.float32), at(metres)), metres)
+    assert len(buffer.keyframes) == 2
+    np.testing.assert_allclose(points_of(buffer.keyframes[-1])[:, 0], drifted[-1:])  # of two frames in one voxel
+    np.testing.assert_allclose(buffer.recent(2)[:, 0], [9.03, 9.01])
+    buffer.add(RawScan(np.array([[9.04, 0.1, 0.1]], np.float32), at(3.0)), 3.0)  # no keyframe yet
+    np.testing.assert_allclose(buffer.recent(2)[:, 0], [9.04, 9.03, 9.01])
+
+
 def test_keyframe_buffer_keeps_its_capacity():
     buffer = KeyframeBuffer(CONFIG)
     for k in range(9):
@@ -105,7 +117,7 @@ def test_points_beyond_reach_are_dropped():
     buffer.add(RawScan(np.array([[6.0, 0.0, 0.0]], np.float32), at(5.0)), 1.0)
     scan = buffer.virtual_scan(np.array([5.0, 0.0, 1.5]), 99.0, 0.25)
     np.testing.assert_array_equal(np.sort(scan[:, 0]), [1.0, 6.0])
-    np.testing.assert_array_equal(buffer.recent(2), [*behind, [6.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(buffer.recent(2), [[6.0, 0.0, 0.0], *behind])
 
 
 def test_clear_drops_all_keyframes():
