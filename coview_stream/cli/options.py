@@ -221,7 +221,12 @@ def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/1
 def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> None:
     """Declare the options of a simulated world that ``demo`` and ``simulate`` share, with their defaults in metres."""
     parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
-    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
+    parser.add_argument(
+        "--sensor",
+        default="vlp16",
+        help="vlp16, vlp16-inclined (and turning), os64, os64-2048, mid360, bpearl (a hemisphere) or blk360 (on a "
+        "tripod: the robot stands while it scans) (vlp16)",
+    )
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
     parser.add_argument("--size", type=float, default=size, help=f"side of the map, metres ({size:g})")
     parser.add_argument("--length", type=float, default=length, help=f"distance driven, metres ({length:g})")

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from coview_stream.cli.options import add_shared, add_world
+from coview_stream.cli.options import add_shared, add_world, mount_of
 from coview_stream.errors import ConfigError, InputError, require_library
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="record survey, scans, truth and odometry for Foxglove or rerun as well (extra: foxglove)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a world simulated there before")
-    add_shared(parser, "--progress")
+    add_shared(parser, "--mount", "--progress")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,15 +81,18 @@ def run(args: argparse.Namespace) -> int:
             tilt_noise=args.drift * drift.tilt_noise,
         ),
         dirt=parse_dirt(args.dirt, args.dirt_seed),
+        mount=mount_of(args),
     )
     progress = args.progress or sys.stderr.isatty()
     world = simulate(args.out, config, progress=progress, overwrite=args.overwrite)
     facts = f"{world.base_points} map points, {world.frames} frames, {world.distance:.1f} m driven"
     print(f"{world.directory}: {facts}")
+    if args.mount is not None:
+        print(f"frames are the sensor's: coview-stream locate ... --mount={args.mount}")
     for line in config.dirt.describe():
         print(f"dirt: {line}")
     if args.mcap is not None:
         from coview_stream.viewers.foxglove_sink import record_world
 
-        print(f"{args.mcap}: {record_world(args.out, args.mcap)} frames")
+        print(f"{args.mcap}: {record_world(args.out, args.mcap, config.mount)} frames")
     return 0

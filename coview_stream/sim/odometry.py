@@ -44,16 +44,18 @@ class OdometryConfig:
         within(self, **{field.name: (0.0, 1e5 if field.name == "offset" else 1.0) for field in fields(self)})
 
 
-def drive(scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator) -> Floats:
-    """Return poses (N, 4, 4) of the sensor in the scene, one every 0.1 s over ``length`` metres.
+def drive(
+    scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator, period: float = FRAME_PERIOD
+) -> Floats:
+    """Return poses (N, 4, 4) of the sensor in the scene, one every ``period`` seconds over ``length`` metres.
 
     Start and direction on the route are drawn; a long drive goes round again. The sensor is ``height``
     metres above the ground, and pitches and rolls with it.
     """
     route = scene.route if rng.random() < 0.5 else scene.route[::-1]
     arc = arc_lengths(route)
-    count = int(length / (speed * FRAME_PERIOD)) + 1
-    at = (rng.uniform(0, arc[-1]) + np.arange(count) * speed * FRAME_PERIOD) % arc[-1]
+    count = int(length / (speed * period)) + 1
+    at = (rng.uniform(0, arc[-1]) + np.arange(count) * speed * period) % arc[-1]
     heading = np.interp(at, arc, np.unwrap(directions(route)))
     sideways = _WANDER * np.sin(2 * np.pi * at / rng.uniform(25, 45) + rng.uniform(0, 2 * np.pi))
     x = np.interp(at, arc, route[:, 0]) - sideways * np.sin(heading)

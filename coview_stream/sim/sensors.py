@@ -1,6 +1,7 @@
 """Lidars of robots: beam directions, range, noise and lost pulses.
 
-Sensor frame: x forward, y left, z up; a frame is 0.1 s. Figures are set by hand, after the sensors' data sheets.
+Sensor frame: x forward, y left, z up. A frame is 0.1 s, or the scan of a terrestrial scanner, which a robot stands
+for. Figures are set by hand, after the sensors' data sheets.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class Caster(MeshCaster):
 
 
 FRAME_PERIOD = 0.1
-"""Seconds from frame to frame."""
+"""Seconds from frame to frame, but of a robot that stops to scan."""
 
 RANGE_NOISE = 0.02
 """Metres, one sigma."""
@@ -137,6 +138,8 @@ class Sensor:
     beams: Callable[[int], Floats]  # frame number -> (N, 3) unit directions in the sensor frame
     min_range: float  # metres; nearer returns are dropped
     max_range: float  # metres, at perpendicular incidence
+    stop: float = 0.0  # metres from scan to scan of a robot that stands while it scans; 0: it scans as it drives
+    stand: float = 0.0  # seconds that it stands
 
     def scan(
         self,
@@ -191,6 +194,43 @@ def _vlp16() -> Sensor:
     return Sensor("vlp16", _spinning(elevation, firing, 1800), 0.5, 100.0)
 
 
+INCLINATION = float(np.radians(45.0))
+"""Of the axis of the rotating VLP-16, radians."""
+
+TURNS = 0.5
+"""Turns of the whole sensor about the vertical, per second."""
+
+
+def _inclined() -> Sensor:
+    """Return FGLoc6D's VLP-16: inclined, and turning about the vertical as a whole. Its frames do not turn with it."""
+    upright = _vlp16()
+    rays, c, s = upright.beams(0), np.cos(INCLINATION), np.sin(INCLINATION)
+    x, y, z = (rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])).T
+    within = np.arange(len(rays)) // 16 / 1800
+
+    def beams(frame: int) -> Floats:
+        angle = 2 * np.pi * TURNS * FRAME_PERIOD * (frame + within)
+        c, s = np.cos(angle), np.sin(angle)
+        return np.column_stack([c * x - s * y, s * x + c * y, z])
+
+    return Sensor("vlp16-inclined", beams, upright.min_range, upright.max_range)
+
+
+def _bpearl() -> Sensor:
+    """Return a hemisphere, RoboSense's RS-Bpearl: 32 rings from 2.3 to 89.5 degrees, a column each 0.2 degrees."""
+    elevation = np.radians(2.3125 + 2.8125 * np.arange(32))
+    return Sensor("bpearl", _spinning(elevation, np.zeros(32), 1800), 0.1, 100.0)
+
+
+def _blk360() -> Sensor:
+    """Return a terrestrial scanner, Leica's BLK360 (2017): 360 x 300 degrees, on a robot that stops each 5 m.
+
+    Its beams, 0.1 degrees apart in its fastest scan, are thinned to 0.6: 150,000 are left.
+    """
+    elevation = np.radians(np.arange(-59.7, 90.0, 0.6))
+    return Sensor("blk360", _spinning(elevation, np.zeros(250), 600), 0.6, 60.0, stop=5.0, stand=40.0)
+
+
 def _os64(name: str = "os64", columns: int = 512) -> Sensor:
     elevation = np.radians(np.linspace(22.5, -22.5, 64))
     staggered: Floats = np.radians(np.tile([3.16, 1.05, -1.05, -3.16], 16))
@@ -208,7 +248,10 @@ def _mid360_beams(frame: int) -> Floats:
 
 SENSORS: dict[str, Callable[[], Sensor]] = {
     "vlp16": _vlp16,
+    "vlp16-inclined": _inclined,
     "os64": _os64,
     "os64-2048": partial(_os64, "os64-2048", 2048),  # its densest mode, 131,072 beams
     "mid360": partial(Sensor, "mid360", _mid360_beams, 0.1, 70.0),
+    "bpearl": _bpearl,
+    "blk360": _blk360,
 }

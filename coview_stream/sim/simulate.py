@@ -1,7 +1,7 @@
 """A simulated world on disk: a base map, a run of a robot, and the truth.
 
 OUT/base.laz                   airborne scan, map frame
-OUT/run/frames/000000.pcd ...  deskewed frames, body frame
+OUT/run/frames/000000.pcd ...  deskewed frames, sensor frame (the body's, without a mount)
 OUT/run/odometry.tum           odom <- body, drifting
 OUT/sweeps                     of a world with motion: a ROS recording with the raw sweeps and more odometry
 OUT/truth.tum                  map <- body
@@ -25,6 +25,7 @@ import numpy as np
 from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config.checks import within
+from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
@@ -48,7 +49,7 @@ class SimulationConfig:
     """
 
     scene: str = "town"  # town, campus, village, industrial or forest
-    sensor: str = "vlp16"  # vlp16, os64, os64-2048 or mid360
+    sensor: str = "vlp16"  # vlp16, vlp16-inclined, os64, os64-2048, mid360, bpearl or blk360
     seed: int = 1  # of all random numbers; equal configurations give equal files
     size: float = 240.0  # side of the square map, metres
     length: float = 80.0  # distance driven, metres
@@ -60,6 +61,7 @@ class SimulationConfig:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)  # errors of the odometry
     dirt: Dirt = field(default_factory=Dirt)  # further imperfections; none by default
     drive_seed: int = 0  # of the drive, its scans and its odometry: another run through the same world
+    mount: Mount = field(default_factory=Mount)  # of the sensor on the body
 
     def __post_init__(self) -> None:
         for name, choices in (("scene", KINDS), ("sensor", SENSORS)):
@@ -81,12 +83,14 @@ class SimulationConfig:
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, for JSON; ``dirt`` and ``drive_seed`` only where they are set."""
+        """Return all fields as plain values, for JSON; ``dirt``, ``drive_seed`` and ``mount`` only if set."""
         values = asdict(self) | {"dirt": self.dirt.to_dict()}
         if not self.dirt.kinds:
             del values["dirt"]
         if not self.drive_seed:
             del values["drive_seed"]
+        if self.mount == Mount():
+            del values["mount"]
         return values
 
 
@@ -129,7 +133,8 @@ def simulate(
         stamps, truth, odometry = trajectories(scene, config)
         (staging / "run" / "frames").mkdir(parents=True)
         bar.begin("drive", len(truth))
-        with nullcontext() if config.dirt.motion is None else Recording(staging / "sweeps") as recording:
+        still = config.dirt.motion is None or SENSORS[config.sensor]().stop
+        with nullcontext() if still else Recording(staging / "sweeps") as recording:
             for k, points in enumerate(frames(scene, config, truth, odometry, recording)):
                 write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
                 bar.advance(1)
@@ -172,10 +177,14 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
 
 
 def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats, Floats]:
-    """Return stamps (N,) in seconds, true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4)."""
-    truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE))
+    """Return stamps (N,) in seconds, true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4).
+
+    A robot that stops to scan has one of each where it stands.
+    """
+    moving = _seconds(config)[0]
+    truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE), moving)
     odometry = drifting_odometry(truth, config.odometry, _stream(config, _ODOMETRY))
-    stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
+    stamps = _stamps(config, len(truth))
     dirt = config.dirt
     if dirt.odometry is not None:
         odometry = dirt.odometry.apply(odometry, _dirt_stream(config, Stream.ODOMETRY))
@@ -193,21 +202,31 @@ def frames(
     odometry: Floats | None = None,
     recording: Recording | None = None,
 ) -> Iterator[Points]:
-    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame.
+    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, sensor frame.
 
     ``odometry`` (N, 4, 4) deskews raw sweeps; without it the truth does. ``recording`` takes the raw sweeps of a world
     with motion.
     """
     sensor = SENSORS[config.sensor]()
     if config.dirt.on_sensor:
-        scanner = Scanner(scene, sensor, config.dirt, config.height, partial(_dirt_stream, config))
-        stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
+        scanner = Scanner(scene, sensor, config.dirt, config.height, partial(_dirt_stream, config), config.mount)
+        stamps = _stamps(config, len(truth))
         yield from scanner.frames(stamps, truth, truth if odometry is None else odometry, recording)
         return
     caster, rng = Caster(scene.now), _stream(config, _SENSOR)
     T: Pose
     for k, T in enumerate(truth):
-        yield sensor.scan(caster, T, k, rng)
+        yield sensor.scan(caster, T @ config.mount.T_body_sensor, k, rng)
+
+
+def _seconds(config: SimulationConfig) -> tuple[float, float]:
+    """Return the seconds that the robot drives, and those that it stands, from frame to frame."""
+    sensor = SENSORS[config.sensor]()
+    return (sensor.stop / config.speed, sensor.stand) if sensor.stop else (FRAME_PERIOD, 0.0)
+
+
+def _stamps(config: SimulationConfig, count: int) -> Floats:
+    return _FIRST_STAMP + sum(_seconds(config)) * np.arange(count, dtype=np.float64)
 
 
 def _dirt_stream(config: SimulationConfig, purpose: Stream) -> np.random.Generator:

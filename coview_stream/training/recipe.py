@@ -10,7 +10,8 @@ import numpy as np
 from coview_stream.config.checks import counts, positive
 from coview_stream.errors import ConfigError
 from coview_stream.sim.kinds import KINDS
-from coview_stream.training.sensors import TRAINED_DIRT, TRAINED_SENSORS
+from coview_stream.sim.sensors import SENSORS
+from coview_stream.training.sensors import TRAINED_DIRT
 
 Range = tuple[float, float]
 
@@ -79,7 +80,7 @@ class Recipe:
             if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
                 bounds = f"stay, smallest first, within {low:g} to {high:g}"
                 raise ConfigError(f"{name}: {value!r} is out of range; {bounds}")
-        for name, choices in (("kinds", tuple(KINDS)), ("sensors", TRAINED_SENSORS)):
+        for name, choices in (("kinds", tuple(KINDS)), ("sensors", tuple(SENSORS))):
             values = getattr(self, name)
             if not values or not set(values) <= set(choices):
                 raise ConfigError(f"{name}: {values!r}; use one or more of {', '.join(choices)}")

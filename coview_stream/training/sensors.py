@@ -1,9 +1,8 @@
 """Sensors of training drives, and their dirt.
 
-The sensors are the simulator's, and FGLoc6D's VLP-16, inclined by 45 degrees and rotating as a whole. The dirt is the
-part of :mod:`coview_stream.sim.dirt` that matters in a forest: a leaning sensor, beams of finite width, noise that
-grows with the range, tall grass, each up to twice its default strength. Seasons are the recipe's ``leaf_off``. Dirt has
-random numbers of its own: a drive without it stays the same.
+The sensors are the simulator's. The dirt is the part of :mod:`coview_stream.sim.dirt` that matters in a forest: a
+leaning sensor, beams of finite width, noise that grows with the range, tall grass, each up to twice its default
+strength. Seasons are the recipe's ``leaf_off``. Dirt has random numbers of its own: a drive without it stays the same.
 """
 
 from __future__ import annotations
@@ -19,28 +18,14 @@ from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.sim.dirt.optics import Beams
 from coview_stream.sim.dirt.robot import Mounting
 from coview_stream.sim.dirt.scene import Grass
-from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, Sensor
+from coview_stream.sim.sensors import SENSORS, Caster, Sensor
 
-INCLINATION = float(np.radians(45.0))
-"""Of the sensor's axis, radians."""
-
-TURNS = 0.5
-"""Turns of the whole sensor about the vertical, per second."""
-
-_COLUMNS = 1800
-_ROTATING = "vlp16-inclined"
-
-TRAINED_SENSORS = (*SENSORS, _ROTATING)
-"""Names for :func:`trained_sensor`."""
-
-_GROUP = {"vlp16": 16, "os64": 64, "os64-2048": 64, _ROTATING: 16}  # beams fired together
+_GROUP = {"vlp16": 16, "vlp16-inclined": 16, "os64": 64, "os64-2048": 64, "bpearl": 32}  # beams fired together
 
 
 def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
     """Make a sensor by its name; ``stride`` maps its number of beams to n: only every n-th column is cast."""
-    sensor = SENSORS["vlp16" if name == _ROTATING else name]()
-    if name == _ROTATING:
-        sensor = Sensor(name, _rotating(sensor.beams(0)), sensor.min_range, sensor.max_range)
+    sensor = SENSORS[name]()
     nth = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
     if nth == 1:
         return sensor
@@ -52,20 +37,6 @@ def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sen
         return np.asarray(rays[(np.arange(len(rays)) // group + frame) % nth == 0])
 
     return Sensor(name, thinned, sensor.min_range, sensor.max_range)
-
-
-def _rotating(rays: Floats) -> Callable[[int], Floats]:
-    """Incline the rays (N, 3) of one frame, and turn them about the vertical meanwhile."""
-    c, s = np.cos(INCLINATION), np.sin(INCLINATION)
-    x, y, z = (rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])).T
-    within = np.arange(len(rays)) // (len(rays) // _COLUMNS) / _COLUMNS
-
-    def beams(frame: int) -> Floats:
-        angle = 2 * np.pi * TURNS * FRAME_PERIOD * (frame + within)
-        c, s = np.cos(angle), np.sin(angle)
-        return np.column_stack([c * x - s * y, s * x + c * y, z])
-
-    return beams
 
 
 TRAINED_DIRT = ("mounting", "beams", "grass")

@@ -11,6 +11,7 @@ import numpy as np
 from coview_stream.basemap.summary import MapView
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_to_tum, rot_z, transform
@@ -208,11 +209,11 @@ class FoxgloveSink(Sink):
         return self._messages.Timestamp(seconds, rest)
 
 
-def record_world(world: Path, out: Path) -> int:
+def record_world(world: Path, out: Path, mount: Mount | None = None) -> int:
     """Write a simulated world as ``out`` (MCAP, Foxglove's schemas), at the run's stamps.
 
     ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts there and goes
-    where odometry leads.
+    where odometry leads. ``mount`` is that of the lidar.
 
     Returns:
         Number of frames.
@@ -226,7 +227,7 @@ def record_world(world: Path, out: Path) -> int:
     try:
         survey = read_cloud(world / "base.laz")
         sink.map(MapView.of_cloud(survey.points, survey.origin))
-        run = open_run(world / "run")
+        run = open_run(world / "run", mount=mount)
         _, truth = read_tum(world / "truth.tum")
         T_map_odom = truth[0] @ inverse(run.poses[0])
         for frame, T_map_body in zip(run, truth, strict=True):

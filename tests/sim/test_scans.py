@@ -61,18 +61,25 @@ def test_the_robot_stands_on_the_road(scene, run):
     assert np.einsum("ij,ij->i", heading, step / np.linalg.norm(step, axis=1)[:, None]).min() > 0.98
 
 
+FIELDS = {  # lowest and highest beam, degrees, and rings, after the data sheets
+    "vlp16": (-15, 15, 16), "vlp16-inclined": (-60, 60, None), "os64": (-22.5, 22.5, 64), "mid360": (-7, 52, None),
+    "os64-2048": (-22.5, 22.5, 64), "bpearl": (2.3, 89.5, 32), "blk360": (-59.7, 89.7, 250),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("name", sorted(SENSORS))
 def test_beam_directions_are_unit_vectors_and_repeat_as_specified(name):
     sensor = SENSORS[name]()
     first, second = sensor.beams(0), sensor.beams(1)
     assert np.linalg.norm(first, axis=1) == pytest.approx(1.0)
-    assert np.array_equal(first, second) is (name != "mid360")
+    assert np.array_equal(first, second) is (name not in ("mid360", "vlp16-inclined"))
     elevation = np.degrees(np.arcsin(first[:, 2]))
-    low, high = {"vlp16": (-15, 15), "mid360": (-7, 52)}.get(name, (-22.5, 22.5))
+    low, high, rows = FIELDS[name]
     assert elevation.min() == pytest.approx(low, abs=0.1)
     assert elevation.max() == pytest.approx(high, abs=0.1)
-    rows = {"vlp16": 16, "os64": 64, "os64-2048": 64}.get(name)
     assert rows is None or len(np.unique(elevation.round(6))) == rows
+    azimuth = np.degrees(np.arctan2(first[:, 1], first[:, 0])) % 360
+    assert np.diff(np.sort(azimuth)).max() < 1.0  # all round
 
 
 def cast_down(scene, porosity, count=4000):

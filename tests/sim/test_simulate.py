@@ -8,12 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud, read_tum
+from coview_stream.config.mount import parse_mount
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import Dirt, Simulated, SimulationConfig, simulate
+from coview_stream.sim.dirt.robot import Motion
+from coview_stream.sim.simulate import frames, scene_of, trajectories
 
 TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 ORIGIN = (412_000.0, 5_318_000.0, 240.0)
@@ -96,6 +100,44 @@ def test_only_an_earlier_simulated_world_is_replaced(world, tmp_path):
     assert not (copy / "run" / "frames" / "999999.pcd").exists()
 
 
+def test_frames_of_a_mounted_sensor_are_its_own_and_the_option_turns_them_back(tmp_path, capsys):
+    argv = ["simulate", str(tmp_path / "m"), "--scene", "village", "--seed", "5", "--size", "80", "--length", "0"]
+    assert main([*argv, "--density", "2", "--mount=0,45,0,0.3,0,0.2"]) == 0
+    assert "locate ... --mount=0,45,0,0.3,0,0.2" in capsys.readouterr().out
+    mount = parse_mount("0,45,0,0.3,0,0.2")
+    raw, body = (next(iter(open_run(tmp_path / "m" / "run", mount=given))).points for given in (None, mount))
+    np.testing.assert_allclose(body, mount.to_body(raw), atol=1e-5)
+    elevation = np.degrees(np.arctan2(raw[:, 2], np.hypot(raw[:, 0], raw[:, 1])))
+    assert np.abs(elevation).max() < 15.1
+    ahead = body[(np.abs(body[:, 1]) < 1.0) & (body[:, 0] > 0.5)]
+    assert len(ahead) > 500  # a nose down by 45 degrees sees the road before the robot
+    assert np.abs(ahead[:, 2] + 1.5).max() < 0.4
+
+
+@pytest.mark.slow
+def test_a_mounted_moving_sensor_is_deskewed_as_an_upright_one(tmp_path):
+    moving = replace(TINY, length=1.0, dirt=Dirt(motion=Motion()))
+    turned = replace(moving, mount=parse_mount("0,0,90"))
+    clouds = []
+    for name, config in (("a", moving), ("b", turned)):
+        simulate(tmp_path / name, config)
+        clouds.append([frame.points for frame in open_run(tmp_path / name / "run", mount=config.mount)][-1])
+        assert len(open_run(tmp_path / name / "sweeps", mount=config.mount)) > 0
+    apart = cKDTree(clouds[0]).query(clouds[1])[0]  # another beam leaves first, on the same surfaces
+    assert np.median(apart) < 0.1
+
+
+def test_a_robot_with_a_terrestrial_scanner_stands_while_it_scans():
+    config = replace(TINY, sensor="blk360", length=11.0, speed=0.5)
+    scene = scene_of(config)
+    stamps, truth, odometry = trajectories(scene, config)
+    np.testing.assert_allclose(np.diff(stamps), 40.0 + 5.0 / 0.5)
+    assert len(truth) == len(odometry) == 3
+    np.testing.assert_allclose(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1), 5.0, atol=0.2)
+    cloud = next(frames(scene, config, truth))
+    assert 50_000 < len(cloud) < 150_000
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -130,8 +172,6 @@ def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, 
 
 @pytest.mark.slow
 def test_another_drive_seed_is_another_run_through_the_same_world():
-    from coview_stream.sim.simulate import scene_of, trajectories
-
     first, other = SimulationConfig(seed=3), SimulationConfig(seed=3, drive_seed=1)
     scenes = [scene_of(config) for config in (first, other)]
     assert np.array_equal(scenes[0].now.solid.vertices, scenes[1].now.solid.vertices)

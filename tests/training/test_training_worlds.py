@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from coview_stream.descriptors.birds_eye_view import LAYERS
 from coview_stream.errors import ConfigError, InputError
+from coview_stream.sim.sensors import INCLINATION
 from coview_stream.training.drives import CLEARANCE, between_trees
 from coview_stream.training.recipe import Recipe
-from coview_stream.training.sensors import INCLINATION, trained_sensor
+from coview_stream.training.sensors import trained_sensor
 from coview_stream.training.stands import Stand, draw_stand
 from coview_stream.training.trees import PATTERNS, draw_stems
 from coview_stream.training.worlds import (

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Bools, Floats, Floats32
-from coview_stream.geometry.transforms import Points, Pose, Poses
+from coview_stream.geometry.transforms import Points, Pose, Poses, inverse, transform
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
 from coview_stream.odometry.buffer import Segment
@@ -21,7 +22,7 @@ from coview_stream.sim.dirt.robot import Track, beam_times
 from coview_stream.sim.dirt.scene import Cover, Movers, Seasons, drawn_parts
 from coview_stream.sim.mesh import join
 from coview_stream.sim.scenes import Parts, Scene
-from coview_stream.sim.sensors import FRAME_PERIOD, POROSITY, RANGE_NOISE, MeshCaster, Sensor
+from coview_stream.sim.sensors import POROSITY, RANGE_NOISE, MeshCaster, Sensor
 
 CLOUDS, ODOMETRY = "/points", "/odom"
 """Topics of the recording."""
@@ -51,7 +52,7 @@ class Recording:
     def add(self, points: Points, times: Floats, segment: Segment) -> None:
         """Add a sweep that bears the stamp of its segment's end, and new samples of the segment's odometry before it.
 
-        ``points`` (N, 3) float32 metres are each in the body frame at their ``times`` (N,), seconds after the stamp.
+        ``points`` (N, 3) float32 metres are each in the sensor frame at their ``times`` (N,), seconds after the stamp.
         """
         for stamp, pose in zip(segment.stamps.tolist(), segment.poses, strict=True):
             if stamp > self._newest:
@@ -149,39 +150,47 @@ class Scanner:
     """Lidar in a dirty world; read frames in order, they share random numbers."""
 
     def __init__(
-        self, scene: Scene, sensor: Sensor, dirt: Dirt, height: float, rng: Callable[[Stream], np.random.Generator]
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        dirt: Dirt,
+        height: float,
+        rng: Callable[[Stream], np.random.Generator],
+        mount: Mount = Mount(),  # noqa: B008 - immutable
     ) -> None:
         """Use the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's."""
-        self._sensor, self._dirt, self._height = sensor, dirt, height
+        self._sensor, self._dirt, self._height, self._mount = sensor, dirt, height, mount
         covered = dirt.snow is not None or dirt.grass is not None
         cover = Cover(scene.site, dirt.snow, dirt.grass, rng(Stream.COVER)) if covered else None
         self._surfaces = Surfaces(scene, cover, dirt.glass, rng(Stream.GLASS))
         self._movers = None if dirt.traffic is None else Movers(scene.site, dirt.traffic, rng(Stream.TRAFFIC))
-        self.T_body_sensor = np.eye(4) if dirt.mounting is None else dirt.mounting.draw(rng(Stream.MOUNTING))
+        leant = np.eye(4) if dirt.mounting is None else dirt.mounting.draw(rng(Stream.MOUNTING))
+        self.T_body_sensor = leant @ mount.T_body_sensor
         self._rng, self._sky = rng(Stream.BEAMS), rng(Stream.WEATHER)
 
     def frames(
         self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses, recording: Recording | None = None
     ) -> Iterator[Points]:
-        """Yield frames (N, 3) float32 metres, in the robot's assumed body frame, at stamps (N,), seconds.
+        """Yield frames (N, 3) float32 metres, in the sensor's frame, at stamps (N,), seconds.
 
         The odometry (N, 4, 4) deskews raw sweeps, which ``recording`` takes as well where the robot moves meanwhile.
         """
-        motion = self._dirt.motion
+        motion = None if self._sensor.stop else self._dirt.motion
         track = None if motion is None else Track(stamps, T_scene_body, T_odom_body)
         for k, T in enumerate(T_scene_body):
-            points, times = self.sweep(k, T, track)
+            points, times = self.sweep(k, T, track, float(stamps[k] - stamps[0]))
             if track is not None and motion is not None:
                 if recording is not None:
                     recording.add(points, times, track.segment(k, motion.rate))
                 if motion.deskewed:
-                    points = track.straightened(k, points, times, motion.rate)
+                    straight = track.straightened(k, self._mount.to_body(points), times, motion.rate)
+                    points = transform(inverse(self._mount.T_body_sensor), straight)
             yield points
 
-    def sweep(self, frame: int, T_scene_body: Pose, track: Track | None) -> tuple[Points, Floats]:
+    def sweep(self, frame: int, T_scene_body: Pose, track: Track | None, seconds: float) -> tuple[Points, Floats]:
         """Return points (N, 3) in the sensor frame at their times, and the times (N,), seconds after the stamp.
 
-        Without a track all beams leave at once, at the stamp.
+        The stamp is ``seconds`` after the first one. Without a track all beams leave at once, at the stamp.
         """
         rays = self._sensor.beams(frame)
         times = beam_times(len(rays))
@@ -193,7 +202,7 @@ class Scanner:
         origins, towards = poses[which, :3, 3].astype(np.float32), poses[which, :3, :3]
         moving = None
         if self._movers is not None:
-            moving = MeshCaster([self._movers.around(T_scene_body, frame * FRAME_PERIOD)], {})
+            moving = MeshCaster([self._movers.around(T_scene_body, seconds)], {})
         echoes = self._echoes(origins, rays, towards, moving)
         distance = self._weather(echoes, rays)
         noise = np.full(len(rays), RANGE_NOISE)
