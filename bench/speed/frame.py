@@ -85,7 +85,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     def plain() -> list[Floats32]:
         grid, _ = reference.polar_bin(points, centre, config.rings, config.sectors, config.radius)
         highest = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
-        return [highest, reference.coview(*grid)]
+        return [highest, reference.coview(grid.max_height, grid.count)]
 
     ours = partial(describe, points, centre, config)
     if not all(map(np.array_equal, ours().values(), plain())):

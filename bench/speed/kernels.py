@@ -42,7 +42,9 @@ def cases() -> Iterator[tuple[str, Callable[..., Any], Callable[..., Any], tuple
     at = rng.integers(0, 600, (2, 300)).astype(np.int32)
     raster = (top, count, 0.5, *at, rng.normal(size=300).astype(np.float32), 20, 60, 50.0)
     yield "station_bins 300", ck.station_bins, reference.station_bins, raster
-    yield "coview 300", ck.coview, reference.coview, reference.station_bins(*raster)
+    grid = reference.station_bins(*raster, raster_mean=top - 1.0)
+    yield "coview 300", ck.coview, reference.coview, grid[:2]
+    yield "paper_context 300", ck.paper_context, reference.paper_context, grid
     along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))  # a street's ground and two walls
     parts = [np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])]
     parts += [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]

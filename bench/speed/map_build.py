@@ -65,7 +65,7 @@ def baseline(cloud: Floats32, stations: Floats32, chosen: Indices) -> tuple[floa
         near = thin[tree.query_ball_point(station[:2], config.radius)]
         grid, _ = reference.polar_bin(near, station, config.rings, config.sectors, config.radius)
         found["scan_context"].append(np.where(grid.count > 0, np.maximum(grid.max_height, 0), 0))
-        found["coview"].append(reference.coview(*grid))
+        found["coview"].append(reference.coview(grid.max_height, grid.count))
     each = (time.perf_counter() - begin) / len(chosen)
     return once, each, {name: np.stack(values) for name, values in found.items()}
 

@@ -1,4 +1,4 @@
-"""Building of a map in memory: clouds to arrays (paper, section 3.1, and the virtual reference scans of 3.2)."""
+"""Building of a map in memory: clouds to arrays with the paper's virtual reference scans."""
 
 from __future__ import annotations
 

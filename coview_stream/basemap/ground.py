@@ -1,4 +1,4 @@
-"""Ground of a base map: its points and heights, by cloth simulation (paper, section 3.1) or a morphological filter."""
+"""Ground of a base map: its points and heights, by cloth simulation (as in the paper) or a morphological filter."""
 
 from __future__ import annotations
 

@@ -53,7 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans")
     for name, (kind, text) in _OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N", help=text)
-    parser.add_argument("--channels", metavar="A,B", help="descriptor channels that vote (scan_context,coview)")
+    parser.add_argument(
+        "--channels",
+        metavar="A,B",
+        help="descriptor channels that vote: scan_context, coview, paper (scan_context,coview)",
+    )
     parser.add_argument(
         "--learned",
         action=argparse.BooleanOptionalAction,

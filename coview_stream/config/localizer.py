@@ -99,7 +99,7 @@ class RegistrationConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """Keyframes: when the robot's frames become a virtual local scan, VLS (paper, section 3.3); set by hand.
+    """Keyframes: when the robot's frames become a virtual local scan, VLS (of the paper); set by hand.
 
     Attributes:
         distance: metres driven from keyframe to keyframe, the paper's sigma_d.

@@ -9,13 +9,13 @@ from typing import Any, Literal, get_args
 from coview_stream.config.checks import check_types, counts, positive, require
 from coview_stream.errors import ConfigError
 
-Channel = Literal["scan_context", "coview"]
+Channel = Literal["scan_context", "coview", "paper"]
 Preset = Literal["slam", "tls"]
 
 
 @dataclass(frozen=True)
 class DescriptorConfig:
-    """Polar descriptor of a virtual scan (paper, section 3.2, eqs 1-4); set by hand where the paper gives no value.
+    """Polar descriptor of a virtual scan (paper, eqs 1-4); set by hand where the paper gives no value.
 
     Stored in the map and read back from it, so that map and robot cannot drift apart.
 
@@ -23,10 +23,10 @@ class DescriptorConfig:
         radius: metres that a descriptor reaches; the paper's.
         rings: bins along it; at most 100,000 in all sectors.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
-        channels: descriptors that vote together. ``scan_context`` is the maximum height of every bin, ``coview`` keeps
-            the bins that both views can see (eqs 1-3: horizontally visible, or dense). Unlike views (an airborne map)
-            favour co-visibility, like views Scan Context, and the two together are right on both;
-            ``python -m bench ablation`` compares them on simulated worlds.
+        channels: descriptors that vote together. ``scan_context`` is the greatest height of every bin. ``paper`` is the
+            co-view context as printed (eqs 1-4): the greatest height of bins that are horizontally co-visible only, the
+            mean height of bins that are vertically co-visible as well. ``coview`` keeps bins that are either, with
+            their greatest heights. ``python -m bench ablation`` compares them and their sums.
         voxel: metres; one point is kept in each cube of it.
         ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
             the sensor. ``python -m bench ablation`` compares the two.
@@ -52,7 +52,7 @@ class DescriptorConfig:
 
 @dataclass(frozen=True)
 class MapConfig:
-    """Building of a base map (paper, section 3.1); set by hand where the paper gives no value.
+    """Building of a base map; set by hand where the paper gives no value.
 
     Attributes:
         descriptor: of the stations.

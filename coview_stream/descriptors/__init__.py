@@ -1,1 +1,1 @@
-"""Descriptors of places: co-view context (paper, section 3) and learned features."""
+"""Descriptors of places: co-view context (paper, eqs 1-4) and learned features."""

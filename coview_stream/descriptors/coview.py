@@ -1,4 +1,4 @@
-"""Co-view descriptor: channels of the polar bins of a virtual scan (paper, section 3.2, eqs 1-4)."""
+"""Co-view descriptor: channels of the polar bins of a virtual scan (paper, eqs 1-4)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,22 @@ from coview_stream.geometry.transforms import Points
 Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
-_VERTICAL: Literal["max", "off"] = "max"  # ``off`` is the strict reading of eq. 2; bench ablation compares them
+_VERTICAL: Literal["max", "off"] = "max"  # ``off`` keeps what eq. 2 alone does; bench ablation compares them
 _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
 
-    In ``scan_context`` heights below zero (ground in a hollow) count as zero.
+    In ``scan_context`` heights below zero (ground in a hollow) count as zero; ``paper`` needs a grid with mean heights.
     """
     if name == "scan_context":
         value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
         return value
-    return kernels.coview(*grid, vertical=_VERTICAL)
+    if name == "paper":
+        assert grid.mean_height is not None
+        return kernels.paper_context(grid.max_height, grid.count, grid.mean_height)
+    return kernels.coview(grid.max_height, grid.count, vertical=_VERTICAL)
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:

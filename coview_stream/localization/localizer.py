@@ -32,7 +32,7 @@ _DEFERRED = 3.0  # factor on the metres and seconds between deferred registratio
 
 
 class Localizer:
-    """Localization of one robot on a base map (paper, Algorithm 1, and a graph of poses from the first fix on).
+    """Localization of one robot on a base map (paper, eqs 1-13, and a graph of poses from the first fix on).
 
     Attributes:
         base_map: the map; may be shared by many localizers.

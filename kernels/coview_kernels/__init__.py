@@ -8,7 +8,7 @@ can be called from any thread. Importing this package does not import Taichi; th
 from __future__ import annotations
 
 from coview_kernels.arrays import OverheadGrid, PolarGrid, Raster
-from coview_kernels.covisibility import coview
+from coview_kernels.covisibility import coview, paper_context
 from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.distinct import distinct_poses
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, Move, field_scores, near_structure, unexplained
@@ -55,6 +55,7 @@ __all__ = [
     "near_structure",
     "nearest",
     "offsets_near",
+    "paper_context",
     "polar_bin",
     "shutdown",
     "station_bins",

@@ -11,18 +11,23 @@ Integers = ti.types.ndarray(i32, 1)
 SPAN = launch.SPAN
 
 
+OFF, MAX, PAPER = 0, 1, 2
+
+
 @ti.func
 def describe_grid(
-    at: i32, rings: i32, sectors: i32, vertical: i32, highest: ti.template(), count: ti.template(), value: ti.template()
-):
+    at: i32, rings: i32, sectors: i32, rule: i32,
+    highest: ti.template(), count: ti.template(), mean: ti.template(), value: ti.template(),
+):  # fmt: skip
     """Write the context of the grid that begins at ``at``.
 
-    vertical: 0 off, 1 greatest height. Slopes are h / (i + 1) with i from 0; they are compared by products that are
-    exact, see reference/.
+    Slopes are h / (i + 1) with i from 0; they are compared by products that are exact, see reference/. Bins that are
+    vertically visible only have the value 0 (OFF, PAPER) or their greatest height (MAX); bins that are visible both
+    ways have their mean height by PAPER, which also sees bins on the line of sight itself. ``mean`` is read by PAPER.
     """
     size = rings * sectors
     points = ti.cast(0, ti.i64)
-    if vertical != 0:
+    if rule != OFF:
         for b in range(at, at + size):
             points += ti.max(count[b], 0)
     for j in range(sectors):
@@ -36,19 +41,23 @@ def describe_grid(
                 top = highest[b]
                 h = ti.cast(top, ti.f64)
                 a = i + 1
-                if best_a == 0 or h * best_a > a * best_h:
+                dense = ti.cast(n, ti.i64) * size >= points
+                if best_a == 0 or h * best_a > a * best_h or (rule == PAPER and h * best_a == a * best_h):
                     best_h = h
                     best_a = a
                     out = top
-                elif vertical != 0 and ti.cast(n, ti.i64) * size >= points:
+                    if rule == PAPER and dense:
+                        out = mean[b]
+                elif rule == MAX and dense:
                     out = top
             value[b] = out
 
 
 @ti.kernel
 def coview(
-    grids: i32, chunks: i32, rings: i32, sectors: i32, vertical: i32, highest: Floats, count: Integers, value: Floats
-):
+    grids: i32, chunks: i32, rings: i32, sectors: i32, rule: i32,
+    highest: Floats, count: Integers, mean: Floats, value: Floats,
+):  # fmt: skip
     """Write the contexts of all grids."""
     for q in range(chunks * SPAN):
         if q % SPAN == 0:
@@ -56,4 +65,4 @@ def coview(
             step = (grids + chunks - 1) // chunks
             for m in range(ti.min(grids, c * step), ti.min(grids, (c + 1) * step)):
                 at = m * rings * sectors
-                describe_grid(at, rings, sectors, vertical, highest, count, value)
+                describe_grid(at, rings, sectors, rule, highest, count, mean, value)

@@ -73,7 +73,7 @@ def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges:
 @ti.func
 def add(
     start: i32, n: i32, first: i32, points: ti.template(), rings: i32, sectors: i32,
-    params: ti.template(), edges: ti.template(), highest: ti.template(), count: ti.template(),
+    params: ti.template(), edges: ti.template(), highest: ti.template(), count: ti.template(), total: ti.template(),
 ):  # fmt: skip
     """Add ``n`` points, at most BLOCK, to the bins that begin at ``first``; see ``bins``."""
     size = rings * sectors
@@ -109,6 +109,7 @@ def add(
         top = highest[b]
         highest[b] = ti.select(top > h, top, h)
         count[b] = count[b] + 1  # += would be atomic: a locked instruction, 20 times as slow
+        total[b] = total[b] + h
     if near > 0:
         for j in range(n):
             if at[j] == first + size + NEAR:
@@ -118,14 +119,15 @@ def add(
                 b = first + exact_bin(dx, dy, rings, sectors, per_metre, edges)
                 highest[b] = ti.max(highest[b], height[j])
                 count[b] = count[b] + 1
+                total[b] = total[b] + height[j]
 
 
 @ti.kernel
 def bins(
     points: Floats, rows: i32, chunks: i32, rings: i32, sectors: i32,
-    params: Doubles, edges: Doubles, highest: Floats, count: Integers,
+    params: Doubles, edges: Doubles, highest: Floats, count: Integers, total: Doubles,
 ):  # fmt: skip
-    """Add ``rows`` points to the bins of their chunks.
+    """Add ``rows`` points to the bins of their chunks: greatest height, number, and sum of the heights.
 
     A chunk has R S bins and three more: points beyond ``r_max``, points that are not finite, points near an edge.
     ``params``: centre x, y, z, rings per metre. All arrays are flat: an index into more axes costs a read of the
@@ -141,7 +143,7 @@ def bins(
             for block in range((end - begin + BLOCK - 1) // BLOCK):
                 start = begin + block * BLOCK
                 n = ti.min(BLOCK, end - start)
-                add(start, n, first, points, rings, sectors, params, edges, highest, count)
+                add(start, n, first, points, rings, sectors, params, edges, highest, count, total)
 
 
 @ti.kernel
@@ -170,3 +172,22 @@ def station_bins(
                     if number > 0:
                         highest[m * size + b] = ti.cast(ti.cast(best, f64) - floor, f32)
                         count[m * size + b] = number
+
+
+@ti.kernel
+def station_means(
+    stations: i32, chunks: i32, size: i32, total: Doubles, base: Integers, ground: Floats,
+    starts: Integers, offsets: Integers, count: Integers, mean: Floats,
+):  # fmt: skip
+    """Mean heights of the bins that ``station_bins`` counted; ``total``: sum of the heights of each padded cell."""
+    for q in range(chunks * SPAN):
+        if q % SPAN == 0:
+            c = q // SPAN
+            step = (stations + chunks - 1) // chunks
+            for m in range(ti.min(stations, c * step), ti.min(stations, (c + 1) * step)):
+                for b in range(size):
+                    if count[m * size + b] > 0:
+                        heights = ti.cast(0.0, f64)
+                        for k in range(starts[b], starts[b + 1]):
+                            heights += total[base[m] + offsets[k]]
+                        mean[m * size + b] = ti.cast(heights / count[m * size + b] - ti.cast(ground[m], f64), f32)

@@ -28,12 +28,14 @@ VERTICALS: tuple[Vertical, ...] = get_args(Vertical)
 
 
 class PolarGrid(NamedTuple):
-    """Heights and counts in rings x sectors around a centre; bins without points hold 0 in both."""
+    """Heights and counts in rings x sectors around a centre; bins without points hold 0 in all."""
 
     max_height: F32
     """(..., R, S) greatest height above the centre, metres."""
     count: I32  # type: ignore[assignment]  # hides tuple.count, which is not needed here
     """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
+    mean_height: F32 | None = None
+    """(..., R, S) mean height above the centre, metres, for :func:`paper_context`; None where not asked for."""
 
 
 class Raster(NamedTuple):

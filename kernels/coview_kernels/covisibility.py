@@ -1,4 +1,4 @@
-"""Co-view descriptor (eqs 1-4): the bins that are visible from the ground and from above.
+"""Co-view descriptors (eqs 1-4): the bins that are visible from the ground and from above, ours and the paper's.
 
 A few grids, as a keyframe has them, are described in NumPy on every backend: a launch takes longer.
 """
@@ -6,6 +6,7 @@ A few grids, as a keyframe has them, are described in NumPy on every backend: a 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,25 +18,50 @@ from coview_kernels.launch import Launch
 from coview_kernels.warm_up import compiled_by
 
 _MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
+_RULES = (*VERTICALS, "paper")  # in the order of the numbers that the kernel takes for them
+_NOT_READ: F32 = np.zeros(1, dtype=np.float32)
+
+
+def paper_context(max_height: npt.ArrayLike, count: npt.ArrayLike, mean_height: npt.ArrayLike) -> F32:
+    """Eqs 1-4 of the paper as printed: the co-view context.
+
+    A bin is occupied where its count is positive. It is *horizontally* co-visible (eqs 1 and 2) if no nearer bin of
+    its sector hides it: from the centre outwards, rings i = 1..R, the first occupied bin of a sector is visible and
+    becomes the horizon; an occupied bin at or above the horizon, h >= i * h_vis / i_vis, is visible and becomes the
+    next. It is *vertically* co-visible (eq. 3) if it is occupied and its density, the count, is at least the mean count
+    over all R x S bins, empty ones included. By eq. 4 a bin has
+
+    * its greatest height where it is horizontally, but not vertically co-visible;
+    * its mean height where it is both;
+    * 0 otherwise.
+
+    Args:
+        max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it); ignored in empty bins.
+        count: (..., R, S) int32, of points.
+        mean_height: (..., R, S) float32, like ``max_height``.
+
+    Returns:
+        (..., R, S) float32, metres.
+
+    Raises:
+        ValueError: shapes disagree, or there are fewer than two axes.
+    """
+    height, points = _checked(max_height, count)
+    mean: npt.NDArray[Any] = np.ascontiguousarray(mean_height, dtype=np.float32)
+    check_same_shape("mean_height", mean, "max_height", height.shape)
+    return _described("paper", reference.paper_context, height, points, mean)
 
 
 def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical = "max") -> F32:
-    """Eqs 1-4: the co-view context, one height per bin that both a ground robot and an airborne scanner see.
+    """Our co-view context: the bins that are visible from the ground *or* dense, with their greatest heights.
 
-    A bin is occupied where its count is positive. It is *horizontally* visible (eq. 2) if no nearer bin of its sector
-    hides it: from the centre outwards, rings i = 1..R, the first occupied bin of a sector is visible and becomes the
-    horizon; an occupied bin above the horizon, h > i * h_vis / i_vis, is visible and becomes the next horizon.
-
-    Our reading of the paper: a bin is *vertically* visible (seen from above) if it is occupied and its density d_ij,
-    the count, is at least the mean count over all R x S bins, empty ones included (eqs 3-4): dense bins hold vertical
-    structure, which both views share. A visible bin has its greatest height as value (the paper takes the mean height
-    of bins that are only vertically visible); others have 0. With ``vertical="off"`` so have bins that are only
-    vertically visible.
+    Unlike :func:`paper_context` it keeps dense bins behind a wall, takes no means, and leaves out bins that lie on the
+    line of sight itself, as flat ground does.
 
     Args:
         max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it); ignored in empty bins.
         count: (..., R, S) int32, of voxels: counts of raw points depend on the scan pattern.
-        vertical: value of bins that are visible from above only: ``max``, their greatest height, or ``off``, 0.
+        vertical: value of bins that are dense (eq. 3) only: ``max``, their greatest height, or ``off``, 0.
 
     Returns:
         (..., R, S) float32, metres.
@@ -43,28 +69,42 @@ def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical =
     Raises:
         ValueError: shapes disagree, there are fewer than two axes, or ``vertical`` is unknown.
     """
+    height, points = _checked(max_height, count)
+    if vertical not in VERTICALS:
+        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")
+
+    def plain(height: F32, points: I32, _: F32) -> F32:
+        return reference.coview(height, points, vertical)
+
+    return _described(vertical, plain, height, points, _NOT_READ)
+
+
+def _checked(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
     height: npt.NDArray[Any] = np.ascontiguousarray(max_height, dtype=np.float32)
     points: npt.NDArray[Any] = np.ascontiguousarray(count, dtype=np.int32)
     if np.ndim(max_height) < 2:
         raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
     check_same_shape("count", points, "max_height", height.shape)
-    if vertical not in VERTICALS:
-        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")
-    if points.size < _MIN_BINS:
-        return reference.coview(height, points, vertical)
-    return runtime.dispatch(_coview, reference.coview, height, points, vertical)
+    return height, points
 
 
-def _coview(max_height: F32, count: I32, vertical: Vertical) -> F32:
-    value = np.empty_like(max_height)
-    rings, sectors = max_height.shape[-2:]
-    grids = math.prod(max_height.shape[:-2])
-    Launch(
-        *("covisibility", "coview", grids, min(runtime.workers(), max(1, grids)), rings, sectors),
-        VERTICALS.index(vertical),
-        *(a.reshape(-1) for a in (max_height, count, value)),
-    )()
-    return value
+def _described(rule: str, plain: Callable[[F32, I32, F32], F32], height: F32, count: I32, mean: F32) -> F32:
+    """Describe grids by a rule, in NumPy where they are few."""
+    if count.size < _MIN_BINS:
+        return plain(height, count, mean)
+
+    def kernel(height: F32, count: I32, mean: F32) -> F32:
+        value = np.empty_like(height)
+        rings, sectors = height.shape[-2:]
+        grids = math.prod(height.shape[:-2])
+        Launch(
+            *("covisibility", "coview", grids, min(runtime.workers(), max(1, grids)), rings, sectors),
+            _RULES.index(rule),
+            *(a.reshape(-1) for a in (height, count, mean, value)),
+        )()
+        return value
+
+    return runtime.dispatch(kernel, plain, height, count, mean)
 
 
 compiled_by("coview", lambda: coview(*np.ones((2, 100, 20, 60))))

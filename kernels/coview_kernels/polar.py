@@ -22,7 +22,7 @@ _EMPTY: F32 = np.empty(0, dtype=np.float32)
 def polar_bin(
     points: npt.ArrayLike, centre: npt.ArrayLike, rings: int, sectors: int, r_max: float
 ) -> tuple[PolarGrid, int]:
-    """Greatest height and number of points in rings x sectors around ``centre``.
+    """Greatest height, number and mean height of the points in rings x sectors around ``centre``.
 
     Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r < ``r_max``; sector
     ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi), counter-clockwise from the x axis.
@@ -62,10 +62,11 @@ class _PolarBins:
         self._params = np.array([0.0, 0.0, 0.0, rings / r_max])
         self._highest = np.empty(shape, dtype=np.float32)
         self._count = np.empty(shape, dtype=np.int32)
+        self._total = np.empty(shape, dtype=np.float64)
         self._shape = rings, sectors
         self._launch = Launch(
             *("polar", "bins", _EMPTY, 0, 1, rings, sectors, self._params, edges),
-            *(self._highest.reshape(-1), self._count.reshape(-1)),
+            *(self._highest.reshape(-1), self._count.reshape(-1), self._total.reshape(-1)),
         )
 
     def __call__(self, points: F32, centre: F64) -> tuple[PolarGrid, int]:
@@ -73,6 +74,7 @@ class _PolarBins:
         self._params[:3] = centre
         self._highest.fill(-np.inf)
         self._count.fill(0)
+        self._total.fill(0.0)
         chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
         for index, value in enumerate((points.reshape(-1), len(points), chunks)):
             self._launch.put(index, value)
@@ -82,7 +84,8 @@ class _PolarBins:
         top = np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0)
         count = np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, dtype=np.int32)
         top[count == 0] = 0.0
-        return PolarGrid(top, count), int(self._count[:, size + 1].sum())
+        mean = np.add.reduce(self._total[:, :size].reshape(-1, *shape), axis=0) / np.maximum(count, 1)
+        return PolarGrid(top, count, mean.astype(np.float32)), int(self._count[:, size + 1].sum())
 
 
 _bins = lru_cache(maxsize=8)(_PolarBins)
@@ -98,6 +101,7 @@ def station_bins(
     rings: int,
     sectors: int,
     r_max: float,
+    raster_mean: npt.ArrayLike | None = None,
 ) -> PolarGrid:
     """Virtual reference scans (VRS) of M stations, gathered from a raster of the base map.
 
@@ -116,6 +120,7 @@ def station_bins(
         rings: R, at least 1.
         sectors: S, at least 1.
         r_max: outer radius, metres.
+        raster_mean: (H, W) float32 mean height of each cell, metres; with it the grid has mean heights.
 
     Returns:
         The grid, (M, R, S) each; heights above the station's ground.
@@ -128,19 +133,22 @@ def station_bins(
     row = as_int32("rows", rows, None)
     col = as_int32("cols", cols, len(row))
     base = as_float32("ground", ground, len(row))
+    mean = None if raster_mean is None else as_float32("raster_mean", raster_mean, *top.shape)
     check_grid_size(rings, sectors, r_max)
     if not (math.isfinite(cell) and cell > 0):
         raise ValueError(f"cell must be finite and positive, got {cell}")
     if np.any((row < 0) | (row >= top.shape[0]) | (col < 0) | (col >= top.shape[1])):
         raise ValueError(f"rows and cols must lie inside the raster of {top.shape[0]} x {top.shape[1]} cells")
     return runtime.dispatch(
-        _station_bins, reference.station_bins, *(top, count, float(cell), row, col, base, rings, sectors, float(r_max))
+        _station_bins,
+        reference.station_bins,
+        *(top, count, float(cell), row, col, base, rings, sectors, float(r_max), mean),
     )
 
 
 def _station_bins(
     raster_max: F32, raster_count: I32, cell: float, rows: I32, cols: I32, ground: F32,
-    rings: int, sectors: int, r_max: float,
+    rings: int, sectors: int, r_max: float, raster_mean: F32 | None = None,
 ) -> PolarGrid:  # fmt: skip
     d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
     starts = np.searchsorted(bins, np.arange(rings * sectors + 1)).astype(np.int32)
@@ -154,14 +162,19 @@ def _station_bins(
     base = (rows.astype(np.int64) + reach) * width + cols + reach
     size = rings * sectors
     shape = (len(rows), rings, sectors)
-    grid = PolarGrid(np.zeros(shape, np.float32), np.zeros(shape, np.int32))
+    highest, number = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+    parts = (len(rows), min(runtime.workers(), max(1, len(rows))), size)
+    where = base.astype(np.int32), ground, starts, (d_row * width + d_col).astype(np.int32)
     Launch(
-        *("polar", "station_bins", len(rows), min(runtime.workers(), max(1, len(rows))), size),
-        *(top.ravel(), points.ravel(), base.astype(np.int32), ground),
-        *(starts, (d_row * width + d_col).astype(np.int32)),
-        *(grid.max_height.reshape(-1), grid.count.reshape(-1)),
+        *("polar", "station_bins", *parts, top.ravel(), points.ravel(), *where),
+        *(highest.reshape(-1), number.reshape(-1)),
     )()
-    return grid
+    if raster_mean is None:
+        return PolarGrid(highest, number)
+    mean = np.zeros(shape, np.float32)
+    total = np.pad(np.where(empty, 0.0, raster_mean.astype(np.float64) * raster_count), reach)
+    Launch("polar", "station_means", *parts, total.ravel(), *where, number.reshape(-1), mean.reshape(-1))()
+    return PolarGrid(highest, number, mean)
 
 
 _CENTRE, _ONE, _INDEX = (0.0, 0.0, 0.0), np.ones((1, 1)), np.zeros(1, dtype=np.int32)

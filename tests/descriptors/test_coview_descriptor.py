@@ -9,7 +9,7 @@ from coview_stream.basemap.stations import aligned_corner, describe_stations, ra
 from coview_stream.config import DescriptorConfig
 from coview_stream.descriptors.coview import describe, ground_below
 
-ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview"))
+ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "paper"))
 
 
 def polar(r, degrees, z):

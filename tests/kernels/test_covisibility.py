@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coview_kernels import coview, covisibility, reference
+from coview_kernels import coview, covisibility, paper_context, reference
 from coview_kernels.reference import visible
 
 
@@ -41,6 +41,68 @@ def test_kernel_agrees_with_numpy(grid, vertical):
     assert context.dtype == np.float32
     expected = reference.coview(height, count, vertical)
     np.testing.assert_array_equal(context, expected)
+
+
+@given(grids())
+def test_paper_context_agrees_with_numpy(grid):
+    height, count = grid
+    mean = height - np.float32(0.5)
+    np.testing.assert_array_equal(paper_context(height, count, mean), reference.paper_context(height, count, mean))
+
+
+@given(grids())
+def test_paper_context_agrees_with_equations_1_to_4_in_exact_arithmetic(grid):
+    height, count = (a.reshape(-1, *a.shape[-2:]) for a in grid)
+    mean = height - np.float32(0.5)
+    context = paper_context(height, count, mean)
+    for m, j in np.ndindex(len(height), height.shape[2]):
+        i_vis = h_vis = None
+        for i in range(1, height.shape[1] + 1):
+            h, d = Fraction(float(height[m, i - 1, j])), int(count[m, i - 1, j])
+            horizontal = d > 0 and (i_vis is None or h >= i * h_vis / i_vis)
+            vertical = d > 0 and d >= Fraction(int(count[m].sum()), count[m].size)
+            if horizontal:
+                i_vis, h_vis = i, h
+            value = mean[m, i - 1, j] if horizontal and vertical else height[m, i - 1, j] if horizontal else 0
+            assert context[m, i - 1, j] == value
+
+
+# sectors like those of the paper's Fig. 5, one a row, from the centre outwards: greatest height, points, mean height
+SECTORS = {
+    "ground, a wall, a lower house and a tower behind it": (
+        ([0.0, 4.0, 3.0, 9.0], [2, 9, 2, 1], [0.0, 2.0, 1.5, 8.0]),
+        [0.0, 2.0, 0.0, 9.0],  # the wall is dense: its mean; the house is hidden; the tower rises above the wall
+    ),
+    "a dense house behind a wall is seen from above alone": (
+        ([0.0, 6.0, 5.0, 0.0], [1, 1, 9, 0], [0.0, 5.0, 3.0, 0.0]),
+        [0.0, 6.0, 0.0, 0.0],
+    ),
+    "flat ground lies on its own line of sight": (
+        ([0.0, 0.0, 0.0, 0.0], [1, 1, 0, 1], [-0.1, -0.1, 0.0, -0.1]),
+        [-0.1, -0.1, 0.0, -0.1],
+    ),
+    "a slope of constant grade is visible all the way": (
+        ([1.0, 2.0, 3.0, 4.0], [8, 1, 1, 1], [0.5, 1.5, 2.5, 3.5]),
+        [0.5, 2.0, 3.0, 4.0],
+    ),
+    "the ground falls: what is below the line of sight is hidden": (
+        ([0.0, -0.5, -1.0, 2.0], [1, 1, 1, 1], [0.0, -0.5, -1.0, 1.0]),
+        [0.0, 0.0, 0.0, 1.0],
+    ),
+    "an empty near bin hides nothing": (
+        ([0.0, 0.0, 2.0, 2.0], [0, 0, 1, 3], [0.0, 0.0, 1.0, 1.5]),
+        [0.0, 0.0, 1.0, 0.0],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SECTORS)
+@pytest.mark.parametrize("implementation", [paper_context, reference.paper_context])
+def test_sectors_made_by_hand(name, implementation):
+    sector, expected = SECTORS[name]
+    height, count, mean = (np.array(values)[:, None] for values in sector)
+    found = implementation(height.astype(np.float32), count.astype(np.int32), mean.astype(np.float32))
+    np.testing.assert_allclose(found[:, 0], expected)
 
 
 @given(grids())
@@ -94,3 +156,5 @@ def test_errors_name_the_argument():
         coview(np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="vertical"):
         coview(grid, grid, "highest")
+    with pytest.raises(ValueError, match="mean_height"):
+        paper_context(grid, grid, np.zeros((3, 2)))

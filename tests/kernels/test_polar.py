@@ -17,6 +17,8 @@ SIZES = st.sampled_from([(1, 1), (1, 2), (3, 4), (20, 60), (20, 61), (7, 360)])
 def assert_same(grid, expected):
     np.testing.assert_array_equal(grid.count, expected.count)
     np.testing.assert_array_equal(grid.max_height, expected.max_height)
+    # sums of float64, in another order
+    np.testing.assert_allclose(grid.mean_height, expected.mean_height, rtol=1e-6, atol=1e-6)
     for ours, theirs in zip(grid, expected, strict=True):
         assert ours.dtype == theirs.dtype
         assert ours.shape == theirs.shape
@@ -47,7 +49,7 @@ def test_result_does_not_depend_on_the_number_of_threads(threads):
 def test_polar_bin_agrees_with_its_definition_away_from_edges(points, size):
     rings, sectors = size
     count = np.zeros(size, dtype=int)
-    highest = np.zeros(size)
+    highest, total = np.zeros(size), np.zeros(size)
     clear = []
     for x, y, z in points[np.isfinite(points).all(axis=1)].astype(float):
         ring = math.hypot(x, y) / (50.0 / rings)
@@ -58,9 +60,11 @@ def test_polar_bin_agrees_with_its_definition_away_from_edges(points, size):
         bin_ = (int(ring), int(sector) % sectors)
         highest[bin_] = z if count[bin_] == 0 else max(z, highest[bin_])
         count[bin_] += 1
+        total[bin_] += z
     grid, _ = polar_bin(np.array(clear, dtype=np.float32).reshape(-1, 3), (0, 0, 0), *size, 50.0)
     np.testing.assert_array_equal(grid.count, count)
     np.testing.assert_allclose(grid.max_height, highest, rtol=1e-6)
+    np.testing.assert_allclose(grid.mean_height, total / np.maximum(count, 1), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("implementation", [polar_bin, reference.polar_bin])
@@ -117,16 +121,15 @@ def rasters(draw):
 def test_station_bins_agrees_with_numpy(raster, size, cell):
     top, count, rows, cols, ground = raster
     rows, cols, ground = rows.astype(np.int32), cols.astype(np.int32), ground.astype(np.float32)
-    arguments = (top, count, cell, rows, cols, ground, *size, 8.0)
-    grid, expected = station_bins(*arguments), reference.station_bins(*arguments)
-    np.testing.assert_array_equal(grid.count, expected.count)
-    np.testing.assert_array_equal(grid.max_height, expected.max_height)
+    arguments = (top, count, cell, rows, cols, ground, *size, 8.0, top - 1)
+    assert_same(station_bins(*arguments), reference.station_bins(*arguments))
+    assert station_bins(*arguments[:-1]).mean_height is None
 
 
 @given(rasters())
 def test_station_bins_are_polar_bins_of_cell_centres(raster):
     top, count, rows, cols, ground = raster
-    grid = station_bins(top, count, 0.5, rows, cols, ground, 5, 8, 6.0)
+    grid = station_bins(top, count, 0.5, rows, cols, ground, 5, 8, 6.0, top)
     assert grid.count.shape == (len(rows), 5, 8)
     row, col = np.nonzero(count)
     for m in range(len(rows)):
@@ -135,6 +138,7 @@ def test_station_bins_are_polar_bins_of_cell_centres(raster):
         expected, _ = polar_bin(points, (0, 0, np.float32(ground[m])), 5, 8, 6.0)
         np.testing.assert_array_equal(grid.count[m], expected.count)
         np.testing.assert_array_equal(grid.max_height[m], expected.max_height)
+        np.testing.assert_allclose(grid.mean_height[m], expected.mean_height, atol=2e-5)  # of float32 offsets
 
 
 def test_values_of_empty_raster_cells_are_ignored():

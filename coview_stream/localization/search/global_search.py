@@ -27,7 +27,7 @@ _GUESSES = 12  # poses of a guess that are tried at a keyframe
 
 
 class GlobalSearch:
-    """Search of the whole map, a keyframe at a time (paper, Algorithm 1); docs/method.md follows its steps.
+    """Search of the whole map, a keyframe at a time (paper, eqs 1-13); docs/method.md follows its steps.
 
     Attributes:
         coview: the recognizer by the paper's descriptors; None if it is not used.

@@ -1,4 +1,4 @@
-"""Keyframes, the virtual local scans made of them, and a check of the odometry between them (paper, section 3.3)."""
+"""Keyframes, the virtual local scans made of them, and a check of the odometry between them (of the paper)."""
 
 from __future__ import annotations
 

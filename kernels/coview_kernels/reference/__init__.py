@@ -6,7 +6,7 @@ They trust their arguments: the public functions of :mod:`coview_kernels` check 
 
 from __future__ import annotations
 
-from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.covisibility import coview, dense, paper_context, visible
 from coview_kernels.reference.crop import crop_points
 from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.field import field_scores, structure_at
@@ -25,12 +25,14 @@ __all__ = [
     "codes_at",
     "coview",
     "crop_points",
+    "dense",
     "distinct_poses",
     "field_scores",
     "height_columns",
     "lowest_heights",
     "nearest",
     "offsets_near",
+    "paper_context",
     "polar_bin",
     "station_bins",
     "structure_at",

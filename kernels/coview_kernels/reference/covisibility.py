@@ -1,4 +1,4 @@
-"""Co-view descriptor (eqs 1-4) in plain NumPy, all rings and sectors at once."""
+"""Co-view descriptors (eqs 1-4) in plain NumPy, all rings and sectors at once."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from coview_kernels.arrays import F32, I32, Mask, Vertical
 _MIN_SLOPE = -np.finfo(np.float64).max  # of a height of minus infinity: above the slopes of empty bins
 
 
-def visible(max_height: F32, count: I32) -> Mask:
-    """Return the horizontally visible bins (..., R, S) of eq. 2; see :func:`coview_kernels.coview`."""
+def visible(max_height: F32, count: I32, ties: bool = False) -> Mask:
+    """Return the horizontally visible bins (..., R, S) of eq. 2, with ``ties`` also those on the line of sight."""
     occupied: Mask = count > 0
     # Slopes are quotients of a float32 and a small integer, rounded once: equal ones stay equal, and distinct ones
     # distinct. So a tie is a tie on every machine.
@@ -19,16 +19,27 @@ def visible(max_height: F32, count: I32) -> Mask:
         slope = np.where(occupied, np.maximum(max_height.astype(np.float64) / distance, _MIN_SLOPE), -np.inf)
     horizon = np.full_like(slope, -np.inf)
     np.maximum.accumulate(slope[..., :-1, :], axis=-2, out=horizon[..., 1:, :])
-    seen: Mask = slope > horizon
+    seen: Mask = occupied & (slope >= horizon) if ties else slope > horizon
     return seen
+
+
+def dense(count: I32) -> Mask:
+    """Return the vertically visible bins (..., R, S) of eq. 3: at least as many points as the bins' mean."""
+    points = np.maximum(count, 0).astype(np.int64)
+    bins = count.shape[-2] * count.shape[-1]
+    enough: Mask = (points > 0) & (points * bins >= points.sum(axis=(-2, -1), keepdims=True))
+    return enough
 
 
 def coview(max_height: F32, count: I32, vertical: Vertical = "max") -> F32:
     """See :func:`coview_kernels.coview`."""
     seen = visible(max_height, count)
     if vertical != "off":
-        occupied = count > 0
-        bins = count.shape[-2] * count.shape[-1]
-        points = np.where(occupied, count, 0).astype(np.int64)
-        seen |= occupied & (points * bins >= points.sum(axis=(-2, -1), keepdims=True))
+        seen |= dense(count)
     return np.where(seen, max_height, np.float32(0))
+
+
+def paper_context(max_height: F32, count: I32, mean_height: F32) -> F32:
+    """See :func:`coview_kernels.paper_context`."""
+    height = np.where(dense(count), mean_height, max_height)
+    return np.where(visible(max_height, count, ties=True), height, np.float32(0))

@@ -76,8 +76,9 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
     highest = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(highest, bins, height)
     highest[count == 0] = 0.0
+    mean = (np.bincount(bins, weights=height, minlength=size) / np.maximum(count, 1)).astype(np.float32)
     shape = (rings, sectors)
-    grid = PolarGrid(highest.reshape(shape), count.reshape(shape))
+    grid = PolarGrid(highest.reshape(shape), count.reshape(shape), mean.reshape(shape))
     return grid, int(np.count_nonzero(~finite))
 
 
@@ -95,7 +96,7 @@ def cell_table(cell: float, rings: int, sectors: int, r_max: float) -> tuple[I64
 
 def station_bins(
     raster_max: F32, raster_count: I32, cell: float, rows: I32, cols: I32, ground: F32,
-    rings: int, sectors: int, r_max: float,
+    rings: int, sectors: int, r_max: float, raster_mean: F32 | None = None,
 ) -> PolarGrid:  # fmt: skip
     """See :func:`coview_kernels.station_bins`."""
     d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
@@ -109,12 +110,18 @@ def station_bins(
     offsets = d_row * width + d_col
 
     size = (len(rows), rings * sectors)
-    highest, count = np.zeros(size, np.float32), np.zeros(size, np.int32)
+    highest, count, mean = np.zeros(size, np.float32), np.zeros(size, np.int32), np.zeros(size, np.float32)
+    sums = None
+    if raster_mean is not None:
+        sums = np.pad(np.where(empty, 0.0, raster_mean.astype(np.float64) * raster_count), reach).ravel()
     for m, (row, col, base) in enumerate(zip(rows, cols, ground.astype(np.float64), strict=True)):
         at = offsets + ((int(row) + reach) * width + int(col) + reach)
         n = np.add.reduceat(count_pad[at], starts)
         top = np.maximum.reduceat(max_pad[at], starts)
         highest[m, occupied_bins] = np.where(n > 0, top - base, 0.0)
         count[m, occupied_bins] = n
+        if sums is not None:
+            total = np.add.reduceat(sums[at], starts)
+            mean[m, occupied_bins] = np.where(n > 0, total / np.maximum(n, 1) - base, 0.0)
     shape = (len(rows), rings, sectors)
-    return PolarGrid(highest.reshape(shape), count.reshape(shape))
+    return PolarGrid(highest.reshape(shape), count.reshape(shape), None if sums is None else mean.reshape(shape))
