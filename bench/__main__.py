@@ -63,6 +63,7 @@ BENCHMARKS = {
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors"),
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),
+    "forest_drives": Benchmark("forest.drives", "400 m and 2 km in forests: odometry, GNSS, the map alone, ours"),
     "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
     "changes": Benchmark("fusion.changes", "precision and recall of fuse --changes"),
     "joint": Benchmark("fusion.joint", "errors of two runs with and without fuse --joint"),

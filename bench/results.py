@@ -32,6 +32,8 @@ COMMANDS = {
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20",
+    "forest_drives": "forest_drives dense-forest long-forest --plots docs/images",
+    "forest_times": "forest_drives times",
     "fuzz": "fuzz --seconds 60",
     "soak": "soak --minutes 600",
 }

@@ -17,6 +17,7 @@ import numpy as np
 from bench.accuracy.scores import Track
 from bench.tracking.worlds import Recorded, World, in_gap
 from coview_stream import BaseMap, Localizer
+from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, yaw_of
@@ -252,9 +253,9 @@ def scenarios(seeds: int = SEEDS, quick: bool = False) -> tuple[Scenario, ...]:
     )
 
 
-def follow(site: Path, recorded: Recorded, drive: Drive) -> Track:
+def follow(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig | None = None) -> Track:
     """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
-    localizer, fixes = Localizer(BaseMap.load(site)), list[Fix | None]()
+    localizer, fixes = Localizer(BaseMap.load(site), config), list[Fix | None]()
     for frame, cover, odometry, stamp in zip(drive.frames, drive.cover, drive.odometry, drive.stamps, strict=True):
         cloud, rng = recorded.read(int(frame)), np.random.default_rng([frame, 51])
         if cover == DUST:

@@ -6,7 +6,6 @@ in a scenario is made of those frames. Frames are kept as int16 steps of 4 mm, a
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
 
 from bench.harness.files import fingerprint, remembered
 from bench.harness.worlds import MAPPER, SIMULATOR
@@ -26,19 +26,23 @@ from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
 from coview_stream.geometry.transforms import Points
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import KINDS, SimulationConfig
+from coview_stream.sim.layout import Layout, loop_layout, resample
 from coview_stream.sim.scenes import Scene, build_scene
 
 STEP = 0.004  # metres, to which frames are rounded
 GAP, GAP_RADIUS = (120.0, 220.0), 40.0  # metres of the drive between which a gap's map holds nothing so near
 CHANGED = 0.3  # share of the buildings, cars, poles and trees that are others in the changed map
-_TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
+_FOREST = KINDS["forest"]
+_PATH = 1.2  # metres from a path's middle to the trees beside it
+_PETALS, _DEPTH, _ROUNDED = 7, 0.45, 60  # of a winding path: bends outwards, their depth, and samples that round them
+_FELLED = 0.1  # share of the trees along a path that are gone since the survey; new ones stand where there is room
 _SELF = "bench/tracking/worlds.py"
 
 
 class World(NamedTuple):
     """A place and a drive of ``length`` metres at ``speed`` m/s, and how far the odometry of its plain run drifts."""
 
-    kind: str  # town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest)
+    kind: str  # one of the simulator's, or of FORESTS
     sensor: str
     seed: int
     size: float
@@ -54,15 +58,39 @@ class World(NamedTuple):
     @property
     def config(self) -> SimulationConfig:
         """The simulator's settings."""
-        scene = "forest" if self.kind == "sparse-forest" else self.kind
+        scene = "forest" if self.kind in FORESTS else self.kind
         return SimulationConfig(scene, self.sensor, self.seed, self.size, self.length, speed=self.speed)
 
-    def scene(self, changed: float = 0.0) -> Scene:
-        """Draw the place."""
-        config = self.config
-        sparse = {"forest": KINDS["forest"]._replace(trees=_TREES, undergrowth=_UNDERGROWTH)}
-        with patch.dict(KINDS, sparse) if self.kind == "sparse-forest" else nullcontext():
-            return build_scene(config.scene, config.seed, config.size, changed)
+    def scene(self, changed: float | None = None) -> Scene:
+        """Draw the place; the share ``changed`` of its trees, cars and poles is another since the survey."""
+        config, usual = self.config, _FELLED if self.kind in PATHS else 0.0
+        with patch.dict(KINDS, {"forest": FORESTS.get(self.kind, _FOREST)}):
+            return build_scene(config.scene, config.seed, config.size, usual if changed is None else changed)
+
+
+def winding_path(rng: np.random.Generator, size: float, half: float) -> Layout:
+    """Return a closed path of rounded petals through the square of ``size`` metres, about four times its side long."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 6000, endpoint=False)
+    radius = 1.0 + _DEPTH * np.cos(_PETALS * angle + rng.uniform(0.0, 2.0 * np.pi))
+    radius *= (size / 2 - 30.0) / radius.max()
+    loop = resample(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), 0.25)
+    loop = gaussian_filter1d(loop, _ROUNDED, axis=0, mode="wrap")
+    loop = np.concatenate([loop, loop[:1]])
+    return Layout(resample(loop, 0.25), (resample(loop, 1.0),), _PATH)
+
+
+def _lonely_path(rng: np.random.Generator, size: float, half: float) -> Layout:
+    return replace(loop_layout(rng, size, half, _PATH, branches=0, waviness=0.3), half_width=_PATH)
+
+
+PATHS = {
+    "dense-forest": _FOREST._replace(streets=_lonely_path, trees=0.16),
+    "long-forest": _FOREST._replace(streets=winding_path, trees=0.06),
+}
+"""Forests for the second paper's tables, with a path of 2.4 m: 940 stems per hectare, and 450 along two kilometres."""
+
+FORESTS = {"sparse-forest": _FOREST._replace(trees=0.012, undergrowth=0.008), **PATHS}
+"""Forests beside the simulator's own, which has 360 stems per hectare; ``sparse-forest`` has 120."""
 
 
 class Recorded(NamedTuple):

@@ -1,0 +1,311 @@
+"""Long drives in forests: the second paper's tables. Odometry, GNSS and odometry, the map alone, graph off, and ours.
+
+400 m through 940 stems per hectare and 2 km through 450, a tenth of the trees gone since the survey. NAME picks
+``dense-forest``, ``long-forest`` or ``times``; ``--plots`` draws all errors as boxes, and the tracks in their colour.
+``times`` takes the product's parts on the first drive; run it on an otherwise idle machine. Errors of a variant are
+of all its poses, of ours from the first fix on. GNSS is simulated (:mod:`bench.forest.gnss`).
+"""
+
+from __future__ import annotations
+
+import time
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+
+from bench.accuracy.scores import Errors, Track, errors, losses, rms
+from bench.forest.variants import VARIANTS, by_lidar, lidar_odometry
+from bench.forest.worlds import say, weights
+from bench.harness.files import fingerprint, folder, remembered
+from bench.harness.rows import Row, informs, listed
+from bench.tracking.drives import Drive, start
+from bench.tracking.worlds import Recorded, World, map_of, open_world
+from coview_stream import BaseMap, Localizer
+from coview_stream.config import LocalizerConfig
+from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.tracking.pose_graph import PoseGraph
+from coview_stream.localization.tracking.tracker import Tracker
+from coview_stream.report.plots import ACCENT, STATE_COLOURS, draw_base_map, figure
+
+WORLDS = (
+    World("dense-forest", "vlp16", 6001, 300.0, 400.0, 2.0, 0.01),
+    World("long-forest", "os64", 6002, 520.0, 2000.0, 4.0, 0.01),
+)
+_MADE_BY = (*(f"bench/forest/{part}.py" for part in ("variants", "gnss")), "bench/tracking/drives.py")
+_QUICK = 60.0  # metres of the first
+_TIMES = "times"
+_AGAIN = 30.0  # metres of driving after which the robot is searched anew for the times
+
+_POINTS = 150_000  # of a map, behind a track
+_FARTHEST = 98  # percentile of the errors at which the colours end
+_LOWEST = 1e-3  # metres or degrees: the boxes' axis begins there
+
+Stats = dict[str, float | None]
+
+THEIRS: tuple[tuple[str, Stats, Stats], ...] = (
+    ("GNSS and odometry", {"rmse": 2.96, "max": 8.15}, {"rmse": 5.44}),
+    (
+        "theirs",
+        {"rmse": 0.23, "median": 0.14, "mean": 0.18, "std": 0.15, "max": 0.83},
+        {"rmse": 1.16, "median": 0.65, "mean": 0.88, "max": 6.32},
+    ),
+)
+"""Their Table I, Forest II, 2 km: metres and degrees. Another forest, another robot; real."""
+
+THEIR_SECONDS = {
+    "odometry": (0.055, 0.012),
+    "registration": (0.288, 0.063),
+    "graph": (0.038, 0.024),
+    "re-localization": (0.418, 0.189),
+}
+"""Their Table II: mean and standard deviation, on an i7-10875H; re-localization on an RTX 5000."""
+
+_KEYS = ("rmse", "median", "mean", "std", "max")
+
+
+def statistics(values: Floats) -> Stats:
+    """Root mean square, median, mean, standard deviation and greatest of the finite values (N,); None of nothing."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return dict.fromkeys(_KEYS)
+    numbers = (rms(known), np.median(known), known.mean(), known.std(), known.max())
+    return {key: float(number or 0.0) for key, number in zip(_KEYS, numbers, strict=True)}
+
+
+class Result(NamedTuple):
+    """A variant's answers on a drive."""
+
+    track: Track
+    truth: Floats
+    driven: Floats
+
+    def figures(self) -> dict[str, Any]:
+        """Return its line of the table."""
+        error, known = errors(self.track, self.truth), self.track.tracking
+        first = int(known.argmax()) if known.any() else None
+        figures = {f"{key}_m": value for key, value in statistics(error.metres).items()}
+        figures |= {f"{key}_deg": value for key, value in statistics(error.degrees).items()}
+        return figures | {
+            "posed": 100.0 * float(known.mean()),
+            "first_m": None if first is None else float(self.driven[first]),
+            "false": int((known & ~error.right).sum()),
+            "lost": losses(self.track.states),
+        }
+
+
+def drive_of(world: World, recorded: Recorded, odometry: str) -> Drive:
+    """Return the drive with odometry from its own lidar, or of wheels that drift by the world's share."""
+    drive = start(recorded.truth, world.drift, world.seed)
+    if odometry == "wheels":
+        return drive
+    out = folder() / world.name
+    spec = {"code": fingerprint("coview_stream/odometry", "coview_stream/sim"), "world": repr(world)}
+    made = out / "lidar_odometry.npy"
+    remembered(out / "lidar_odometry.json", spec, lambda: np.save(made, by_lidar(recorded, drive.stamps)))
+    return Drive(drive.frames, drive.stamps, drive.truth, np.load(made), drive.driven, drive.cover)
+
+
+def followed(world: World, name: str, odometry: str) -> Result:
+    """Return a variant's answers in a world; kept until the code changes."""
+    recorded, site = open_world(folder(), world), map_of(folder(), world)
+    drive, out = drive_of(world, recorded, odometry), folder() / "forest-drives" / world.name
+    file = out / f"{name.replace(' ', '-')}-{odometry}.npz"
+    spec = {"code": fingerprint(), "bench": fingerprint(*_MADE_BY), "world": repr(world), "weights": weights()}
+
+    def work() -> None:
+        begin = time.perf_counter()
+        track = VARIANTS[name](site, recorded, drive, config_for(odometry))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(file, poses=track.poses, states=np.array(track.states))
+        say(f"{world.name}, {name}: {time.perf_counter() - begin:.0f} s")
+
+    remembered(file.with_suffix(".json"), spec, work)
+    with np.load(file) as kept:
+        count = len(drive)
+        track = Track(
+            drive.stamps, kept["states"].tolist(), kept["poses"], np.full((count, 6, 6), np.nan),
+            np.full((count, 2), np.nan),
+        )  # fmt: skip
+    return Result(track, drive.truth, drive.driven)
+
+
+def config_for(odometry: str) -> LocalizerConfig:
+    """Return the product's settings as ``locate`` has them: odometry from the lidar leans with it."""
+    return LocalizerConfig(sensor_leans=odometry == "wheels")
+
+
+class Stopwatch:
+    """Seconds of the product's parts, call by call; the graph's are added up, and left out of a registration's."""
+
+    def __init__(self) -> None:
+        self.taken: dict[str, list[float]] = {name: [] for name in THEIR_SECONDS}
+        self.graph = 0.0
+
+    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with its time taken."""
+
+        def run(*args: Any, **named: Any) -> Any:
+            begin, before = time.perf_counter(), self.graph
+            out = call(*args, **named)
+            seconds = time.perf_counter() - begin - (self.graph - before)
+            if part == "graph":
+                self.graph += seconds
+            else:
+                self.taken[part].append(seconds)
+            return out
+
+        return run
+
+
+def times(world: World) -> dict[str, list[float]]:
+    """Seconds of each part of the product, by name: a frame's odometry, a keyframe's registration and graph, a search.
+
+    Registration is with its verification. The robot is searched anew, by features and descriptors, every 30 m.
+    """
+    recorded, site, watch = open_world(folder(), world), BaseMap.load(map_of(folder(), world)), Stopwatch()
+    drive = start(recorded.truth, world.drift, world.seed)
+    odometry, localizer = lidar_odometry(recorded.truth), Localizer(site, config_for("lidar"))
+    localizer.prepare()
+    step, since = watch.timed("odometry", odometry.step), 0.0
+    with ExitStack() as stack:
+        for owner, name, part in (
+            (PoseGraph, "move", "graph"), (PoseGraph, "correct", "graph"), (Tracker, "match_to_map", "registration"),
+            (GlobalSearch, "update", "re-localization"),
+        ):  # fmt: skip
+            stack.enter_context(patch.object(owner, name, watch.timed(part, getattr(owner, name))))
+        estimate = property(watch.timed("graph", vars(PoseGraph)["estimate"].fget))
+        stack.enter_context(patch.object(PoseGraph, "estimate", estimate))
+        for index, stamp in enumerate(drive.stamps):
+            cloud, count, watch.graph = recorded.read(index), len(watch.taken["registration"]), 0.0
+            fix = localizer.step(cloud, step(cloud, None, float(stamp)), float(stamp))
+            if len(watch.taken["registration"]) > count:
+                watch.taken["graph"].append(watch.graph)
+            if fix.T_map_body is not None and drive.driven[index] - since >= _AGAIN:
+                since = float(drive.driven[index])
+                localizer.relocalize()
+    return watch.taken
+
+
+def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
+    """Draw a row of two panels for each drive, metres and degrees: a box per variant, whiskers at 1 and 99 %."""
+    options = {"figsize": (9.0, 0.6 + 2.4 * len(drives)), "nrows": len(drives), "ncols": 2, "axes": {"squeeze": False}}
+    with figure(path, **options) as (_, panels):
+        for line, (drive, variants) in zip(panels, drives.items(), strict=True):
+            colours = [STATE_COLOURS["TRACKING"], ACCENT]
+            for axes, unit, part, colour in zip(line, ("m", "deg"), ("metres", "degrees"), colours, strict=True):
+                values = [np.maximum(_known(getattr(error, part)), _LOWEST) for error in variants.values()]
+                boxes = axes.boxplot(values, orientation="horizontal", whis=(1, 99), showfliers=False, widths=0.6,
+                                     tick_labels=list(variants), patch_artist=True)  # fmt: skip
+                for box in boxes["boxes"]:
+                    box.set(facecolor=colour, alpha=0.5)
+                for median in boxes["medians"]:
+                    median.set(color="#000000")
+                axes.set_xscale("log")
+                axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
+                axes.invert_yaxis()
+                axes.set_xlabel(f"error [{unit}]")
+            line[0].set_title(drive)
+
+
+def draw_tracks(drives: Sequence[tuple[BaseMap, Floats, Errors]], path: Path) -> None:
+    """Draw the true track (N, 4, 4) of each drive over its map, in the colour of the error in metres."""
+    options = {"figsize": (5.2 * len(drives), 5.0), "ncols": len(drives), "axes": {"squeeze": False}}
+    with figure(path, **options) as (drawing, panels):
+        for axes, (site, truth, error) in zip(panels[0], drives, strict=True):
+            shift = draw_base_map(axes, site.sampled_points(_POINTS) + site.origin)
+            at, known = truth[:, :3, 3] - shift, np.isfinite(error.metres)
+            axes.plot(at[:, 0], at[:, 1], color="#000000", linewidth=0.7)
+            most = float(np.percentile(error.metres[known], _FARTHEST)) if known.any() else 1.0
+            dots = axes.scatter(at[known, 0], at[known, 1], s=5, c=error.metres[known], cmap="plasma", vmin=0.0,
+                                vmax=most, linewidths=0, zorder=3)  # fmt: skip
+            drawing.colorbar(dots, ax=axes, shrink=0.7, label="error [m]", extend="max")
+
+
+def _known(values: Floats) -> Floats:
+    return np.asarray(values[np.isfinite(values)])
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the drives, the variants and the pictures."""
+    parser.add_argument("names", nargs="*", metavar="NAME", help="dense-forest, long-forest, times (all)")
+    names = list(VARIANTS)
+    parser.add_argument(
+        "--variants", nargs="+", default=names, choices=names, metavar="V", help=f"some of {', '.join(names)}"
+    )
+    about = "of wheels that drift by 1 %%, or of the lidar's own frames by kiss-icp (wheels)"
+    parser.add_argument("--odometry", choices=("wheels", "lidar"), default="wheels", help=about)
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="draw forest_errors.png and forest_tracks.png there")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row per drive and variant, then the times."""
+    known = [*(world.kind for world in WORLDS), _TIMES]
+    if unknown := set(asked.names) - set(known):
+        raise InputError(f"no drive {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    chosen = set(asked.names or known)
+    worlds = [world for world in WORLDS if world.kind in chosen]
+    first = WORLDS[0]
+    if asked.quick:
+        first = first._replace(length=_QUICK, size=200.0, seed=6000)
+        worlds = [first] if worlds else []
+    results: dict[str, dict[str, Result]] = {}
+    for world in worlds:
+        found = results.setdefault(world.kind, {})
+        for name in asked.variants:
+            found[name] = followed(world, name, asked.odometry)
+            figures = {"drive": world.kind, "variant": name, **found[name].figures()}
+            rmse = figures["rmse_m"]
+            yield informs(f"forest_drives/{world.kind}, {name}: rmse", np.nan if rmse is None else rmse, "m", figures)
+    if asked.plots and results:
+        asked.plots.mkdir(parents=True, exist_ok=True)
+        draw_errors({kind: {n: errors(r.track, r.truth) for n, r in some.items()} for kind, some in results.items()},
+                    asked.plots / "forest_errors.png")  # fmt: skip
+        tracks = [(BaseMap.load(map_of(folder(), world)), results[world.kind]["ours"]) for world in worlds]
+        draw_tracks(
+            [(site, r.truth, errors(r.track, r.truth)) for site, r in tracks], asked.plots / "forest_tracks.png"
+        )
+    if _TIMES in chosen:
+        for part, seconds in times(first).items():
+            taken = statistics(1e3 * np.array(seconds))
+            mean = taken["mean"]
+            details = {"part": part, "n": len(seconds), **taken}
+            yield informs(f"forest_drives/times, {part}: mean", np.nan if mean is None else mean, "ms", details)
+
+
+COLUMNS = (
+    ("drive", "drive", None), ("variant", "variant", None), ("posed %", "posed", 1), ("first m", "first_m", 1),
+    *((f"{key} m", f"{key}_m", 3) for key in _KEYS), *((f"{key} deg", f"{key}_deg", 2) for key in _KEYS),
+    ("false", "false", 0), ("lost", "lost", 0),
+)  # fmt: skip
+_TIMED = (
+    ("part", "part", None), ("n", "n", 0), ("mean ms", "mean", 1), ("std ms", "std", 1), ("median ms", "median", 1),
+    ("max ms", "max", 1), ("theirs, mean ms", "their_mean", 0), ("theirs, std ms", "their_std", 0),
+)  # fmt: skip
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Errors of all variants beside the paper's own, and times beside the paper's own."""
+    drives = [row.details for row in rows if "variant" in row.details]
+    parts = [row.details for row in rows if "part" in row.details]
+    out = {}
+    if drives:
+        out[""] = listed(COLUMNS, [*drives, *(_theirs(*each) for each in THEIRS)])
+    if parts:
+        for part in parts:
+            part["their_mean"], part["their_std"] = (1e3 * value for value in THEIR_SECONDS[part["part"]])
+        out[_TIMES] = listed(_TIMED, parts)
+    return out
+
+
+def _theirs(name: str, metres: Stats, degrees: Stats) -> dict[str, Any]:
+    figures = dict.fromkeys(key for _, key, _ in COLUMNS)
+    figures |= {f"{key}_m": value for key, value in metres.items()}
+    figures |= {f"{key}_deg": value for key, value in degrees.items()}
+    return figures | {"drive": "their Forest II, real", "variant": name}
