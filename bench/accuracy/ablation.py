@@ -1,252 +1,327 @@
-"""What each choice of the method is worth.
+"""What each choice of the method is worth, group by group, on sites that separate.
 
-Every variant changes a choice (the last ones several of the paper's at once) and runs on the same simulated worlds: how
-often the search names the right place (from one keyframe, from five), then the whole localizer on the same run. What is
-done stays in ``--work``.
+Every variant changes one choice. Choices of the search are judged at single keyframes, those of registration from known
+starts, the others by the whole localizer. Sites: an airborne-like map of 6 pulses per square metre, streets of equal
+houses, a sparse sensor, a dirty world, a forest, and two real runs (``--data``). The first row of a group is the
+default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features, descriptors and both are
+rows of ``python -m bench forest``; odometry alone, map alone and no graph are rows of ``python -m bench tracking``.
+Results stay in ``--work``.
 """
 
 from __future__ import annotations
 
+import os
+import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache, partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
-import numpy.typing as npt
 
-from bench.accuracy.accuracy import evaluated
-from bench.accuracy.paper import Modes, SmallestDistance, add_vote
-from bench.harness.files import fingerprint, folder, isolated, remembered
+from bench.accuracy import paper
+from bench.accuracy.choices import OFF, Choice, Localizing, Registering, Site, uncalibrated, unverified
+from bench.harness.files import ROOT, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs, listed
-from bench.harness.worlds import KINDS, LIDARS, map_of, prepare, world_name
+from bench.harness.worlds import prepare
 from coview_stream import BaseMap
-from coview_stream.basemap import file_format
-from coview_stream.basemap.stations import describe_storeys
-from coview_stream.clouds import read_tum
-from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig
-from coview_stream.descriptors.coview import describe, ground_below
-from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
-from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.offline import locate
-from coview_stream.localization.registration.clouds import voxelized
-from coview_stream.localization.search.consensus import Consensus
-from coview_stream.localization.search.keyframes import KeyframeBuffer
-from coview_stream.recordings.open_run import open_run
-from coview_stream.sim import SimulationConfig
+from coview_stream.clouds import read_cloud, read_tum, write_cloud
+from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config.localizer import AcceptanceConfig
+from coview_stream.errors import InputError
+from coview_stream.sim import KINDS, SimulationConfig, buildings, parse_dirt
+from coview_stream.sim.kinds import Plot
 
-WINDOW = 5  # keyframes that vote together in the coarse measure
-
-_DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
-
-NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a half blocks and shifts
-
-
-@dataclass(frozen=True)
-class Variant:
-    """The method with one or more of its choices made otherwise."""
-
-    name: str
-    descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
-    modes: Modes = field(default_factory=Modes)
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A keyframe as the search sees it."""
-
-    scan: Points  # (N, 3) virtual local scan, odometry frame, metres
-    position: Floats  # (3,) of the sensor
-    ground: float  # height below it
-    T_map_odom: Pose  # (4, 4) the truth, map frame relative to the map's origin
-
-
-class Search:
-    """One variant's votes, and how often they name the right place: of the newest keyframe alone, of the last few."""
-
-    def __init__(self, variant: Variant, base_map: BaseMap) -> None:
-        self.variant = variant
-        self.right = {"keyframes": 0, "top1": 0, "windows": 0, "coarse": 0}
-        grid, config = base_map.station_grid, ConsensusConfig()
-        self._alone = Consensus(grid, replace(config, window=1))
-        self._window: Consensus | SmallestDistance = (
-            SmallestDistance(grid.stations, WINDOW)
-            if variant.modes.single
-            else Consensus(grid, replace(config, window=WINDOW))
-        )
-
-    def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
-        """Add a keyframe's distances and judge the places."""
-        add_vote(self._alone, centre, volumes)
-        add_vote(self._window, centre, volumes)
-        self.right["keyframes"] += 1
-        self.right["top1"] += right(self._alone.hypotheses()[0].T_map_odom, seen)
-        if len(self._window) == WINDOW:
-            self.right["windows"] += 1
-            self.right["coarse"] += right(self._window.hypotheses()[0].T_map_odom, seen)
-
-
-class Bank:
-    """One map's geometry, and its stations described in as many ways as are asked for, each once."""
-
-    def __init__(self, path: Path) -> None:
-        arrays, self._parameters, _ = file_format.load(path)
-        self._geometry = {name: a for name, a in arrays.items() if not name.startswith(_DESCRIBED)}
-        self.built = BaseMap(arrays, self._parameters)
-        self._known: dict[tuple[Channel, bool], npt.NDArray[np.float16]] = {}
-
-    def map(self, descriptor: DescriptorConfig, modes: Modes) -> BaseMap:
-        """Return the base map as if it had been built with ``descriptor``."""
-        points, stations, block = np.array(self.built.points), self.built.stations, self.built.config.block
-        for name in descriptor.channels:
-            if (name, modes.strict) not in self._known:
-                with modes.descriptors():
-                    found = describe_storeys(points, stations, block, replace(descriptor, channels=(name,)))
-                self._known[name, modes.strict] = found[name]
-        described = {f"descriptor.{name}": self._known[name, modes.strict] for name in descriptor.channels}
-        config = self._parameters["config"] | {"descriptor": asdict(descriptor)}
-        return BaseMap(self._geometry | described, self._parameters | {"config": config})
-
-
-def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> Iterator[Seen]:
-    """Keyframes of a world's run in order; ``origin`` (3,) is the map's."""
-    run, (_, truth) = open_run(world / "run"), read_tum(world / "truth.tum")
-    settings = KeyframeConfig()
-    buffer = KeyframeBuffer(settings)
-    for frame in run:
-        T_odom_body = to_local(frame.T_odom_body, run.poses[0][:3, 3])  # near its own origin, as the localizer has it
-        T_map_body = to_local(truth[frame.index], origin)
-        keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, settings), T_odom_body), frame.stamp)
-        if keyframe is None:
-            continue
-        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
-        if len(scan) >= settings.min_points:
-            ground = ground_below(scan, keyframe.position)
-            yield Seen(scan, keyframe.position.copy(), ground, T_map_body @ inverse(T_odom_body))
-
-
-def places(world: Path, bank: Bank) -> dict[str, dict[str, int]]:
-    """Count how often each variant names the right place along a world's run."""
-    searches = [Search(variant, bank.built) for variant in VARIANTS]
-    described = cache(bank.map)
-    for seen in keyframes_of(world, bank.built.origin, VARIANTS[0].descriptor):
-        known: dict[tuple[DescriptorConfig, Modes], Floats32] = {}
-        for search in searches:
-            descriptor, modes = search.variant.descriptor, replace(search.variant.modes, single=False)
-            centre = np.array([*seen.position[:2], seen.ground if descriptor.ground_zero else seen.position[2]])
-            volumes = {}
-            for name in descriptor.channels:
-                one = replace(descriptor, channels=(name,))
-                if (one, modes) not in known:
-                    # the zero is the keyframe's affair: it does not change the stations
-                    base_map = described(replace(one, ground_zero=True), modes)
-                    with modes.descriptors():
-                        query = describe(seen.scan, centre, one)
-                    known[one, modes] = modes.distances(base_map, query)[name]
-                volumes[name] = known[one, modes]
-            search.vote(seen, centre, volumes)
-    return {search.variant.name: search.right for search in searches}
-
-
-def right(T_map_odom: Pose, seen: Seen) -> bool:
-    """Whether a hypothesis puts the keyframe at its true place and heading; heights are not compared."""
-    found, true = (transform(T, seen.position[None])[0] for T in (T_map_odom, seen.T_map_odom))
-    turn = wrap_angle(yaw_of(T_map_odom) - yaw_of(seen.T_map_odom))
-    return bool(np.hypot(*(found - true)[:2]) < NEAR and abs(turn) < ALIGNED)
-
-
-SEEDS = tuple(range(2101, 2109))
-"""Held out: not for tuning, as those of ``python -m bench accuracy``."""
-
-_LENGTH = 24.0  # metres driven in each world
-_COC = partial(DescriptorConfig, channels=("coview",))
-
-VARIANTS = (
-    Variant("default: both channels, exhaustive, consensus"),
-    Variant("Scan Context alone", DescriptorConfig(channels=("scan_context",))),
-    Variant("co-view context alone", _COC()),
-    Variant("co-view alone, strict (eq. 2 only)", _COC(), Modes(strict=True)),
-    Variant("ring key retrieval, 200 candidates", modes=Modes(ring_key=True)),
-    Variant("co-view alone, strict, ring key", _COC(), Modes(ring_key=True, strict=True)),
-    Variant("single minimum, no consensus", modes=Modes(single=True)),
-    Variant("keyframe's zero at the sensor", DescriptorConfig(ground_zero=False)),
-    Variant("co-view alone, zero at the sensor", _COC(ground_zero=False)),
-    Variant("all three: co-view, ring key, single", _COC(), Modes(ring_key=True, single=True)),
-    Variant("all three: strict, ring key, single", _COC(), Modes(ring_key=True, single=True, strict=True)),
-)
-"""The last one is the paper's own method."""
-
-Measured = dict[str, dict[str, Any]]  # variant name -> its measures in one world
-
-COLUMNS = (
-    ("variant", "variant", None), ("top-1", "top1", 2), (f"coarse ({WINDOW} kf)", "coarse", 2), ("SLR", "slr", None),
-    ("false frames", "false", None), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 3), ("first fix m", "first_m", 1),
+_DEFAULT = DescriptorConfig()
+_ROWS = KINDS["town"]._replace(
+    plots=(Plot(buildings.house, 1.0, (10.0, 10.0), (9.0, 9.0)),), setback=(4.0, 4.0), gap=(5.0, 5.0), vacant=0.0,
+    infill=0.0, trees=0.0005, hedges=0.0,
 )  # fmt: skip
 
+_CONVERGED = 0.3  # metres; a registration within this has found the place
 
-def world_of(seed: int) -> SimulationConfig:
-    """Return the world of a seed: kinds and lidars in turn, odd ones changed since the map was made."""
-    size = (240.0, 270.0, 300.0)[seed // 2 % 3]
-    changed = 0.25 if seed % 2 else 0.0
-    return SimulationConfig(KINDS[seed % 4], LIDARS[seed % 3], seed, size, _LENGTH, changed=changed)
+_WORLD: dict[str, Any] = {"size": 180.0, "length": 24.0, "speed": 3.0, "changed": 0.2}
+WORLDS: dict[str, dict[str, Any]] = {
+    "airborne-like": {"scene": "town", "sensor": "vlp16", "seed": 2101, "density": 6.0},
+    "repetitive": {"scene": "rows", "sensor": "vlp16", "seed": 2102},
+    "sparse": {"scene": "campus", "sensor": "mid360", "seed": 2103, "density": 10.0},
+    "dirty": {"scene": "industrial", "sensor": "os64", "seed": 2104, "dirt": "mounting,odometry,traffic,seasons,years"},
+    "forest": {"scene": "forest", "sensor": "os64", "seed": 2105},
+}
+"""Simulated sites; seeds held out, as those of ``python -m bench accuracy``."""
+
+REAL, _REAL_METRES, _AROUND = ("riverside_a", "kitti04"), 72.0, 110.0
+"""Real runs; metres of them that are used, and metres around these that the map holds."""
 
 
-def ablate(below: Path, config: SimulationConfig) -> Measured:
-    """Measure all variants in one world: the search alone, then the whole localizer on the world's run."""
-    world, bank = below / world_name(config), Bank(map_of(below, config))
-    search, out = places(world, bank), Measured()
-    for variant in VARIANTS:
-        with variant.modes.localizer():
-            located = locate(bank.map(variant.descriptor, variant.modes), open_run(world / "run"))
-        out[variant.name] = search[variant.name] | evaluated(located, world)
+def _with(**changes: Any) -> DescriptorConfig:
+    return replace(_DEFAULT, **changes)
+
+
+SPACINGS = (2.0, 1.0, 3.0, 4.0, 6.0, 8.0)
+
+SEARCH: dict[str, dict[str, Choice]] = {
+    "channels": {
+        f"default: {' + '.join(_DEFAULT.channels)}": Choice(),
+        "scan_context": Choice(_with(channels=("scan_context",))),
+        "coview": Choice(_with(channels=("coview",))),
+        "coview, eq. 2 alone": Choice(_with(channels=("coview",)), strict=True),
+        "paper": Choice(_with(channels=("paper",))),
+        "scan_context + paper": Choice(_with(channels=("scan_context", "paper"))),
+        "zero at the sensor": Choice(_with(ground_zero=False)),
+    },
+    "bins": {
+        "default: 20 rings, 60 sectors, 50 m": Choice(),
+        **{f"{n} rings": Choice(_with(rings=n)) for n in (10, 40)},
+        **{f"{n} sectors": Choice(_with(sectors=n)) for n in (30, 120)},
+        **{f"{r:g} m": Choice(_with(radius=r)) for r in (25.0, 80.0)},
+    },
+    "scan": {
+        "default: VLS of all keyframes": Choice(),
+        "of five": Choice(gathered=5),
+        "of two": Choice(gathered=2),
+        "between two keyframes": Choice(gathered=1),
+    },
+    "vote": {
+        "default: all stations, consensus of five": Choice(),
+        "two keyframes vote": Choice(window=2),
+        "ten keyframes vote": Choice(window=10),
+        "single smallest distance of five": Choice(single=True),
+        "200 nearest ring keys": Choice(nearest=200),
+        "1000 nearest ring keys": Choice(nearest=1000),
+        "paper, 200 nearest ring keys": Choice(_with(channels=("paper",)), nearest=200),
+    },
+    "spacing": {f"{'default: ' if m == SPACINGS[0] else ''}L = {m:g} m": Choice(spacing=m) for m in SPACINGS},
+}
+"""Choices of the search."""
+
+REGISTRATION = {
+    "default: plane, 70 %": Registering(),
+    **{f"plane, {keep:.0%}": Registering(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
+    "plane, facades removed": Registering(facades=False),
+    "point, same kernel": Registering(way="points"),
+    "point, facades removed": Registering(way="points", facades=False),
+    "the paper's: plain, point, 60 %": Registering(RegistrationConfig(keep=0.6), "paper"),
+    "the paper's, facades removed": Registering(RegistrationConfig(keep=0.6), "paper", facades=False),
+}
+"""Choices of the registration."""
+
+LOCALIZER = {
+    "default": Localizing(),
+    **{f"{n} keyframes vote": Localizing(LocalizerConfig(consensus=ConsensusConfig(window=n))) for n in (1, 5, 20)},
+    "verification off": Localizing(changed=unverified),
+    "risk 0.4": Localizing(LocalizerConfig(acceptance=AcceptanceConfig(risk=0.4))),
+    "calibration off": Localizing(changed=uncalibrated),
+    "outliers of scans removed": Localizing(filtered=True),
+    "60 % of the pairs": Localizing(LocalizerConfig(registration=RegistrationConfig(keep=0.6))),
+}
+"""Choices of the whole localizer."""
+
+GROUPS = (*SEARCH, "registration", "localizer")
+
+
+def sites(names: Sequence[str], data: Path) -> dict[str, Path]:
+    """Return the folders of sites by name, made unless they are there; ``data`` holds the real runs."""
+    out = {}
+    for name in names:
+        if name in WORLDS:
+            out[name] = isolated(_simulated, folder(), WORLDS[name])
+        elif (data / name / "base.laz").is_file():
+            out[name] = isolated(_real, folder(), data / name)
+        else:
+            raise InputError(f"{data / name}: not there; --data names the folder of the real runs, --sites fewer sites")
     return out
 
 
-def total(name: str, got: Sequence[dict[str, Any]]) -> Row:
-    """Row of a variant over all its worlds; a run without a fix counts as an endless first fix."""
+def _simulated(below: Path, changes: Mapping[str, Any]) -> Path:
+    with patch.dict(KINDS, {"rows": _ROWS}):
+        dirt = parse_dirt(changes.get("dirt", ""))
+        config = SimulationConfig(**_WORLD | changes | {"dirt": dirt})
+        return prepare(below / "ablation", config)
 
-    def count(key: str) -> int:
-        return sum(each[key] for each in got)
 
-    def error(key: str) -> float:
-        return float(np.mean([each[key]["mean"] for each in got if each[key]] or [np.nan]))
+def _real(below: Path, source: Path) -> Path:
+    """Cut a real survey to the surroundings of the frames that are used, and build its map."""
+    out = below / "ablation" / source.name
 
-    top1 = count("top1") / count("keyframes") if count("keyframes") else np.nan
-    coarse = count("coarse") / count("windows") if count("windows") else np.nan
-    first = float(np.median([np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in got]))
-    details = {
-        "variant": name, "top1": top1, "coarse": coarse, "slr": f"{count('success')} of {len(got)}",
-        "false": f"{count('false_frames')} of {count('posed')}", "e_t": error("translation"), "e_r": error("rotation"),
-        "first_m": first, "keyframes": count("keyframes"),
+    def make() -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        _, truth = read_tum(source / "truth.tum")
+        cloud = read_cloud(source / "base.laz")
+        way = truth[np.cumsum([0.0, *np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)]) < _REAL_METRES, :2, 3]
+        low, high = (way.min(axis=0) - _AROUND, way.max(axis=0) + _AROUND)
+        xy = cloud.points[:, :2] + np.asarray(cloud.origin)[:2]
+        inside = ((xy > low) & (xy < high)).all(axis=1)
+        write_cloud(out / "base.laz", cloud.points[inside], origin=cloud.origin)
+        BaseMap.build(out / "base.laz").save(out / "site.coview")
+        for part in ("run", "truth.tum"):
+            link = out / part
+            if not link.exists():
+                link.symlink_to(source / part)
+
+    parts = (f"coview_stream/{part}" for part in ("basemap", "descriptors", "config"))
+    remembered(out / "built.json", {"metres": [_REAL_METRES, _AROUND], "code": fingerprint(*parts)}, make)
+    return out
+
+
+def metres(name: str) -> float:
+    """Metres of a site's run that are used."""
+    return _REAL_METRES if name in REAL else float(_WORLD["length"])
+
+
+def measure(place: Path, length: float, group: str) -> dict[str, Any]:
+    """Measure a group's variants on one site; by variant, with ``cpu`` seconds of them all."""
+    begin, site, out = time.process_time(), Site(place, length), {}
+    if group == "registration":
+        out = {name: {"errors": site.registrations(choice)} for name, choice in REGISTRATION.items()}
+    elif group == "localizer":
+        out = {name: site.located(choice) for name, choice in LOCALIZER.items()}
+    else:
+        out = {name: site.search(choice) for name, choice in SEARCH[group].items()}
+    if group == "spacing":
+        for name, choice in SEARCH[group].items():
+            stations = site.stations(choice.spacing)
+            out[name]["paper"] = paper.located(site.map, site.run, site.truth[1], choice.spacing, stations)
+    return out | {"cpu": time.process_time() - begin}
+
+
+def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Row of a choice of the search over all sites: shares of keyframes; of each site the best places' share."""
+
+    def share(key: str, of: str, some: Sequence[Mapping[str, Any]]) -> float:
+        return sum(each[key] for each in some) / max(1.0, sum(each[of] for each in some))
+
+    every = list(by_site.values())
+    details: dict[str, Any] = {
+        "group": group, "variant": name, "top1": share("top1", "keyframes", every),
+        "top10": share("top10", "keyframes", every), "coarse": share("coarse", "windows", every),
+        "keyframes": sum(each["keyframes"] for each in every),
+        "ms": 1e3 * share("seconds", "keyframes", every),
+        **{site: share("coarse", "windows", [each]) for site, each in by_site.items()},
     }  # fmt: skip
-    return informs(f"ablation/{name}: top-1", 100 * top1, "%", details)
+    if group == "spacing":
+        answers = [each["paper"] for each in every]
+        for way in paper.WAYS:
+            details[way] = float(np.mean([answer[way]["success"] for answer in answers]))
+            details[f"{way}, ms"] = float(np.mean([answer[way]["keyframe_ms"] for answer in answers]))
+        details["stations"] = float(np.mean([each["stations"] for each in every]))
+    return informs(f"ablation/{group}, {name}: top-1", 100.0 * details["top1"], "%", details)
+
+
+def registration_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Row of a choice of the registration; mean errors of what is right, and each site's median of all."""
+    every = [one for each in by_site.values() for one in each["errors"]]
+    good = [one for one in every if one["metres"] < _CONVERGED]
+    details: dict[str, Any] = {"group": "registration", "variant": name}
+    for off in OFF:
+        some = [one for one in every if one["off"] == off]
+        details[f"{off:g}"] = f"{sum(one['metres'] < _CONVERGED for one in some)} of {len(some)}"
+    for key in ("metres", "degrees"):
+        details[key] = float(np.mean([one[key] for one in good] or [np.nan]))
+    details["ms"] = float(np.median([one["ms"] for one in every] or [np.nan]))
+    for site, each in by_site.items():
+        details[site] = float(np.median([one["metres"] for one in each["errors"]] or [np.nan]))
+    return informs(f"ablation/registration, {name}: converged", 100.0 * len(good) / max(1, len(every)), "%", details)
+
+
+def localizer_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Row of a choice of the localizer; a run without a fix counts as an endless first fix."""
+    every = list(by_site.values())
+    first = [np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in every]
+    found = sum(each["success"] for each in every)
+    details: dict[str, Any] = {
+        "group": "localizer", "variant": name, "right": f"{found} of {len(every)}",
+        "false": f"{sum(each['false_frames'] for each in every)} of {sum(each['posed'] for each in every)}",
+        "first": float(np.median(first)), "worst": float(max(first)),
+        **{key: float(np.mean([each[key] for each in every if each[key] is not None])) for key in ("e_t", "e_r", "ms")},
+    }  # fmt: skip
+    return informs(f"ablation/localizer, {name}: runs localized", found, "", details)
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add the worlds."""
-    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, help=f"({SEEDS[0]} to {SEEDS[-1]})")
+    """Add the groups and the sites."""
+    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
+    groups = ", ".join(GROUPS)
+    parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), metavar="GROUP", help=groups)
+    parser.add_argument("--sites", nargs="+", choices=(*WORLDS, *REAL), default=[*WORLDS, *REAL], metavar="SITE")
+    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the group spacing")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per variant."""
-    measured = {}
-    for seed in dict.fromkeys(asked.seeds[:1] if asked.quick else asked.seeds):
-        config = world_of(seed)
-        isolated(prepare, folder(), config)
-        spec = {"world": config.to_dict(), "code": fingerprint(), "bench": fingerprint("bench/accuracy")}
-        file = folder() / "results" / f"ablation-{world_name(config)}.json"
-        measured[seed] = remembered(file, spec, partial(isolated, ablate, folder(), config))
-    for name in (variant.name for variant in VARIANTS):
-        row = total(name, [world[name] for world in measured.values()])
-        row.details["seeds"] = list(measured)
-        yield row
+    chosen = asked.sites[:1] if asked.quick else asked.sites
+    places = sites(chosen, asked.data)
+    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy")}
+    for group in asked.only:
+        measured: dict[str, dict[str, Any]] = {}
+        for name, place in places.items():
+            spec = {"site": name, "group": group, **code}
+            make = partial(isolated, measure, place, metres(name), group)
+            measured[name] = remembered(folder() / "results" / f"ablation-{group}-{name}.json", spec, make)
+        cpu = sum(each.pop("cpu") for each in measured.values())
+        variants = next(iter(measured.values()))
+        for variant in variants:
+            by_site = {name: each[variant] for name, each in measured.items()}
+            if group == "registration":
+                row = registration_row(variant, by_site)
+            elif group == "localizer":
+                row = localizer_row(variant, by_site)
+            else:
+                row = search_row(group, variant, by_site)
+            row.details.update(sites=list(measured), cpu=cpu)
+            yield row
+
+
+_SHARES = (("variant", "variant", None), ("top-1", "top1", 2), ("top-10", "top10", 2), ("five keyframes", "coarse", 2))
+COLUMNS = {
+    "spacing": (*_SHARES, *((way, way, 2) for way in paper.WAYS), ("stations", "stations", 0), ("ms", "ms", 0)),
+    "registration": (
+        ("variant", "variant", None), *((f"right from {off:g} m", f"{off:g}", None) for off in OFF),
+        ("e_t m", "metres", 3), ("e_r deg", "degrees", 2), ("ms", "ms", 0),
+    ),
+    "localizer": (
+        ("variant", "variant", None), ("runs", "right", None), ("false frames", "false", None),
+        ("median first fix m", "first", 1), ("latest", "worst", 1), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 2),
+        ("step ms", "ms", 0),
+    ),
+}  # fmt: skip
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """One line per variant; above it, the seeds."""
-    seeds, votes = rows[0].details["seeds"], rows[0].details["keyframes"]
-    text = listed(COLUMNS, [row.details for row in rows])
-    return {"": f"Worlds of the seeds {', '.join(map(str, seeds))}; {votes} keyframes vote.\n\n{text}"}
+    """One table per group, below its sites and processor time; draws the picture."""
+    out = {}
+    for group in dict.fromkeys(row.details["group"] for row in rows):
+        found = [row.details for row in rows if row.details["group"] == group]
+        per_site = () if group in ("localizer", "spacing") else tuple((site, site, 2) for site in found[0]["sites"])
+        columns = (*COLUMNS.get(group, (*_SHARES, ("ms", "ms", 0))), *per_site)
+        about = f"Sites: {', '.join(found[0]['sites'])}; {found[0]['cpu'] / 60.0:.1f} minutes of one core."
+        out[group] = f"{about}\n\n{listed(columns, found)}"
+        if group == "spacing" and asked.picture:
+            draw(found, asked.picture)
+    return out
+
+
+def draw(found: Sequence[Mapping[str, Any]], file: Path) -> None:
+    """Draw success and time against L = sigma_d, as the first paper's Fig. 9."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    found = sorted(found, key=lambda row: row["stations"], reverse=True)
+    spacing = sorted(SPACINGS)
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    for label, share in {"consensus of five keyframes": "coarse", "one keyframe": "top1"}.items():
+        left.plot(spacing, [100.0 * row[share] for row in found], "o-", label=label)
+    for way in paper.WAYS:
+        left.plot(spacing, [100.0 * row[way] for row in found], "s--", label=way, markersize=4)
+        right.plot(spacing, [row[f"{way}, ms"] for row in found], "s--", label=way, markersize=4)
+    left.set(xlabel="L = sigma_d, m", ylabel="right, %", ylim=(-4, 104))
+    right.set(xlabel="L = sigma_d, m", ylabel="ms per keyframe, one core", yscale="log")
+    left.legend(fontsize=7)
+    right.legend(fontsize=7)
+    figure.savefig(file, dpi=110)

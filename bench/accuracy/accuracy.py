@@ -1,7 +1,8 @@
 """Errors, runs localized and false fixes in held-out worlds, clean and with dirt.
 
 Localizes a run in each held-out world, then runs on the map of another world of the same kind, where the only right
-answer is no pose; then the same drives clean, with each kind of dirt, and with all of it. Results stay in ``--work``.
+answer is no pose; then the same drives clean, with each kind of dirt, and with all of it. Beside it stands the first
+paper's method on the same runs. Results stay in ``--work``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.accuracy import paper
 from bench.harness.files import fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, bounded, informs, judged, listed
 from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, prepared_run, world_name
@@ -87,7 +89,8 @@ def measure(world: Path, site: Path, inside: bool) -> Run:
     }
     if not inside:
         return run | {"false_frames": len(located.posed), "success": not located.posed}
-    return run | evaluated(located, world)
+    by_paper = paper.located(base_map, open_run(world / "run"), read_tum(world / "truth.tum")[1])
+    return run | evaluated(located, world) | {"paper": by_paper}
 
 
 def evaluated(located: RunResult, world: Path) -> Run:
@@ -110,7 +113,8 @@ def run_one(below: Path, run: SimulationConfig, site: SimulationConfig, call: Ca
             call(prepared_run, below, run)
         return dict(call(measure, below / world_name(run), map_of(below, site), not outside))
 
-    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/accuracy.py")}
+    files = (f"bench/accuracy/{name}.py" for name in ("accuracy", "paper"))
+    code = {"code": fingerprint(), "bench": fingerprint(*files)}
     try:
         spec = {"run": run.to_dict(), "map": site.to_dict(), **code}
         result = remembered(below / "results" / f"{name}.json", spec, make)
@@ -129,6 +133,7 @@ COLUMNS = (
 DIRT_COLUMNS = (
     ("dirt", "dirt", None), ("found", "found", None), ("false", "false_frames", 0), ("posed %", "share", 1),
     ("first m", "first_fix_m", 1), ("rmse t m", "rmse_t", 3), ("rmse r deg", "rmse_r", 3),
+    *((way, way, None) for way in paper.WAYS),
 )  # fmt: skip
 
 
@@ -184,10 +189,12 @@ def total(kind: str, runs: Sequence[Run]) -> Row:
     names = {"rmse_t": "translation", "rmse_r": "rotation"}
     rmse = {key: [run[key]["rmse"] for run in runs if run.get(key)] for key in names.values()}
     runs_found = sum(bool(run["success"]) for run in runs)
+    by_paper = [run["paper"] for run in runs if "paper" in run]
+    ways = {way: f"{sum(a[way]['success'] for a in by_paper)} of {len(by_paper)}" for way in paper.WAYS}
     about = {
         "dirt": kind, "found": f"{runs_found} of {len(runs)}", "false_frames": sum(run["false_frames"] for run in runs),
         "share": float(np.mean(posed)), "first_fix_m": float(np.median(first)), "runs": list(runs),
-        **{name: float(np.mean(rmse[key])) if rmse[key] else None for name, key in names.items()},
+        **ways, **{name: float(np.mean(rmse[key])) if rmse[key] else None for name, key in names.items()},
     }  # fmt: skip
     return informs(f"accuracy/dirt {kind}: posed", about["share"], "%", about)
 
@@ -219,8 +226,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs, and all kinds of dirt."""
+    """All runs, the same beside the paper's, and all kinds of dirt."""
     runs = [figures(row.details) for row in rows if row.details and "dirt" not in row.details]
     kinds = [row.details for row in rows if "dirt" in row.details]
     parts = {"": (COLUMNS, runs), "dirt": (DIRT_COLUMNS, kinds)}
-    return {name: listed(columns, found) for name, (columns, found) in parts.items() if found}
+    out = {name: listed(columns, found) for name, (columns, found) in parts.items() if found}
+    inside = [run | {"success": run["success"] == "yes"} for run in runs if "paper" in run]
+    if inside:
+        out["beside the paper"] = paper.compared(inside, [run for run in runs if run["outside"]])
+    return out

@@ -3,7 +3,8 @@
 Each set of ``--data`` (``base.laz``, ``run/``, ``truth.tum``; not part of the repository) is spoilt as the condition
 says. ``coview-stream locate`` localizes it in a process of its own, on the map that ``coview-stream build`` makes of
 ``base.laz``. ``--densities`` adds maps as an aircraft might have seen the same place, without facades, made as
-``coview-stream airborne`` does. Results stay in ``--work``.
+``coview-stream airborne`` does. ``--paper`` localizes the same runs by the first paper's method, too. Results stay in
+``--work``.
 
 A frame is false if its pose is more than 1 m or 5 degrees off; *share* is the share of frames with a pose, per cent of
 the unspoilt run's. A condition is a name with its figures, ``pitch:2``; several joined by ``+`` follow one another;
@@ -38,9 +39,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench.accuracy import paper
 from bench.accuracy.scores import Track, errors, score
 from bench.harness.files import PYTHON, ROOT, built, environment, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed, number
+from coview_stream import BaseMap
 from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats, Indices
@@ -220,6 +223,23 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
     return remembered(out / "scores.json", spec | {"code": fingerprint()}, make)
 
 
+def by_paper(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:
+    """Return the answers of the first paper's method to a run that :func:`located` has made, unless they are there."""
+    place = condition.replace(":", "_")
+    world = below / "runs" / real.name / place
+
+    def make() -> dict[str, Any]:
+        return paper.located(BaseMap.load(site), open_run(world / "run"), read_tum(world / "truth.tum")[1])
+
+    spec = {
+        "set": real.name,
+        "condition": condition,
+        "code": fingerprint(),
+        "bench": fingerprint("bench/accuracy/paper.py"),
+    }
+    return remembered(below / "located" / site.stem / place / "paper.json", spec, make)
+
+
 def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[str, Any]:
     """Score a trajectory: frames, posed, first fix and its errors, root mean squares, greatest, false frames."""
     stamps, true = truth
@@ -245,6 +265,7 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--densities", nargs="+", type=float, default=[], metavar="PER_M2", help="also on airborne-like maps: 4 8 20"
     )
+    parser.add_argument("--paper", action="store_true", help="also by the first paper's method")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -265,6 +286,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 scores = located(real, condition, site, below)
                 base = base or scores
                 about = {"set": real.name, "density": density, "map": site_name, "condition": condition}
+                if asked.paper:
+                    about["paper"] = by_paper(real, condition, site, below)
                 results.append({**about, **scores, "share": share(scores, base)})
                 per = "" if density is None else f", {density:g} per m2"
                 name = f"conditions/{real.name}{per}, {condition}: posed"
@@ -306,5 +329,14 @@ COLUMNS = (
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs."""
-    return {"": listed(COLUMNS, [row.details for row in rows if row.details])}
+    """All runs; with ``--paper`` they stand beside the paper's."""
+    runs = [row.details for row in rows if row.details]
+    if not asked.paper:
+        return {"": listed(COLUMNS, runs)}
+    ways = tuple((way, way, None) for way in paper.WAYS)
+    text = listed((*COLUMNS, *ways), [run | paper.in_words(run["paper"]) for run in runs])
+    ours = [
+        run | {"success": bool(run["posed"]) and not run["false_frames"], "e_t": run["rmse_m"], "e_r": run["rmse_deg"]}
+        for run in runs
+    ]
+    return {"": text, "beside the paper": paper.compared(ours)}

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
-from bench.accuracy.paper import Modes, robust_zscore
+from bench.accuracy.choices import robust_zscore
 from bench.forest.worlds import Drive, Place, code, drawn, in_odometry, on_disk, place, recorded, say, weights
 from bench.harness.files import remembered
 from bench.harness.rows import Row, failed, informs, number, table
@@ -43,6 +43,7 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.refinement import register_place
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.retrieval import exact_distances
 from coview_stream.localization.search.scoring import PlaceScorer, Scored
 from coview_stream.report.evaluation import driven
 
@@ -169,7 +170,8 @@ class Methods:
     def _by_hand(self, query: SearchRequest) -> dict[str, list[Hypothesis]]:
         """Name places by descriptors."""
         centre = on_ground(query.scan, query)
-        volumes = Modes().distances(self.base_map, describe(query.scan, centre, self.base_map.descriptor_config))
+        described = describe(query.scan, centre, self.base_map.descriptor_config)
+        volumes = {name: exact_distances(self.base_map.descriptors(name), one) for name, one in described.items()}
         both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in by_volume.items()}

@@ -24,6 +24,7 @@ import numpy as np
 
 import coview_kernels
 from bench.__main__ import run
+from bench.accuracy import paper
 from bench.harness.files import folder, isolated
 from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import WORLDS, Place, map_of, places
@@ -108,6 +109,19 @@ class Tracking:
         # the submap's frame takes the place of odometry's
         scan = ObservedScan.of(source, newest.cloud, inverse(place.T_odom_submap) @ newest.T_odom_body)
         return Answer(T, PlaceEvidence(self._site).observe(scan, T).ratio > 0.0)
+
+
+class ByPaper:
+    """The first paper's method on the submap as one virtual local scan; it verifies nothing, so it always vouches."""
+
+    def __init__(self, site: BaseMap, way: str) -> None:
+        coview_kernels.warm_up()
+        self._reference, self._count = paper.Reference(site), paper.WAYS[way]
+
+    def answer(self, place: Place) -> Answer:
+        """Take the station of the smallest distance, and refine."""
+        scan = paper.LocalScan.of(place.submap, np.zeros(3), self._reference.config.voxel)
+        return Answer(self._reference.refine(scan, self._reference.match(scan, self._count)[1]), True)
 
 
 class KissMatcher:
@@ -295,6 +309,7 @@ OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
 PEERS = (
     Peer(OURS, Keyframes),
     Peer("coview_stream, one scan", partial(Keyframes, one_scan=True)),
+    *(Peer(way, partial(ByPaper, way=way)) for way in paper.WAYS),
     Peer("KISS-Matcher", KissMatcher),
     Peer("MapClosures", MapClosures),
     Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),

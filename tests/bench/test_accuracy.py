@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import ablation, accuracy, conditions, odometry
-from bench.accuracy.ablation import Seen, right
+from bench.accuracy.choices import Seen, TableVote, nearest_place, right
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
 from bench.tracking.drives import scenarios
@@ -41,7 +41,7 @@ def test_reported_seeds_are_not_those_of_tuning():
     groups = [
         {world.seed for world in accuracy.held_out_worlds()},
         {world.seed for world in accuracy.DIRTY_WORLDS},
-        set(ablation.SEEDS),
+        {world["seed"] for world in ablation.WORLDS.values()},
         {scenario.world.seed for scenario in scenarios()},
         set(TUNED_SEEDS),
     ]
@@ -113,12 +113,45 @@ def test_totals_count_a_lost_run_as_endless_and_without_poses():
     row = accuracy.total("snow", [made_up(), lost, lost])
     assert row.ours == 30.0
     assert (row.details["found"], row.details["first_fix_m"], row.details["rmse_t"]) == ("1 of 3", np.inf, 0.03)
-    got = {"keyframes": 4, "top1": 3, "windows": 0, "coarse": 0, "success": True, "false_frames": 0, "posed": 5}
-    known = got | {"translation": ERRORS, "rotation": ERRORS, "first_fix_m": 4.0}
-    lost = got | {"success": False, "posed": 0, "top1": 0, "translation": None, "rotation": None, "first_fix_m": None}
-    row = ablation.total("a", [known, lost, lost])
-    assert row.ours == 25.0
-    assert (row.details["slr"], row.details["e_t"], row.details["first_m"]) == ("1 of 3", 0.02, np.inf)
+
+
+def test_every_group_begins_with_the_default_and_changes_it_otherwise():
+    for group, choices in (*ablation.SEARCH.items(), (None, ablation.REGISTRATION), (None, ablation.LOCALIZER)):
+        first, *others = choices.items()
+        assert first[0].startswith("default")
+        assert first[1] == type(first[1])()
+        assert all(choice != first[1] for _, choice in others)
+        assert len({repr(choice) for choice in choices.values()}) == len(choices), group
+
+
+def test_rows_of_the_ablation_add_sites_up():
+    one = {"keyframes": 4, "top1": 3, "top10": 4, "windows": 0, "coarse": 0, "seconds": 2.0, "stations": 9}
+    row = ablation.search_row("scan", "a", {"x": one, "y": one | {"top1": 0, "windows": 2, "coarse": 1}})
+    assert row.ours == 37.5
+    assert [row.details[key] for key in ("top1", "top10", "coarse", "ms", "x", "y")] == [0.375, 1.0, 0.5, 500, 0.0, 0.5]
+    known = {"success": True, "false_frames": 0, "posed": 5, "first_fix_m": 4.0, "e_t": 0.02, "e_r": 0.1, "ms": 3.0}
+    lost = known | {"success": False, "posed": 0, "first_fix_m": None, "e_t": None, "e_r": None}
+    row = ablation.localizer_row("b", {"x": known, "y": lost, "z": lost})
+    assert (row.details["right"], row.details["e_t"], row.details["first"]) == ("1 of 3", 0.02, np.inf)
+    tries = [
+        {"off": 0.5, "metres": 0.1, "degrees": 0.2, "ms": 4.0},
+        {"off": 1.0, "metres": 0.9, "degrees": 9.0, "ms": 6.0},
+    ]
+    row = ablation.registration_row("c", {"x": {"errors": tries}})
+    assert [row.details[key] for key in ("0.5", "1", "metres", "ms", "x")] == ["1 of 1", "0 of 1", 0.1, 5.0, 0.5]
+
+
+def test_the_smallest_distance_and_the_best_vote_name_the_same_place():
+    rng = np.random.default_rng(0)
+    stations = np.column_stack([rng.uniform(-20, 20, (40, 2)), np.zeros(40)]).astype(np.float32)
+    volume = rng.normal(0.6, 0.02, (40, 12)).astype(np.float32)
+    volume[13, 7] = 0.3
+    place = nearest_place(volume, np.array([2.0, 4.0, 0.0]), stations)
+    assert (place.station, place.shift, place.votes) == (13, 7, pytest.approx(0.3))
+    there = place.T_map_odom @ [2.0, 4.0, 0.0, 1.0]
+    np.testing.assert_allclose(there[:3], stations[13], atol=1e-6)
+    best = [int(number[0]) for number in TableVote.of_distances(np.zeros(3), [volume]).candidates()]
+    assert best == [13, 7]
 
 
 @pytest.mark.parametrize(
@@ -126,7 +159,8 @@ def test_totals_count_a_lost_run_as_endless_and_without_poses():
 )
 def test_a_place_is_right_within_three_metres_and_nine_degrees(shift, degrees, verdict):
     position = np.array([12.0, -5.0, 1.5])
-    seen = Seen(np.zeros((0, 3), np.float32), position, 0.0, pose_from(rot_z(1.0), [100.0, 50.0, 3.0]))
+    empty = np.zeros((0, 3), np.float32)
+    seen = Seen({}, position, pose_from(rot_z(1.0), [100.0, 50.0, 3.0]), empty)
     about = pose_from(rot_z(np.radians(degrees)), position + np.array([0.0, shift, 7.0]))
     assert right(seen.T_map_odom @ about @ pose_from(np.eye(3), -position), seen) is verdict
 

@@ -1,0 +1,389 @@
+"""Choices of the method, and how they are measured on one site: the search, registration, the whole localizer.
+
+A choice of the search is judged at every keyframe by exact distances: whether the best place of this keyframe is right,
+one of its ten best, the best of five keyframes together. Registration starts half a metre or a metre, and three
+degrees, from the truth. The localizer runs as ``coview-stream locate`` does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, Literal
+from unittest.mock import patch
+
+import numpy as np
+import numpy.typing as npt
+
+import coview_kernels as kernels
+from bench.accuracy import paper
+from coview_stream import BaseMap
+from coview_stream.basemap.stations import StationGrid, describe_storeys, find_stations
+from coview_stream.clouds import read_tum
+from coview_stream.clouds.filters import remove_outliers
+from coview_stream.config import ConsensusConfig, DescriptorConfig, KeyframeConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config.localizer import MIN_PAIRS
+from coview_stream.descriptors import coview
+from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.rasters import argsmallest
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
+    inverse,
+    pose_from,
+    rot_z,
+    to_local,
+    transform,
+    wrap_angle,
+    yaw_of,
+)
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.offline import locate
+from coview_stream.localization.registration.clouds import (
+    LocalMap,
+    LocalMaps,
+    RegistrationCloud,
+    prepare_scan,
+    voxelized,
+)
+from coview_stream.localization.registration.register import RESIDUAL_SCALE, register
+from coview_stream.localization.search import acceptance
+from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
+from coview_stream.localization.search.keyframes import KeyframeBuffer
+from coview_stream.localization.search.retrieval import exact_distances
+from coview_stream.localization.state import State
+from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Frame, Run
+from coview_stream.report.evaluation import driven, evaluate
+
+NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a half blocks and shifts
+WINDOW, BEST = 5, 10  # keyframes that vote together, best places of one
+OFF, TURNED = (0.5, 1.0), float(np.radians(3.0))  # how far registrations start from the truth, metres and radians
+
+_SAMPLE = 100_000  # distances that a median is taken of
+_GATHERED = (1, 2, WINDOW, None)  # newest keyframes whose points make a VLS; None: all
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The search with some of its choices made otherwise.
+
+    Attributes:
+        descriptor: of stations and keyframes.
+        spacing: metres between stations, and between keyframes: L = sigma_d.
+        gathered: newest keyframes whose points make the VLS, 1, 2 or 5; None: all.
+        strict: of co-visibility keep only eq. 2.
+        nearest: stations nearest in ring key that are compared; None: all.
+        window: keyframes that vote together.
+        single: the one smallest distance of these keyframes names the place.
+    """
+
+    descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
+    spacing: float = 2.0
+    gathered: int | None = None
+    strict: bool = False
+    nearest: int | None = None
+    window: int = WINDOW
+    single: bool = False
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A keyframe as the search sees it."""
+
+    scans: dict[int | None, Points]  # (N, 3) VLS by the number of keyframes gathered, odometry frame, metres
+    position: Floats  # (3,) of the sensor
+    T_map_odom: Pose  # (4, 4) the truth, map frame relative to the map's origin
+    submap: Points  # (N, 3) points to register
+
+
+class Site:
+    """A map, the first metres of a run, and its true poses; in ``site.coview``, ``run/`` and ``truth.tum``."""
+
+    def __init__(self, folder: Path, metres: float) -> None:
+        self.map = BaseMap.load(folder / "site.coview")
+        whole, (stamps, truth) = open_run(folder / "run"), read_tum(folder / "truth.tum")
+        frames = int(np.searchsorted(driven(truth), metres, "right"))
+        self.run, self.truth = whole[:frames], (stamps[:frames], truth[:frames])
+        self.points = np.array(self.map.points)
+        self.described = lru_cache(maxsize=4)(self._described)
+        self.stations = lru_cache(maxsize=None)(self._stations)
+        self.keyframes = lru_cache(maxsize=None)(self._keyframes)
+        self.volumes = lru_cache(maxsize=8)(self._volumes)
+
+    def _stations(self, block: float) -> Floats32:
+        own = block == self.map.config.block
+        return np.array(self.map.stations) if own else find_stations(self.points, block)
+
+    def _described(self, block: float, descriptor: DescriptorConfig, strict: bool) -> npt.NDArray[np.float16]:
+        """Descriptors (M, R, S) of the stations, of the only channel."""
+        with _co_visibility(strict):
+            return describe_storeys(self.points, self.stations(block), block, descriptor)[descriptor.channels[0]]
+
+    def _keyframes(self, distance: float) -> list[Seen]:
+        """Keyframes of the run in order, every ``distance`` metres."""
+        settings, out = KeyframeConfig(distance=distance), []
+        buffer, descriptor = KeyframeBuffer(settings), DescriptorConfig(radius=100.0)
+        for frame in self.run:
+            T_odom_body = to_local(frame.T_odom_body, self.run.poses[0][:3, 3])  # as the localizer has it
+            T_map_body = to_local(self.truth[1][frame.index], self.map.origin)
+            keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, settings), T_odom_body), frame.stamp)
+            if keyframe is None:
+                continue
+            whole = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+            if len(whole) < settings.min_points:
+                continue
+            position = keyframe.position.copy()
+            parts = {n: buffer.recent(n) for n in _GATHERED if n is not None}
+            thin = {n: paper.LocalScan.of(part, position, descriptor.voxel).points for n, part in parts.items()}
+            submap = buffer.recent(4)  # as the search registers
+            out.append(Seen({**thin, None: whole}, position, T_map_body @ inverse(T_odom_body), submap))
+        return out
+
+    def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32]]:
+        """Zero (3,) of each keyframe, and its distances (M, S) by a choice of one channel."""
+        descriptor = choice.descriptor
+        # the zero is the keyframe's affair: it does not change the stations
+        stations = self.described(choice.spacing, replace(descriptor, ground_zero=True), choice.strict)
+        keys = None if choice.nearest is None else paper.ring_key(np.float32(stations))
+        out = []
+        for seen in self.keyframes(choice.spacing):
+            scan, z = seen.scans[choice.gathered], float(seen.position[2])
+            centre = np.array([*seen.position[:2], ground_below(scan, seen.position) if descriptor.ground_zero else z])
+            with _co_visibility(choice.strict):
+                query = describe(scan, centre, descriptor)[descriptor.channels[0]]
+            if keys is None:
+                volume = exact_distances(stations, query)
+            else:
+                gap = np.linalg.norm(keys - paper.ring_key(query), axis=1)
+                chosen = np.argsort(gap, kind="stable")[: choice.nearest]
+                volume = np.ones((len(stations), descriptor.sectors), dtype=np.float32)
+                volume[chosen] = exact_distances(stations[chosen], query)
+            out.append((centre, volume))
+        return out
+
+    def search(self, choice: Choice) -> dict[str, float]:
+        """Count how often a choice names the right place along the run, with the seconds of all distances."""
+        begin, channels = time.process_time(), choice.descriptor.channels
+        alone = {name: replace(choice, window=1, single=False) for name in channels}
+        singles = [replace(c, descriptor=replace(c.descriptor, channels=(name,))) for name, c in alone.items()]
+        by_channel = [self.volumes(one) for one in singles]
+        seconds = time.process_time() - begin
+        grid = StationGrid(self.stations(choice.spacing), choice.spacing)
+        one, together = (Consensus(grid, replace(ConsensusConfig(), window=n)) for n in (1, choice.window))
+        smallest: deque[Hypothesis] = deque(maxlen=choice.window)
+        counts = dict.fromkeys(("keyframes", "top1", "top10", "windows", "coarse"), 0.0)
+        for k, seen in enumerate(self.keyframes(choice.spacing)):
+            centre = by_channel[0][k][0]
+            vote = TableVote.of_distances(centre, [volumes[k][1] for volumes in by_channel])
+            for consensus in (one, together):
+                consensus.vote(vote)
+            best = [right(place.T_map_odom, seen) for place in one.hypotheses()[:BEST]]
+            counts["keyframes"] += 1
+            counts["top1"] += best[0]
+            counts["top10"] += any(best)
+            mean = sum(volumes[k][1] for volumes in by_channel) / np.float32(len(by_channel))
+            smallest.append(nearest_place(mean, centre, grid.stations))
+            if k + 1 >= min(choice.window, WINDOW):
+                leader = min(smallest, key=lambda place: place.votes) if choice.single else together.hypotheses()[0]
+                counts["windows"] += 1
+                counts["coarse"] += right(leader.T_map_odom, seen)
+        return counts | {"seconds": seconds, "stations": float(len(grid))}
+
+    @cached_property
+    def starts(self) -> list[tuple[Seen, float, Pose]]:
+        """Every second keyframe with metres, and a ``T_map_odom`` (4, 4) that puts the robot so far off."""
+        out = []
+        for k, seen in enumerate(self.keyframes(2.0)[1::2]):
+            heading, turn = 2.399963 * k, TURNED * (-1.0) ** k  # the golden angle covers all directions
+            there = transform(seen.T_map_odom, seen.position[None])[0]
+            for off in OFF:
+                away = there + off * np.array([np.cos(heading), np.sin(heading), 0.0])
+                T = pose_from(rot_z(turn), away) @ pose_from(np.eye(3), -there) @ seen.T_map_odom
+                out.append((seen, off, T))
+        return out
+
+    def registrations(self, choice: Registering) -> list[dict[str, float]]:
+        """Register all starts; metres ``off``, errors at the robot, and milliseconds of processor time."""
+        maps, out = LocalMaps(self.map, choice.config.source_range), []
+        for seen, off, start in self.starts:
+            source = prepare_scan(seen.submap, seen.position, choice.config)
+            target = maps.around(transform(start, seen.position[None])[0])
+            if target is None:
+                continue
+            if not choice.facades:
+                keep = paper.consistent(transform(start, source.points.astype(np.float64)), target.points)
+                kept = (values[keep] for values in (source.points, source.above, source.height))
+                source = RegistrationCloud(*kept)
+            target.prepare()
+            begin = time.process_time()
+            T = choice.register(source, start, target, seen.position)
+            ms = 1e3 * (time.process_time() - begin)
+            turn = pose_from(np.eye(3), seen.position)
+            metres, degrees = paper.errors((start if T is None else T) @ turn, seen.T_map_odom @ turn)
+            out.append({"off": off, "metres": metres, "degrees": degrees, "ms": ms})
+        return out
+
+    def located(self, choice: Localizing) -> dict[str, Any]:
+        """Localize the run; figures of ``evaluate``."""
+        run = Filtered(**vars(self.run)) if choice.filtered else self.run
+        with choice.changed():
+            found = locate(self.map, run, choice.config)
+        poses = np.array([fix.T_map_body for fix in found.posed]).reshape(-1, 4, 4)
+        estimate = np.array([fix.stamp for fix in found.posed]), poses
+        errors = evaluate(estimate, self.truth)
+        return {
+            "success": errors.success, "false_frames": errors.false_frames, "first_fix_m": errors.first_fix_m,
+            "posed": errors.posed, "frames": errors.frames, "ms": 1e3 * float(np.median(found.seconds)),
+            "e_t": errors.translation.mean if errors.translation else None,
+            "e_r": errors.rotation.mean if errors.rotation else None,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Registering:
+    """Registration with some of its choices made otherwise.
+
+    Attributes:
+        config: overlap and the rest.
+        way: ``product``; ``points``, by the same kernel from point to point, which needs finer stops; ``paper``, plain
+            trimmed ICP from point to point, without scales or weights.
+        facades: False: without the points at heights where the map has none.
+    """
+
+    config: RegistrationConfig = field(default_factory=RegistrationConfig)
+    way: Literal["product", "points", "paper"] = "product"
+    facades: bool = True
+
+    def register(self, source: RegistrationCloud, start: Pose, target: LocalMap, centre: Floats) -> Pose | None:
+        """Return ``T_map_odom`` (4, 4) from a start; ``centre`` (3,) is the robot's position."""
+        if self.way == "paper":
+            points, near = source.points.astype(np.float64), target.points.astype(np.float64)
+            return paper.trimmed_icp(points, near, start, self.config.keep)
+        if self.way == "product":
+            found = register(source, start, target, self.config, self.config.search, centre=centre)
+        else:
+            steps = [kernels.Scale(m, max(RESIDUAL_SCALE, m / 3.0), 1e-4, 1e-5, 1) for m in self.config.search]
+            found = kernels.align_planes(
+                target.grid, np.zeros_like(target.normals), source.points, source.above, start, centre, steps,
+                keep=self.config.keep, iterations=200, min_pairs=MIN_PAIRS, prior=None,
+            )  # fmt: skip
+        return None if found is None else found.T_map_source
+
+
+@dataclass(frozen=True)
+class Localizing:
+    """The whole localizer with some of its choices made otherwise.
+
+    Attributes:
+        config: of the localizer.
+        changed: makes the change in the code, until it ends.
+        filtered: frames without statistical outliers.
+    """
+
+    config: LocalizerConfig = field(default_factory=LocalizerConfig)
+    changed: Callable[[], AbstractContextManager[Any]] = nullcontext
+    filtered: bool = False
+
+
+class Filtered(Run):
+    """A run whose frames have no statistical outliers, removed as from a map."""
+
+    def read(self, index: int, *args: Any, **kwargs: Any) -> Frame:
+        """Read a frame and filter it."""
+        frame = super().read(index, *args, **kwargs)
+        return replace(frame, points=remove_outliers(frame.points, 12, 4.0)[0])
+
+
+def unverified() -> AbstractContextManager[Any]:
+    """Accept the first keyframe's best place that registers."""
+
+    def verdict(scored: Any, leader: Hypothesis | None, *_: Any) -> tuple[State, str]:
+        return (State.SEARCHING, "no place") if leader is None else (State.TRACKING, "not verified")
+
+    return patch.object(acceptance, "_verdict", verdict)
+
+
+def uncalibrated() -> AbstractContextManager[Any]:
+    """Believe sensor and odometry as they are."""
+    exact = Calibration(sigma_tilt=np.radians(0.15), sigma_scale=0.003, sigma_turn=np.radians(0.005))
+
+    def apply(estimator: CalibrationEstimator) -> None:
+        estimator.calibration = exact
+
+    return patch.object(CalibrationEstimator, "_apply", apply)
+
+
+def _co_visibility(strict: bool) -> AbstractContextManager[Any]:
+    return patch.object(coview, "_VERTICAL", "off" if strict else "max")
+
+
+class TableVote:
+    """Vote of z-scores (M, S), lower is better, at every station and shift; the best ``count`` are candidates."""
+
+    def __init__(self, centre: Floats, scores: Floats32, count: int = 4000) -> None:
+        self.centre, self.scores, self.count = centre, scores, count
+
+    @classmethod
+    def of_distances(cls, centre: Floats, volumes: Sequence[Floats32]) -> TableVote:
+        """Average the standardised distances (M, S) of each channel: the distances themselves do not compare."""
+        scores = [robust_zscore(volume) for volume in volumes]
+        return cls(centre, sum(scores[1:], start=scores[0]) * np.float32(1.0 / len(scores)))
+
+    @property
+    def sectors(self) -> int:
+        """Number of shifts S."""
+        return int(self.scores.shape[1])
+
+    def candidates(self) -> tuple[Ints, Ints]:
+        """Return stations and shifts (K,) of the best scores."""
+        station, shift = np.divmod(argsmallest(self.scores.ravel(), self.count), self.sectors)
+        return station, shift
+
+    def at(self, stations: Ints, shifts: Ints) -> Floats32:
+        """Look z-scores (K,) up; 0 for station -1."""
+        return np.where(stations < 0, np.float32(0.0), self.scores[stations, shifts])
+
+    def at_all(self, requests: Sequence[tuple[TableVote, Ints, Ints]]) -> list[Floats32]:
+        """Look all up, one after the other."""
+        return [vote.at(stations, shifts) for vote, stations, shifts in requests]
+
+
+def robust_zscore(volume: Floats32) -> Floats32:
+    """Return the robust standard deviations (M, S) by which each distance exceeds the median; negative is better."""
+    every = max(1, volume.size // _SAMPLE)
+    sample = np.empty(0, dtype=np.float32)
+    for rows in (volume[::every], volume):  # ring keys leave most stations at 1, unscored
+        sample = rows[(rows != 1.0).any(axis=1)].ravel()
+        if sample.size >= min(_SAMPLE // 2, volume.size // 2):
+            break
+    if not len(sample):
+        return np.zeros_like(volume)
+    median = np.median(sample)
+    deviation = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
+    scores: Floats32 = (volume - median) * np.float32(1.0 / deviation)
+    if median > 1.0:  # unscored stations must not get a negative z-score
+        np.maximum(scores, np.float32(0.0), out=scores, where=volume == 1.0)
+    return scores
+
+
+def nearest_place(volume: Floats32, centre: Floats, stations: Floats32) -> Hypothesis:
+    """Return the place of the smallest of distances (M, S), by eq. 12 about the keyframe."""
+    station, shift = (int(n) for n in np.unravel_index(int(volume.argmin()), volume.shape))
+    turn = rot_z(float(yaw_of_shift(shift, volume.shape[1])))
+    T = pose_from(turn, stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
+    return Hypothesis(T, station, shift, float(volume.min()))
+
+
+def right(T_map_odom: Pose, seen: Seen) -> bool:
+    """Whether a hypothesis puts the keyframe at its true place and heading; heights are not compared."""
+    found, true = (transform(T, seen.position[None])[0] for T in (T_map_odom, seen.T_map_odom))
+    turn = wrap_angle(yaw_of(T_map_odom) - yaw_of(seen.T_map_odom))
+    return bool(np.hypot(*(found - true)[:2]) < NEAR and abs(turn) < ALIGNED)
