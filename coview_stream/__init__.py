@@ -5,8 +5,8 @@
 >>> fix = localizer.step(cloud, T_odom_body, stamp)          # doctest: +SKIP
 
 Maps: :class:`BaseMap`, :class:`MapConfig`, :func:`fetch_map`, :func:`read_cloud`. Localization: :class:`Localizer`,
-:class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. A robot of a node: :class:`RobotClient`,
-:class:`PoseMessage`. Errors: :class:`CoViewError` and those below it.
+:class:`AsyncLocalizer`, :class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. A robot of a node:
+:class:`RobotClient`, :class:`PoseMessage`. Errors: :class:`CoViewError` and those below it.
 
 Names are loaded when they are first used: importing the package costs next to nothing.
 """
@@ -45,10 +45,12 @@ if TYPE_CHECKING:
     from coview_stream.messages.types import PoseMessage
     from coview_stream.recordings.open_run import open_run
     from coview_stream.recordings.run import Run
+    from coview_stream.stream.async_localizer import AsyncLocalizer
     from coview_stream.stream.client.client import RobotClient
     from coview_stream.stream.maps.fetch_map import fetch_map
 
 __all__ = [
+    "AsyncLocalizer",
     "BaseMap",
     "CloudError",
     "CoViewError",
@@ -93,6 +95,7 @@ _NAMES = {
     "messages.types": ("PoseMessage",),
     "recordings.open_run": ("open_run",),
     "recordings.run": ("Run",),
+    "stream.async_localizer": ("AsyncLocalizer",),
     "stream.client.client": ("RobotClient",),
     "stream.maps.fetch_map": ("fetch_map",),
 }

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from nightly import nightly
 
-from coview_stream import BaseMap
+from coview_stream import BaseMap, State
 from coview_stream.clouds import read_tum
 from coview_stream.messages import decode_cloud, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
@@ -67,6 +67,18 @@ def test_example_locate_run(world, capsys):
     out = capsys.readouterr().out
     assert "TRACKING" in out
     assert "mean position error" in out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("built_once")
+def test_example_agent(world, capsys):
+    fix, _ = example("agent.py")(world, period=0.05)
+    assert fix.state is State.TRACKING
+    truth = read_tum(world / "truth.tum")[1][-1]
+    assert np.linalg.norm(fix.T_map_body[:3, 3] - truth[:3, 3]) < 0.3
+    out = capsys.readouterr().out
+    assert "SEARCHING, by evidence" in out
+    assert "frames left out, longest call" in out
 
 
 @pytest.mark.slow

@@ -62,18 +62,9 @@ class Localizer:
             MapError: the file cannot be loaded.
             MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
         """
-        if not isinstance(config, LocalizerConfig | None):
-            kind = type(config).__name__
-            raise ConfigError(f"config is a {kind}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")
-        if isinstance(base_map, str | os.PathLike):
-            base_map = BaseMap.load(base_map)
-        if not isinstance(base_map, BaseMap):
-            kind = type(base_map).__name__
-            raise InputError(f"base_map is a {kind}; give a BaseMap or the path of a .coview file")
-        self.base_map = base_map
-        self.config = config or LocalizerConfig()
-        self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
-        self.search = GlobalSearch(base_map, self.config, self._local_maps, index)
+        self.base_map, self.config = checked_arguments(base_map, config)
+        self._local_maps = local_maps or LocalMaps(self.base_map, self.config.registration.source_range)
+        self.search = GlobalSearch(self.base_map, self.config, self._local_maps, index)
         self._restarts = itertools.count(1)
         self.reset()
 
@@ -126,12 +117,12 @@ class Localizer:
         return replace(self._frames.calibration, ground=self._tracker.ground.metres)
 
     def prepare(self) -> None:
-        """Do the work that the first search would wait for: some seconds on a large map, once.
+        """Do the work that the first search and the first registrations would wait for: some seconds, once.
 
         Raises:
             InputError, DependencyError: the network of the learned features cannot be loaded.
         """
-        kernels.warm_up(*GlobalSearch.KERNELS)
+        kernels.warm_up(*GlobalSearch.KERNELS, "nearest")  # tracking needs this one too
         self.search.prepare()
 
     # ---- one frame
@@ -173,7 +164,7 @@ class Localizer:
 
         Returns:
             The search request, if any: give it to a :class:`GlobalSearch`, in any thread or process, and its result to
-            :meth:`apply_search_result` between two frames. Frames go on meanwhile.
+            :meth:`apply_search_result` between two frames. Frames go on meanwhile. ``AsyncLocalizer`` does all of it.
         """
         frame, request = self._predict(cloud, T_odom_body, stamp)
         match = self._match_to_map(frame, defer) if self.state.has_place else None
@@ -274,8 +265,6 @@ class Localizer:
         Raises:
             InputError: it is no guess, or the map has no ground there.
         """
-        if not isinstance(guess, PlaceGuess):
-            raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
         if check:
             require_ground(guess, self.base_map)
         if not self.state.has_place:
@@ -363,3 +352,21 @@ class Localizer:
             self._frames.forget_odometry()
             self._tracker.ground.restore(self._tracker.ground.metres)
             self._tracker.forget_odometry()
+
+
+def checked_arguments(
+    base_map: BaseMap | str | os.PathLike[str], config: LocalizerConfig | None
+) -> tuple[BaseMap, LocalizerConfig]:
+    """Return the map, loaded if it is a path, and the settings, or the defaults.
+
+    ConfigError, InputError, MapError: as of :class:`Localizer`.
+    """
+    if not isinstance(config, LocalizerConfig | None):
+        kind = type(config).__name__
+        raise ConfigError(f"config is a {kind}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")
+    if isinstance(base_map, str | os.PathLike):
+        base_map = BaseMap.load(base_map)
+    if not isinstance(base_map, BaseMap):
+        kind = type(base_map).__name__
+        raise InputError(f"base_map is a {kind}; give a BaseMap or the path of a .coview file")
+    return base_map, config or LocalizerConfig()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import ProtectionLevel, one_in
+from coview_stream.geometry.protection import ProtectionLevel, one_in, protection_level
 from coview_stream.geometry.transforms import (
     Pose,
     pose_fields,
@@ -19,6 +19,7 @@ from coview_stream.geometry.transforms import (
 )
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.observation import Evidence
+from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
@@ -136,6 +137,27 @@ class Fix:
     drift: Drift | None = None
     protection: ProtectionLevel | None = None
     calibration: Calibration | None = None
+
+    def carried(self, stamp: float, T_odom_body: Pose, driven: float, turned: float) -> Fix:
+        """Return this fix, which has a pose, carried on to a later frame by odometry: less certain by its drift.
+
+        Args:
+            stamp: of the later frame, seconds.
+            T_odom_body: (4, 4) odometry there, as it came.
+            driven: metres from this fix's frame to that one.
+            turned: radians likewise.
+
+        Raises:
+            ValueError: this fix has no pose.
+        """
+        if self.T_map_odom is None or self.T_map_body is None or self.covariance is None or self.drift is None:
+            raise ValueError("a fix without a pose corrects nothing")
+        T_map_body = self.T_map_odom @ T_odom_body
+        shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
+        carried = swap_rotation_translation(propagate(swap_rotation_translation(self.covariance), shift))
+        covariance = carried + self.drift.reported(max(0.0, driven), max(0.0, turned))
+        level = protection_level(covariance, 1.0 if self.protection is None else self.protection.doubt)
+        return replace(self, stamp=stamp, T_map_body=T_map_body, covariance=covariance, protection=level)
 
     @property
     def position(self) -> Floats | None:

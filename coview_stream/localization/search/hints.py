@@ -134,7 +134,9 @@ def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) 
 
 
 def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
-    """Raise InputError where a map has no ground near a guess, or within its circle if it has one."""
+    """Raise InputError where a map has no ground near a guess, or within its circle if it has one, or it is none."""
+    if not isinstance(guess, PlaceGuess):
+        raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
     area, places = guess.area(base_map.origin), guess.poses()[:, :2] - base_map.origin[:2]
     ground = base_map.station_grid.levels_at(places) >= 0 if area is None else area.holds(base_map.stations)
     if not ground.any():

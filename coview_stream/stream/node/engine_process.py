@@ -1,7 +1,7 @@
 """Engine in a process of its own, which is started again when it dies, and killed when it hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long; only a process of its own keeps
-the node's pose clock steady. Its command is ``python -m coview_stream.stream.node.engine_process FD KIND``.
+the node's pose clock steady. Its command is ``python -m coview_stream.stream.node.engine_process FD KIND PARENT``.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ NICE = {"odometry": 2, "track": 4, "search": 10}
 odometry."""
 
 _POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
+_PARENT_INTERVAL = 2.0  # seconds between two checks of an idle child whether its parent lives
 
 
 class RejectedError(Exception):
@@ -70,7 +71,9 @@ class EngineChild:
         ours, theirs = socket.socketpair()
         with theirs:
             self.process = subprocess.Popen(
-                python_command("coview_stream.stream.node.engine_process", str(theirs.fileno()), kind),
+                python_command(
+                    "coview_stream.stream.node.engine_process", str(theirs.fileno()), kind, str(os.getpid())
+                ),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=engine_environment(kind),
@@ -332,12 +335,15 @@ def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
         return "failed", traceback.format_exc(limit=-6)
 
 
-def work(pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None = None) -> int:
-    """Load the kernels, open the engine, then answer jobs until the parent closes the pipe; return the exit code.
+def work(
+    pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None = None, parent: int | None = None
+) -> int:
+    """Load the kernels, open the engine, then answer jobs until the parent is gone; return the exit code.
 
     Kernels of later jobs are loaded one by one while no job waits: a job that comes meanwhile waits a quarter of a
     second at most with the cache, some seconds on the first run ever. ``open_engine`` replaces
-    :func:`~coview_stream.stream.node.engines.open_engine`.
+    :func:`~coview_stream.stream.node.engines.open_engine`. Once ``parent``, a process id, is not our parent's, we end
+    even if its pipe is open.
     """
     _set_group_nice(NICE[kind])
     from coview_kernels import warm_up
@@ -373,6 +379,9 @@ def work(pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None 
         steps.append(engine.prepare_later)
         while True:
             use_pause()
+            while not pipe.poll(_PARENT_INTERVAL):
+                if parent not in (None, os.getppid()):  # its pipe may live on in a process that the parent has forked
+                    return 0
             pipe.send(attempt(engine, pipe.recv()))
     return 0
 
@@ -390,4 +399,4 @@ if __name__ == "__main__":
     gc.disable()  # nearly all objects of the start stay: a tenth of the time
     with contextlib.suppress(OSError):
         os.nice(NICE[sys.argv[2]])
-    sys.exit(work(Connection(int(sys.argv[1])), sys.argv[2]))
+    sys.exit(work(Connection(int(sys.argv[1])), sys.argv[2], parent=int(sys.argv[3])))

@@ -31,7 +31,7 @@ class FrameJob:
     robot: str  # name
     epoch: int  # number of the robot's odometry frame; a new one makes the engine forget the robot's place
     stamp_ns: int  # sensor time, nanoseconds
-    points: Points  # (N, 3) float32 body frame, metres
+    points: Points | None  # (N, 3) float32 body frame, metres; None: the frame before, and another search's result
     T_odom_body: Pose  # (4, 4) odometry at the stamp
     times: Floats | None = None  # (N,) seconds after the stamp at which each point was measured; None for no deskewing
     segment: Segment | None = None  # odometry while the frame was measured; goes with ``times``
@@ -213,6 +213,7 @@ class EngineQueue:
         self.considered: Considered | None = None  # places of the newest search; None once there is a place
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
+        self._frame_done: QueuedFrame | None = None  # the newest one
         self._search_result: SearchResult | None = None
         self._request: SearchRequest | None = None
         self._requested_at: float | None = None  # local time from which a keyframe has been waiting
@@ -246,6 +247,29 @@ class EngineQueue:
         """Whether a frame may be taken; without the lock: perhaps no more."""
         return self._frame is not None and self._frame_under_way is None
 
+    @property
+    def has_result(self) -> bool:
+        """Whether the result of a search waits for a frame; without the lock: perhaps no more."""
+        return self._search_result is not None and self._frame_under_way is None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits and nothing is under way."""
+        waiting = (self._frame, self._frame_under_way, self._search_result, self._request, self._searching_since)
+        return all(work is None for work in waiting)
+
+    def take_result(self) -> FrameJob | None:
+        """Hand out the result of a search without a frame; None without one, or while a frame waits or is under way."""
+        done, result = self._frame_done, self._search_result
+        if result is None or done is None or self._frame is not None or self._frame_under_way is not None:
+            return None
+        job = replace(
+            done.job, points=None, search_result=result, require_verification=False, hint=None, guess=None,
+            calibration=None,
+        )  # fmt: skip
+        self._frame_under_way, self._search_result = done._replace(job=job), None
+        return job
+
     def take_frame(self, require_verification: bool, hints: PlaceHints) -> FrameJob | None:
         """Hand out the newest frame, with the result of a search if one has come; None while one is under way."""
         if self._frame is None or self._frame_under_way is not None:
@@ -267,15 +291,17 @@ class EngineQueue:
         """Count a frame's fix and queue its search request; return the frame if its fix still matters."""
         if job.epoch < self._first_epoch:
             return None
-        self._counters.processed += 1
-        self.processed_at = now
-        self.engine_latency.add(result.seconds)
+        if job.points is not None:
+            self._counters.processed += 1
+            self.processed_at = now
+            self.engine_latency.add(result.seconds)
         frame = self._frame_under_way
         if job.epoch != self.epoch or frame is None:
             return None
-        self._frame_under_way = None
-        self.latency.add(now - frame.paired.received)
-        self.longest_wait = max(self.longest_wait, now - frame.waiting_since)
+        self._frame_under_way, self._frame_done = None, frame
+        if job.points is not None:
+            self.latency.add(now - frame.paired.received)
+            self.longest_wait = max(self.longest_wait, now - frame.waiting_since)
         if result.fix.state.has_place:
             self._request = self._requested_at = self.considered = None
         if result.request is not None:
@@ -292,8 +318,9 @@ class EngineQueue:
         if job.epoch != self.epoch:
             return False
         self._frame_under_way = None
-        # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
-        self._search_result = self._search_result or job.search_result
+        if job.points is not None:
+            # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
+            self._search_result = self._search_result or job.search_result
         return True
 
     def put_search_request(self, request: SearchRequest, now: float) -> None:

@@ -102,6 +102,8 @@ class TrackEngine(Engine):
         if job.guess is not None:
             localizer.guess_place(job.guess, check=False)  # the node has said that it is taken
         points = job.points
+        if points is None:
+            return FrameResult(localizer.fix(), None, time.perf_counter() - begin, localizer.take_events())
         if job.times is not None and job.segment is not None:
             sweep = localizer.calibration.sweep
             points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body, sweep)

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import CoViewError
 from coview_stream.localization.state import State
-from coview_stream.stream.node.counters import Rate, last_line
-from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineRunner, FailedError, RejectedError
-from coview_stream.stream.node.engine_queue import Job, RoundRobin, search_order
+from coview_stream.stream.node.counters import Rate
+from coview_stream.stream.node.engine_feed import EngineFeed
+from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineRunner
 from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
@@ -35,12 +35,6 @@ _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish their work
 _MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map while the new one has not verified its place
 _STEP = 0.02  # seconds between two looks at a change of the map
-# of the engines, seconds
-_MAX_RESTART_PAUSE = 10.0  # before an engine that keeps dying is started again
-_LIFE = 60.0  # of an engine, after which its death is not one in a row
-_STOPPED_INTERVAL = 1.0  # between two checks for a stopped engine; the second one kills it
-_ERROR_PAUSE = 0.2  # after an unexpected error
-_IDLE_WAIT = 0.05  # of an engine without work; a job wakes it earlier
 
 Service = Callable[[threading.Event], None]
 """Work on a thread of its own, until the event is set."""
@@ -58,139 +52,6 @@ class OpenedMap(NamedTuple):
 
 OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
 """Opens the map's file again, unless its hash is the one given; the function returns True to give up."""
-
-
-class EngineFeed:
-    """Feeds the engines of one map, each by a thread of its own, and recovers from an engine's failure.
-
-    ``on_change`` is called with a session whose state may have changed, with None for any.
-    """
-
-    def __init__(
-        self,
-        sessions: Sequence[Session],
-        engines: Mapping[str, EngineRunner],
-        errors: RateLimitedErrors,
-        on_change: Callable[[Session | None], None],
-    ) -> None:
-        self.sessions = list(sessions)
-        self.engines = dict(engines)
-        self.restarts = dict.fromkeys(self.engines, 0)  # of each engine
-        self.threads: list[threading.Thread] = []
-        self._errors = errors
-        self._on_change = on_change
-        self._turns = {name: RoundRobin(len(self.sessions)) for name in self.engines}
-        self._deaths = dict.fromkeys(self.engines, 0)  # in a row
-        self._died_at = dict.fromkeys(self.engines, float("-inf"))  # local time
-        self._wake = {name: threading.Event() for name in self.engines}  # there may be a job
-        self._stopping = threading.Event()
-
-    def start(self) -> None:
-        """Start the threads."""
-        targets = {engine: partial(self._feed, engine) for engine in self.engines}
-        for name, target in (targets | {"stopped": self._end_stopped_engines}).items():
-            thread = threading.Thread(target=target, name=f"coview-{name}", daemon=True)
-            thread.start()
-            self.threads.append(thread)  # now, for one that has not started counts as one that has ended
-
-    def stop(self) -> None:
-        """Have the threads end; without waiting."""
-        self._stopping.set()
-        for wake in self._wake.values():
-            wake.set()
-
-    def close(self, timeout: float) -> None:
-        """End the engines, and the threads within ``timeout`` seconds."""
-        self.stop()
-        for engine in self.engines.values():
-            with self._errors.catch("ending an engine"):
-                engine.close()
-        last = time.monotonic() + timeout
-        for thread in self.threads:
-            thread.join(timeout=max(0.0, last - time.monotonic()))
-
-    def wake_for(self, session: Session) -> None:
-        """Wake the engines that have a job of a robot: not all at every message, of which there may be thousands."""
-        for engine, wake in self._wake.items():
-            if session.has_job(engine):
-                wake.set()
-
-    def _feed(self, engine: str) -> None:
-        while not self._stopping.is_set():
-            with self._errors.catch(f"feeding the {engine} engine") as caught:
-                self._wake[engine].clear()  # before looking: a job that comes from now on sets it again
-                if (turn := self.next_job(engine)) is not None:
-                    self.work(engine, *turn)
-                elif not self._wake[engine].wait(timeout=_IDLE_WAIT):
-                    self.watch(engine)
-            if caught.error is not None:
-                self._stopping.wait(_ERROR_PAUSE)
-
-    def next_job(self, engine: str) -> tuple[Session, Job] | None:
-        """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
-        turns = self._turns[engine]
-        order = turns.order()
-        if engine == "search":
-            order = search_order([session.queue.search_demand for session in self.sessions], time.monotonic())
-        for k in order:
-            session = self.sessions[k]
-            if session.has_job(engine) and (job := session.take_job(engine)) is not None:
-                turns.serve(k)
-                return session, job
-        return None
-
-    def work(self, engine: str, session: Session, job: Job) -> None:
-        """Do one job; an error is counted and concerns this robot, unless the engine died."""
-        try:
-            result = self.engines[engine].run(job)
-        except RejectedError as error:
-            session.handle_failure(job, str(error), rejected=True)
-        except FailedError as error:
-            self._errors.report(f"{job.robot}: the {engine} engine", error)
-            session.handle_failure(job, str(error))
-        except DiedError as error:
-            self._engine_died(engine, error, session, job)
-        except Exception as error:  # not foreseen, but the other robots' work goes on
-            self._errors.report(f"{job.robot}: unexpected, at the {engine} engine", error)
-            session.handle_failure(job, repr(error))
-            self._stopping.wait(_ERROR_PAUSE)
-        else:
-            self._deaths[engine] = 0
-            session.handle_result(job, result, time.monotonic())
-            self._on_change(session)
-            self.wake_for(session)  # a frame may have asked for a search
-
-    def watch(self, engine: str) -> None:
-        """Check an engine without a job: a dead one is reported, and started again before it is needed."""
-        try:
-            self.engines[engine].watch()
-        except DiedError as error:
-            self._engine_died(engine, error)
-
-    def _end_stopped_engines(self) -> None:
-        while not self._stopping.wait(_STOPPED_INTERVAL):
-            for engine in self.engines.values():
-                with self._errors.catch("looking after an engine"):
-                    engine.end_stopped()
-
-    def _engine_died(
-        self, engine: str, error: DiedError, session: Session | None = None, job: Job | None = None
-    ) -> None:
-        """Report a dead engine and back off before restarting it."""
-        if self._stopping.is_set():
-            return
-        why = last_line(str(error))
-        self._errors.report(f"the {engine} engine is started again", error, kind=why)
-        self.restarts[engine] += 1
-        for robot in self.sessions:
-            robot.engine_restarted(engine, why)
-        if session is not None and job is not None:
-            session.handle_failure(job, str(error))
-        self._on_change(None)
-        now, before = time.monotonic(), self._died_at[engine]
-        self._died_at[engine] = now
-        self._deaths[engine] = self._deaths[engine] + 1 if now - before < _LIFE else 1
-        self._stopping.wait(min(0.1 * 2.0 ** min(self._deaths[engine], 10), _MAX_RESTART_PAUSE))
 
 
 class Node:
@@ -232,7 +93,8 @@ class Node:
         self._threads: list[threading.Thread] = []
         self._ending: threading.Thread | None = None
         self.reporter = Reporter(self.sessions, transport, self._errors, self.identity)
-        self.feeds: tuple[EngineFeed, ...] = (self._make_feed(opened),)  # of the map, and of one that is to follow it
+        # of the map, and of one that is to follow it
+        self.feeds: tuple[EngineFeed[Session], ...] = (self._make_feed(opened),)
         self.endpoints = {
             session.keys.robot: RobotEndpoints(session, transport, self.reporter, self._wake, pose_format, geo)
             for session in self.sessions
@@ -299,7 +161,7 @@ class Node:
         threads = [*self._threads, *(thread for feed in self.feeds for thread in feed.threads)]
         return [t.name for t in threads if not (t.is_alive() or self._stopping.is_set())]
 
-    def _make_feed(self, opened: OpenedMap) -> EngineFeed:
+    def _make_feed(self, opened: OpenedMap) -> EngineFeed[Session]:
         def note_change(session: Session | None) -> None:
             if session is None:
                 self.reporter.changed.set()
@@ -336,7 +198,7 @@ class Node:
     @property
     def map_sha256(self) -> str:
         """Hash of the map that is served; during a change of the map, of the one before."""
-        return self.feeds[0].sessions[0].map_sha256
+        return self.feeds[0].robots[0].map_sha256
 
     def reload(self) -> dict[str, Any]:
         """Ask for the map's file to be opened again; ``ok`` is False where this node cannot."""

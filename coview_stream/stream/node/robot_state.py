@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import ProtectionLevel, protection_level
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import Event, State
-from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters
@@ -93,8 +88,9 @@ class RobotState:
         if fix.state is State.TRACKING and self._verify_from_ns is None:
             self._lost = False
             self._counters.fixes += before is not State.TRACKING
-            self._correction = OdomCorrection.of(fix, stamp_ns, frame.paired.travelled, frame.paired.turned)
-            self._hints.verified(self._correction.T_map_body, self.calibration)
+            self._correction = OdomCorrection(fix, stamp_ns, frame.paired.travelled, frame.paired.turned)
+            assert fix.T_map_body is not None  # while TRACKING
+            self._hints.verified(fix.T_map_body, self.calibration)
 
     def restart_search(self, reason: str) -> None:
         """Forget the place: there is another odometry frame."""
@@ -175,63 +171,40 @@ class RobotState:
         return None if pose is None else pose.protection
 
 
-@dataclass(frozen=True)
-class OdomCorrection:
+class OdomCorrection(NamedTuple):
     """Correction of odometry by a fix: more than its pose, as odometry and its drift carry it on from here."""
 
-    T_map_odom: Pose  # (4, 4) map <- odometry, source frame of the map
-    T_map_body: Pose  # (4, 4) map <- body at the frame that it comes from
-    covariance: Floats  # (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame
-    confidence: float  # probability of the place, in [0, 1], of the search that accepted it
-    verified_ns: int  # stamp of the newest registration that supported it
+    fix: Fix  # with a pose
+    stamp_ns: int  # of its frame
     travelled: float  # metres that odometry had driven at the frame
     turned: float  # radians that it had turned
-    drift: Drift  # estimate of its drift
-    doubt: float  # factor on the protection level that the covariance alone gives
-
-    @classmethod
-    def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> OdomCorrection:
-        """Make it of a fix that has a pose; ``stamp_ns`` is its frame's."""
-        if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
-            raise ValueError("a fix without a pose corrects nothing")
-        return cls(
-            T_map_odom=fix.T_map_odom,
-            T_map_body=fix.T_map_body,
-            covariance=fix.covariance,
-            confidence=fix.confidence,
-            verified_ns=stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS)),
-            travelled=travelled,
-            turned=turned,
-            drift=fix.drift,
-            doubt=1.0 if fix.protection is None else fix.protection.doubt,
-        )
 
     def age(self, stamp_ns: int) -> float:
-        """Return seconds of sensor time from the newest registration to ``stamp_ns``."""
-        return max(0.0, (stamp_ns - self.verified_ns) / _NS)
+        """Return seconds of sensor time from the newest registration that supported the fix to ``stamp_ns``."""
+        evidence = self.fix.evidence
+        verified_ns = self.stamp_ns if evidence is None else min(self.stamp_ns, round(evidence.stamp * _NS))
+        return max(0.0, (stamp_ns - verified_ns) / _NS)
 
     def pose(self, odometry: OdometryBuffer, robot: str, map_sha256: str) -> PoseMessage | None:
         """Return the newest odometry, corrected, with its own stamp and its drift since; None before any."""
         newest = odometry.newest
         if newest is None:
             return None
-        driven = max(0.0, odometry.travelled - self.travelled)
-        turned = max(0.0, odometry.turned - self.turned)
-        T_map_body = self.T_map_odom @ newest.T_odom_body
-        shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
-        carried = swap_rotation_translation(propagate(swap_rotation_translation(self.covariance), shift))
-        covariance = carried + self.drift.reported(driven, turned)
+        driven, turned = odometry.travelled - self.travelled, odometry.turned - self.turned
+        fix = self.fix.carried(newest.stamp_ns / _NS, newest.T_odom_body, driven, turned)
+        assert fix.T_map_body is not None  # it has a pose
+        assert fix.covariance is not None
         return PoseMessage(
             stamp_ns=newest.stamp_ns,
             robot=robot,
             state=State.TRACKING.value,
-            T_map_body=T_map_body,
-            covariance=covariance,
-            confidence=self.confidence,
+            T_map_body=fix.T_map_body,
+            covariance=fix.covariance,
+            confidence=fix.confidence,
             map_sha256=map_sha256,
             age=self.age(newest.stamp_ns),
-            protection=protection_level(covariance, self.doubt),
-            T_map_odom=self.T_map_odom,
+            protection=fix.protection,
+            T_map_odom=fix.T_map_odom,
         )
 
 

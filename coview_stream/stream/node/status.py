@@ -151,7 +151,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "pose": {
             "rate_hz": rate,
             "age_s": None if age is None else round(age, 3),
-            "confidence": None if correction is None else correction.confidence,
+            "confidence": None if correction is None else correction.fix.confidence,
             "protection_level": None if level is None else level.to_json(),
         },
         "latency_ms": queue.latency.to_json(),
@@ -167,7 +167,9 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
 def map_name(session: Session) -> str | None:
     """Return the robot's map of several; None while that is not known, and of one map."""
     correction = session.robot_state.correction
-    return None if session.parts is None or correction is None else session.parts.at(correction.T_map_body[:3, 3]).name
+    if session.parts is None or correction is None or correction.fix.T_map_body is None:
+        return None
+    return session.parts.at(correction.fix.T_map_body[:3, 3]).name
 
 
 def hypotheses(session: Session) -> HypothesesMessage | None:

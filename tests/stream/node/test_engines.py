@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from trackers import follow
 
 import coview_kernels
 from coview_kernels import runtime
@@ -15,6 +16,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.engine_queue import FrameJob, SearchJob
@@ -102,6 +104,19 @@ def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_
         fresh.prepare_later()
         # the field judges slips of odometry, and none happened
         assert asked[engine] | ({"field"} if engine is track else set()) == launched
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
+def test_prepared_localizer_compiles_no_kernel_later(world_file, world_drive, launched):
+    """Neither for the search nor for tracking: such a step would take a second."""
+    launched.clear()
+    localizer = Localizer(world_file)
+    localizer.prepare()
+    prepared = set(launched)
+    launched.clear()
+    assert follow(localizer, world_drive, FRAMES)[-1].state is State.TRACKING
+    assert launched <= prepared
 
 
 def same(fix, other):
