@@ -58,7 +58,8 @@ class RegistrationConfig:
 
     Attributes:
         method: ``trimmed-icp``, or ``gicp`` (extra gicp), for tracking only: the search uses trimmed ICP.
-        keep: overlap, the share of the pairs that is kept; the paper keeps 0.6, 0.7 converges faster and as well.
+        keep: overlap, the share of the pairs that the last scale keeps, the nearest; the paper keeps 0.6. The scales
+            before it keep all: far from the end the nearest pairs are those that hold a wrong pose.
         search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
         track: likewise while tracking.
         iterations: at most, on each scale. Half as many leave headings one degree off where odometry is three off

@@ -32,10 +32,11 @@ PARTNER = 6
 # and before them the bin of every point
 FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
-KEEP, ITERATIONS, SCALES, MIN_PAIRS, PRIOR = 8, 9, 10, 11, 12
-PIVOT, MEAN, BELIEF, FIRST = 13, 16, 28, 64
-# and of each scale radius, width of the weights, the shift and turn that end it, and how many of the points take part
-RADIUS, WIDTH, SHIFT, TURN, POINTS, EACH = 0, 1, 2, 3, 4, 5
+ITERATIONS, SCALES, MIN_PAIRS, PRIOR = 8, 9, 10, 11
+PIVOT, MEAN, BELIEF, FIRST = 12, 15, 27, 63
+# and of each scale radius, width of the weights, the shift and turn that end it, how many of the points take part, and
+# the share of the pairs that is kept
+RADIUS, WIDTH, SHIFT, TURN, POINTS, KEEP, EACH = 0, 1, 2, 3, 4, 5, 6
 # state: pose by rows (12), then these, the information (36), the sums of a step (30), and six values to work with
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
 RUNNING, DONE, LOST = 0, 1, 2
@@ -284,7 +285,7 @@ def align(
         pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
         about = placed(T, pivot)
         n = ti.cast(settings[scale + POINTS], ti.i32)
-        last, share = trim(settings[KEEP], chunks, n, kinds.shape[0], bins)
+        last, share = trim(settings[scale + KEEP], chunks, n, kinds.shape[0], bins)
         add_up(
             T, about, settings[scale + WIDTH], n, last, share, source, kinds, partners, bins, state,
         )  # fmt: skip

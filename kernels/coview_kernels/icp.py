@@ -51,7 +51,6 @@ def align_planes(
     pivot: npt.ArrayLike,
     scales: Sequence[Scale],
     *,
-    keep: float,
     iterations: int,
     min_pairs: int = 50,
     prior: Prior | None = None,
@@ -59,7 +58,8 @@ def align_planes(
     """Register points to a map of points with normals.
 
     An iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it keeps
-    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth. Then it
+    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth. Far from the
+    end the nearest are those that hold a wrong pose, so coarse scales had better keep all pairs. Then an iteration
     takes a Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit normal n,
     w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the planarity. The
     share makes both kinds weigh the same for any numbers of points, but is 5 at most. A coarse scale may take every
@@ -73,7 +73,6 @@ def align_planes(
         T: (4, 4) ``T_map_source`` to begin with.
         pivot: (3,) source-frame centre of rotations.
         scales: coarse to fine.
-        keep: share of the pairs in (0, 1].
         iterations: maximum on each scale.
         min_pairs: pairs that an answer needs, at least 1.
         prior: fused with the normal equations of the pairs.
@@ -88,12 +87,12 @@ def align_planes(
     of = np.ascontiguousarray(kind, dtype=bool)
     check_same_shape("kind", of, "one value per point", (len(points),))
     planes = as_float32("normals", normals, len(grid.points), 3)
-    if not 0 < keep <= 1:
-        raise ValueError(f"keep must lie in (0, 1], got {keep}")
     if iterations < 1 or not len(scales):
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
     if not all(math.isfinite(v) and v > 0 for scale in scales for v in scale):
         raise ValueError(f"scales must hold positive numbers, got {scales}")
+    if any(scale.keep > 1 for scale in scales):
+        raise ValueError(f"a scale's keep must lie in (0, 1], got {scales}")
     shares = [scale.every for scale in scales]
     if any(a % b for a, b in itertools.pairwise(shares)):
         raise ValueError(
@@ -106,7 +105,7 @@ def align_planes(
         mean = as_finite64("the prior's mean", prior.T_map_source, 4, 4)
         belief = mean, as_finite64("the prior's information", prior.information, 6, 6)
     plan = Plan(
-        as_finite64("T", T, 4, 4), as_finite64("pivot", pivot, 3), tuple(scales), keep, iterations, min_pairs,
+        as_finite64("T", T, 4, 4), as_finite64("pivot", pivot, 3), tuple(scales), iterations, min_pairs,
         belief,
     )  # fmt: skip
     if not len(grid.points) or len(points) < min_pairs:
@@ -166,19 +165,19 @@ def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
 
 def _settings(frame: F64, plan: Plan, numbers: I64) -> F64:
     """Return all constants of the kernel in one array: every argument costs 5 to 10 us."""
-    values = np.zeros(64 + 5 * len(plan.scales))
+    values = np.zeros(63 + 6 * len(plan.scales))
     values[:8] = frame
-    values[8:13] = plan.keep, plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None
-    values[13:16] = plan.pivot
+    values[8:12] = plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None
+    values[12:15] = plan.pivot
     if plan.prior is not None:
-        values[16:28], values[28:64] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
-    values[64:] = [v for scale, n in zip(plan.scales, numbers, strict=True) for v in (*scale[:4], n)]
+        values[15:27], values[27:63] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
+    values[63:] = [v for scale, n in zip(plan.scales, numbers, strict=True) for v in (*scale[:4], n, scale.keep)]
     return values
 
 
 def _compile() -> None:
     arguments = SAMPLE_GRID, SAMPLE, SAMPLE, np.ones(2), np.eye(4), np.zeros(3), [Scale(1.0, 1.0)]
-    align_planes(*arguments, keep=1.0, iterations=1, min_pairs=1)
+    align_planes(*arguments, iterations=1, min_pairs=1)
 
 
 compiled_by("align_planes", _compile)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from coview_kernels import PointGrid, Prior, Scale, align_planes, reference
 from coview_kernels.reference.icp import Plan
 
-SCALES = (Scale(1.5, 0.5, 0.02, 1e-3), Scale(0.8, 0.26), Scale(0.4, 0.13))
-FIXED = {"keep": 0.7, "iterations": 15}
+SCALES = (Scale(1.5, 0.5, 0.02, 1e-3), Scale(0.8, 0.26, keep=0.85), Scale(0.4, 0.13, keep=0.7))
+FIXED = {"iterations": 15}
 
 
 def pose(rotation_vector, translation):
@@ -56,7 +56,7 @@ def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, min_p
     options = FIXED | changes
     ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, min_pairs=min_pairs, **options)
     belief = None if prior is None else (np.asarray(prior.T_map_source), np.asarray(prior.information))
-    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], min_pairs, belief)
+    plan = Plan(T, pivot, scales, options["iterations"], min_pairs, belief)
     return ours, reference.align_planes(grid.tree, normals, local, above, plan)
 
 
@@ -193,7 +193,7 @@ def test_errors_name_the_argument():
     }  # fmt: skip
     bad = {
         "normals": cloud[:1], "source": np.zeros(3), "kind": np.ones(3), "T": np.full((4, 4), np.nan),
-        "pivot": [0, 0, np.inf], "scales": [Scale(0.0, 1.0)], "keep": 1.1, "iterations": 0,
+        "pivot": [0, 0, np.inf], "scales": [Scale(0.0, 1.0)], "iterations": 0,
         "prior": Prior(np.eye(4), np.full((6, 6), np.inf)),
     }  # fmt: skip
     for name, value in bad.items():
@@ -207,6 +207,7 @@ def test_min_pairs_and_shares_of_scales_are_checked():
     assert align_planes(*arguments, np.eye(4), np.zeros(3), SCALES, **FIXED, min_pairs=1) is not None
     with pytest.raises(ValueError, match="min_pairs must be at least 1"):
         align_planes(*arguments, np.eye(4), np.zeros(3), SCALES, **FIXED, min_pairs=0)
-    scales = [Scale(1.0, 1.0, every=3), Scale(0.5, 1.0, every=2)]
-    with pytest.raises(ValueError, match="multiple of the next"):
-        align_planes(*arguments, np.eye(4), np.zeros(3), scales, **FIXED)
+    apart, over = [Scale(1.0, 1.0, every=3), Scale(0.5, 1.0, every=2)], [Scale(1.0, 1.0, keep=1.1)]
+    for scales, reason in ((apart, "multiple of the next"), (over, "keep must lie in")):
+        with pytest.raises(ValueError, match=reason):
+            align_planes(*arguments, np.eye(4), np.zeros(3), scales, **FIXED)

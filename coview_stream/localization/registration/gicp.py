@@ -84,7 +84,6 @@ def register_surfaces(
     pivot: Floats,
     scales: list[kernels.Scale],
     *,
-    keep: float,
     iterations: int,
     prior: kernels.Prior | None = None,
 ) -> kernels.Registration | None:
@@ -101,7 +100,7 @@ def register_surfaces(
     T, total, answer = np.array(T_map_source, dtype=np.float64), 0, None
     for scale in scales:
         for _ in range(iterations):
-            pairs = _pairs(kinds, target, grid, normals, T, pivot, scale.radius, keep)
+            pairs = _pairs(kinds, target, grid, normals, T, pivot, scale.radius, scale.keep)
             if pairs is None:
                 return None
             H, b, count, rmse = pairs

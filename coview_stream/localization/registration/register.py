@@ -34,9 +34,10 @@ _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _MIN_SHARE = 0.01  # least share of the information on a direction; below it the minimum of the pairs is noise
 _STOP_SHIFT = 2e-3  # metres: below the map's noise, and the next step would be a third of it
 _STOP_TURN = 1e-4  # radians
-# of a coarse scale, from whose end the next one goes on: finer stops and more points change no result
-_COARSE_SHIFT = 0.06  # metres per metre of the scale
-_COARSE_TURN = 3e-3  # radians per metre of the scale
+# of a coarse scale: a finer one goes on from where it ends, and moves by less, as its radius and its trimming hold what
+# is near; four times as much left half of the runs a metre off where crowns pull slowly
+_COARSE_SHIFT = 0.015  # metres per metre of the scale
+_COARSE_TURN = 7.5e-4  # radians per metre of the scale
 _COARSE_POINTS = 1500  # up to twice as many take part
 _WIDTH_SHARE = 0.33  # width of the weights per metre of a scale: narrow ones hold a wrong initial pose
 
@@ -79,6 +80,7 @@ def register(
             _STOP_SHIFT if k == last else max(_STOP_SHIFT, _COARSE_SHIFT * scale),
             _STOP_TURN if k == last else max(_STOP_TURN, _COARSE_TURN * scale),
             1 if k == last else stride,
+            config.keep if k == last else 1.0,
         )
         for k, scale in enumerate(scales)
     ]
@@ -90,11 +92,11 @@ def register(
             return None
         return register_surfaces(
             source.surfaces, T_map_source, target.surfaces, target.grid, target.normals, pivot, steps,
-            keep=config.keep, iterations=limit, prior=prior,
+            iterations=limit, prior=prior,
         )  # fmt: skip
     return kernels.align_planes(
         target.grid, target.normals, source.points, source.above, T_map_source, pivot, steps,
-        keep=config.keep, iterations=limit, min_pairs=MIN_PAIRS, prior=prior,
+        iterations=limit, min_pairs=MIN_PAIRS, prior=prior,
     )  # fmt: skip
 
 

@@ -32,6 +32,8 @@ class Scale(NamedTuple):
     """... and turns by less than this, radians."""
     every: int = 1
     """Of either kind of point one of so many takes part."""
+    keep: float = 1.0
+    """Of either kind of pair this share is kept, in (0, 1]: the nearest."""
 
 
 class Plan(NamedTuple):
@@ -40,7 +42,6 @@ class Plan(NamedTuple):
     T: F64
     pivot: F64
     scales: tuple[Scale, ...]
-    keep: float
     iterations: int
     min_pairs: int
     prior: tuple[F64, F64] | None
@@ -93,7 +94,7 @@ def _step(
     found = np.flatnonzero(np.isfinite(distance))
     pairs = partner[found]
     gap = source[found].astype(np.float64) @ T[:3, :3].T + T[:3, 3] - tree.data[pairs]
-    share = _shares(np.einsum("ij,ij->i", gap, gap).astype(np.float32), kind[found], plan.keep, len(source))
+    share = _shares(np.einsum("ij,ij->i", gap, gap).astype(np.float32), kind[found], scale.keep, len(source))
     chosen = np.flatnonzero(share)
     if len(chosen) < plan.min_pairs:
         return None

@@ -168,12 +168,11 @@ def rivals(world_map, first_scan, off, count=1):
     ],
 )
 def test_right_place_is_the_best_rival_of_one_beside_it(world_map, first_scan, off, count):
-    """From where registration alone does not come there."""
+    """From where the finest scale of a registration does not come there alone."""
     x, y, degrees = off
     match, T, place = rivals(world_map, first_scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
-    alone = register(
-        first_scan[0].cloud, T, LocalMaps(world_map, 50.0).around(first_scan[1][:3, 3]), CONFIG.registration, (1.0, 0.5)
-    )
+    target, settings = LocalMaps(world_map, 50.0).around(first_scan[1][:3, 3]), CONFIG.registration
+    alone = register(first_scan[0].cloud, T, target, settings, settings.track[-1:])
     assert alone is None or pose_error(alone.T_map_source @ first_scan[0].T_odom_body, first_scan[1])[0] > 0.5
     metres, turn = pose_error(match[0].T_map_odom @ first_scan[0].T_odom_body, first_scan[1])
     assert metres < 0.05
