@@ -58,9 +58,9 @@ def align_planes(
     """Register points to a map of points with normals.
 
     An iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it keeps
-    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth. Far from the
-    end the nearest are those that hold a wrong pose, so coarse scales had better keep all pairs. Then an iteration
-    takes a Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit normal n,
+    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth. (Coarse
+    scales had better keep all: far from the end, the nearest pairs are those that hold a wrong pose.) Then it takes a
+    Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit normal n,
     w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the planarity. The
     share makes both kinds weigh the same for any numbers of points, but is 5 at most. A coarse scale may take every
     so-many-th point of either kind: the next scale goes on from its end.
