@@ -348,12 +348,13 @@ class Trial:
             "peer": self.peer, "scene": self.scene, "right": f"{len(self.right())} of {self.asked}",
             "false": self.false_accepts(), "ms": milliseconds([self]),
             "metres": float(np.median([a["metres"] for a in self.right()] or [math.nan])),
+            "degrees": float(np.median([a["degrees"] for a in self.right()] or [math.nan])),
         }  # fmt: skip
 
 
 COLUMNS = (
     ("peer", "peer", None), ("world", "scene", None), ("right < 3 m", "right", None), ("false accepts", "false", 0),
-    ("e_t m", "metres", 2), ("query ms", "ms", 0),
+    ("e_t m", "metres", 3), ("e_r deg", "degrees", 2), ("query ms", "ms", 0),
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
 from small_world import pose_error
+from trackers import observed
 
 from coview_kernels import Prior, Registration
 from coview_stream.config import RegistrationConfig
@@ -84,6 +85,18 @@ def test_registration_with_forty_percent_outliers(target, scan, centre):
     metres, degrees = pose_error(result.T_map_source, TRUTH)
     assert metres < 0.03
     assert degrees < 0.15
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "degrees"), [(1.5, 0.0, 8.0), (1.06, -1.06, -8.0), (-2.5, 0.0, 8.0), (1.77, -1.77, -8.0)]
+)
+def test_start_metres_off_is_found_in_few_iterations(world_map, world_drive, x, y, degrees):
+    """Were the coarse scales trimmed, the nearest pairs would hold each of these starts half a metre off or more."""
+    truth = world_drive.T_map_body[4]
+    scan, target = observed(world_drive.clouds[4], truth), LocalMaps(world_map, 50.0).around(truth[:3, 3])
+    start = truth @ pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]) @ np.linalg.inv(truth)
+    found = register(scan.cloud, start, target, CONFIG, CONFIG.search, centre=truth[:3, 3], iterations=5)
+    assert pose_error(found.T_map_source, np.eye(4))[0] < 0.02
 
 
 def test_information_is_symmetric_and_reflects_observability(target, scan):
