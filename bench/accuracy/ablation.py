@@ -29,8 +29,8 @@ from bench.harness.rows import Row, informs, listed
 from bench.harness.worlds import prepare
 from coview_stream import BaseMap
 from coview_stream.clouds import read_cloud, read_tum, write_cloud
-from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
-from coview_stream.config.localizer import AcceptanceConfig
+from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config.localizer import AcceptanceConfig, TrackingConfig
 from coview_stream.errors import InputError
 from coview_stream.sim import KINDS, SimulationConfig, buildings, parse_dirt
 from coview_stream.sim.kinds import Plot
@@ -63,14 +63,17 @@ def _with(**changes: Any) -> DescriptorConfig:
 
 SPACINGS = (2.0, 1.0, 3.0, 4.0, 6.0, 8.0)
 
+CHANNELS: tuple[tuple[Channel, ...], ...] = (
+    ("scan_context",), ("coview",), ("paper",), ("scan_context", "coview"), ("scan_context", "paper"),
+    ("coview", "paper"), ("scan_context", "coview", "paper"),
+)  # fmt: skip
+"""Channels and their sums."""
+
 SEARCH: dict[str, dict[str, Choice]] = {
     "channels": {
         f"default: {' + '.join(_DEFAULT.channels)}": Choice(),
-        "scan_context": Choice(_with(channels=("scan_context",))),
-        "coview": Choice(_with(channels=("coview",))),
+        **{" + ".join(names): Choice(_with(channels=names)) for names in CHANNELS if names != _DEFAULT.channels},
         "coview, eq. 2 alone": Choice(_with(channels=("coview",)), strict=True),
-        "paper": Choice(_with(channels=("paper",))),
-        "scan_context + paper": Choice(_with(channels=("scan_context", "paper"))),
         "zero at the sensor": Choice(_with(ground_zero=False)),
     },
     "bins": {
@@ -90,6 +93,7 @@ SEARCH: dict[str, dict[str, Choice]] = {
         "two keyframes vote": Choice(window=2),
         "ten keyframes vote": Choice(window=10),
         "single smallest distance of five": Choice(single=True),
+        "eq. 7 over common columns": Choice(common=True),
         "200 nearest ring keys": Choice(nearest=200),
         "1000 nearest ring keys": Choice(nearest=1000),
         "paper, 200 nearest ring keys": Choice(_with(channels=("paper",)), nearest=200),
@@ -101,6 +105,8 @@ SEARCH: dict[str, dict[str, Choice]] = {
 REGISTRATION = {
     "default: plane, 70 %": Registering(),
     **{f"plane, {keep:.0%}": Registering(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
+    "plane, 15 iterations": Registering(RegistrationConfig(iterations=15)),
+    "plane, ground and structure trimmed together": Registering(apart=False),
     "plane, facades removed": Registering(facades=False),
     "point, same kernel": Registering(way="points"),
     "point, facades removed": Registering(way="points", facades=False),
@@ -117,6 +123,9 @@ LOCALIZER = {
     "calibration off": Localizing(changed=uncalibrated),
     "outliers of scans removed": Localizing(filtered=True),
     "60 % of the pairs": Localizing(LocalizerConfig(registration=RegistrationConfig(keep=0.6))),
+    "frames of two metres registered": Localizing(
+        LocalizerConfig(tracking=TrackingConfig(window=2.0, min_points=50_000))
+    ),
 }
 """Choices of the whole localizer."""
 

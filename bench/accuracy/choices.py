@@ -83,6 +83,7 @@ class Choice:
         nearest: stations nearest in ring key that are compared; None: all.
         window: keyframes that vote together.
         single: the one smallest distance of these keyframes names the place.
+        common: eq. 7 averages only columns that are occupied on both sides.
     """
 
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
@@ -92,6 +93,7 @@ class Choice:
     nearest: int | None = None
     window: int = WINDOW
     single: bool = False
+    common: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Site:
                 chosen = np.argsort(gap, kind="stable")[: choice.nearest]
                 volume = np.ones((len(stations), descriptor.sectors), dtype=np.float32)
                 volume[chosen] = exact_distances(stations[chosen], query)
-            out.append((centre, volume))
+            out.append((centre, over_common(volume, np.float32(stations), query) if choice.common else volume))
         return out
 
     def search(self, choice: Choice) -> dict[str, float]:
@@ -218,6 +220,8 @@ class Site:
             target = maps.around(transform(start, seen.position[None])[0])
             if target is None:
                 continue
+            if not choice.apart:
+                source = replace(source, above=np.ones(len(source.points), dtype=bool))
             if not choice.facades:
                 keep = paper.consistent(transform(start, source.points.astype(np.float64)), target.points)
                 kept = (values[keep] for values in (source.points, source.above, source.height))
@@ -256,11 +260,13 @@ class Registering:
         way: ``product``; ``points``, by the same kernel from point to point, which needs finer stops; ``paper``, plain
             trimmed ICP from point to point, without scales or weights.
         facades: False: without the points at heights where the map has none.
+        apart: False: points on the ground and above it are trimmed together.
     """
 
     config: RegistrationConfig = field(default_factory=RegistrationConfig)
     way: Literal["product", "points", "paper"] = "product"
     facades: bool = True
+    apart: bool = True
 
     def register(self, source: RegistrationCloud, start: Pose, target: LocalMap, centre: Floats) -> Pose | None:
         """Return ``T_map_odom`` (4, 4) from a start; ``centre`` (3,) is the robot's position."""
@@ -372,6 +378,15 @@ def robust_zscore(volume: Floats32) -> Floats32:
     if median > 1.0:  # unscored stations must not get a negative z-score
         np.maximum(scores, np.float32(0.0), out=scores, where=volume == 1.0)
     return scores
+
+
+def over_common(volume: Floats32, stations: Floats32, query: Floats32) -> Floats32:
+    """Return distances (M, S) averaged over the columns that are occupied on both sides, of those of eq. 7."""
+    sectors = volume.shape[1]
+    occupied = [np.float32((one != 0).any(axis=-2, keepdims=True)) for one in (stations, query)]
+    turned = sectors * (1.0 - paper.distances(*occupied))  # columns in common
+    columns = np.roll(turned[:, ::-1], 1, axis=1)  # the product counts shifts the other way round
+    return np.asarray(1.0 - sectors * (1.0 - volume) / np.maximum(columns, 1.0), dtype=np.float32)
 
 
 def nearest_place(volume: Floats32, centre: Floats, stations: Floats32) -> Hypothesis:

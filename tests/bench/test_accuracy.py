@@ -7,12 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import ablation, accuracy, conditions, odometry
-from bench.accuracy.choices import Seen, TableVote, nearest_place, right
+from bench.accuracy.choices import Seen, TableVote, nearest_place, over_common, right
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
 from bench.tracking.drives import scenarios
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
+from coview_stream.localization.search.retrieval import exact_distances
 from coview_stream.sim import Dirt, SimulationConfig
 from coview_stream.sim.dirt import KINDS_OF_DIRT
 
@@ -152,6 +153,20 @@ def test_the_smallest_distance_and_the_best_vote_name_the_same_place():
     np.testing.assert_allclose(there[:3], stations[13], atol=1e-6)
     best = [int(number[0]) for number in TableVote.of_distances(np.zeros(3), [volume]).candidates()]
     assert best == [13, 7]
+
+
+def test_distances_over_common_columns_let_nearly_empty_stations_win():
+    rng = np.random.default_rng(5)
+    stations, query = rng.random((2, 4, 12), np.float32), rng.random((4, 12), np.float32)
+    stations[1, :, 2:] = 0.0
+    stations[1, :, 1] = np.roll(query, 3, axis=1)[:, 1]
+    stations[1, :, 0] = np.roll(query, 3, axis=1)[:, 0]
+    whole = exact_distances(stations, query)
+    common = over_common(whole, stations, query)
+    np.testing.assert_allclose(common[0], whole[0], atol=1e-5)
+    assert whole[1].min() == pytest.approx(10 / 12, abs=1e-5)
+    assert common[1].min() == pytest.approx(0.0, abs=1e-5)
+    assert common[1].argmin() == whole[1].argmin()
 
 
 @pytest.mark.parametrize(

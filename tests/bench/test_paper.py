@@ -32,6 +32,7 @@ def test_distances_are_one_less_the_mean_cosine_of_columns_and_empty_ones_cost_o
             assert found[k, n] == pytest.approx(1.0 - total / 6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_turned_scan_is_found_at_its_station_and_heading(world_map):
     reference = Reference(world_map)
     T_map_odom = pose_from(rot_z(2.0 * np.pi * 7 / 60), [40.0, -30.0, 2.0])
