@@ -29,9 +29,10 @@ PAGE = ROOT / "docs" / "results.md"
 COMMANDS = {
     **{name: name for name in BENCHMARKS if name not in ("odometry", "ground")},
     "city": "city --side 2 4",
+    "ablation": "ablation --picture docs/images/spacing.png",
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
-    "airborne-like maps": "conditions --conditions base --densities 4 8 20",
+    "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
     "forest_drives": "forest_drives dense-forest long-forest --plots docs/images",
     "forest_times": "forest_drives times",
     "fuzz": "fuzz --seconds 60",
