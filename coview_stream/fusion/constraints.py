@@ -21,6 +21,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, along_body, boxminus, inverse, pose_from, yaw_of
 from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
+from coview_stream.localization.tracking.pose_graph import Constraint
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 STEP = 4.0  # metres driven from keyframe to keyframe
@@ -116,16 +117,6 @@ def spaced(driven: Floats, step: float) -> Ints:
     if driven[-1] - driven[chosen[-1]] > 0.5 * step:
         chosen.append(len(driven) - 1)
     return np.asarray(chosen, dtype=np.int64)
-
-
-@dataclass(frozen=True, eq=False)
-class Constraint:
-    """Result of one registration."""
-
-    source: int  # index of the registered submap
-    target: int  # index of the submap that it was registered to; -1: the base map
-    T: Pose  # (4, 4) pose of the source's body, relative to the target's body or to the map's origin
-    covariance: Floats  # (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body
 
 
 class Registrar:

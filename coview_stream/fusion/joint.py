@@ -13,29 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import require_library
-from coview_stream.fusion.constraints import (
-    AGREE,
-    Constraint,
-    Registrar,
-    Submap,
-    off_by,
-    overlapping,
-    path_of,
-    submaps_of,
-)
+from coview_stream.fusion.constraints import AGREE, Registrar, Submap, off_by, overlapping, path_of, submaps_of
 from coview_stream.fusion.fuse import Progress
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, along_body, along_map, boxminus, interpolate, inverse
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
+from coview_stream.localization.tracking.pose_graph import BatchGraph, Constraint
 
 # chosen by hand
 _KERNEL = 3.0  # sigmas, of Cauchy's weights
@@ -193,24 +184,11 @@ def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[C
 
 def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: Sequence[Constraint]) -> Floats:
     """Return the most probable poses (S, 4, 4)."""
-    gtsam: Any = require_library("gtsam", "gtsam>=4.3", "fuse --joint")
-    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_KERNEL)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-
-    def robust(covariance: Floats) -> Any:
-        return gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
-
-    anywhere = gtsam.noiseModel.Diagonal.Sigmas(_ANYWHERE)
-    for k, submap in enumerate(submaps):
-        values.insert(k, gtsam.Pose3(submap.T_map_body))
-        graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(submap.T_map_body), anywhere))
-    for c in on_map:
-        graph.add(gtsam.PriorFactorPose3(c.source, gtsam.Pose3(c.T), robust(c.covariance)))
-    for c in relative:
-        T = gtsam.Pose3(c.T)
-        graph.add(gtsam.BetweenFactorPose3(c.target, c.source, T, robust(c.covariance)))
-    answer = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return np.asarray([answer.atPose3(k).matrix() for k in range(len(submaps))], dtype=np.float64)
+    graph = BatchGraph(np.array([submap.T_map_body for submap in submaps]), "fuse --joint")
+    anywhere = np.diag(_ANYWHERE**2)
+    graph.add([Constraint(k, -1, submap.T_map_body, anywhere) for k, submap in enumerate(submaps)])
+    graph.add([*on_map, *relative], ("Cauchy", _KERNEL))
+    return graph.solve()
 
 
 def _residual(constraints: Sequence[Constraint], poses: Floats) -> float:

@@ -68,6 +68,13 @@ class Calibration:
         R = self.R_body_cloud
         return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
+    def motion_covariance(self, step: Floats) -> Floats:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the step's axes."""
+        along = np.concatenate([np.zeros(3), step])
+        spread = np.outer(along, along) * self.sigma_scale**2
+        spread[2, 2] += (self.sigma_turn * float(np.linalg.norm(step))) ** 2
+        return np.asarray(spread)
+
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Return one clause of text per noticeable correction.
 

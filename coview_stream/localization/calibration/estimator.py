@@ -199,13 +199,6 @@ class CalibrationEstimator:
         self._known.begin_odometry()
         self._apply()
 
-    def motion_covariance(self, step: Floats) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the step's axes."""
-        along = np.concatenate([np.zeros(3), step])
-        spread = np.outer(along, along) * self.calibration.sigma_scale**2
-        spread[2, 2] += (self.calibration.sigma_turn * float(np.linalg.norm(step))) ** 2
-        return np.asarray(spread)
-
     def measure_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
         """Add the attitude of a registration at the tracked place (eq. C1).
 

@@ -1,7 +1,7 @@
-"""Pose graph: a chain of keyframes with odometry between them and registrations to the map, on gtsam's iSAM2.
+"""Pose graphs on gtsam: while tracking a chain of keyframes, on iSAM2; offline any graph, solved at once.
 
-The unknowns are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of two
-poses in the tangent of the body, the estimate is the most probable one given
+The unknowns of the chain are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the
+difference of two poses in the tangent of the body, the estimate is the most probable one given
 
 * a prior on the first: e(T_prior, X_0) ~ N(0, P)
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
@@ -17,6 +17,7 @@ linearisation, as past and future meet in one pose; its smoothed belief would co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -25,7 +26,16 @@ import numpy as np
 from coview_stream.config import GraphConfig
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, adjoint, along_body, along_map, boxminus, inverse, orthonormal
+from coview_stream.geometry.transforms import (
+    Pose,
+    Poses,
+    adjoint,
+    along_body,
+    along_map,
+    boxminus,
+    inverse,
+    orthonormal,
+)
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are linearised again
@@ -203,3 +213,51 @@ class PoseGraph:
     def _add_correction(self, key: int, measured: _Gaussian) -> None:
         robust = self._gtsam.noiseModel.Robust.Create(self._kernel, self._noise(measured))
         self._factors.add(self._gtsam.PriorFactorPose3(key, self._gtsam.Pose3(measured.T), robust))
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """Measured pose of one node of a graph, on the map or relative to another node."""
+
+    source: int  # index of the measured node
+    target: int  # index of the node that it is measured from; -1: the map
+    T: Pose  # (4, 4) pose of the source's body, relative to the target's body or to the map's origin
+    covariance: Floats  # (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body
+
+
+class BatchGraph:
+    """Graph of any constraints, solved at once: the most probable poses, and the covariance of each."""
+
+    def __init__(self, poses: Poses, feature: str) -> None:
+        """Begin at poses (N, 4, 4) of the nodes.
+
+        Raises:
+            DependencyError: gtsam is missing, which ``feature`` needs.
+        """
+        self._gtsam: Any = require_library("gtsam", "gtsam>=4.3", feature)
+        self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+        for k, T in enumerate(poses):
+            self._values.insert(k, self._gtsam.Pose3(T))
+
+    def add(self, constraints: Sequence[Constraint], kernel: tuple[str, float] | None = None) -> None:
+        """Add constraints, under a kernel of gtsam's (``"Huber"``, ``"Cauchy"``) with its width in sigmas."""
+        gtsam = self._gtsam
+        robust = None if kernel is None else getattr(gtsam.noiseModel.mEstimator, kernel[0]).Create(kernel[1])
+        for c in constraints:
+            noise = gtsam.noiseModel.Gaussian.Covariance(c.covariance)
+            noise = noise if robust is None else gtsam.noiseModel.Robust.Create(robust, noise)
+            T = gtsam.Pose3(c.T)
+            if c.target < 0:
+                self._factors.add(gtsam.PriorFactorPose3(c.source, T, noise))
+            else:
+                self._factors.add(gtsam.BetweenFactorPose3(c.target, c.source, T, noise))
+
+    def solve(self) -> Poses:
+        """Return the most probable poses (N, 4, 4)."""
+        self._values = self._gtsam.LevenbergMarquardtOptimizer(self._factors, self._values).optimize()
+        return np.array([self._values.atPose3(k).matrix() for k in range(self._values.size())]).reshape(-1, 4, 4)
+
+    def covariances(self) -> Floats:
+        """Return the covariance (N, 6, 6) of each pose over (rx, ry, rz, x, y, z), along the axes of its body."""
+        marginals = self._gtsam.Marginals(self._factors, self._values)
+        return np.array([marginals.marginalCovariance(k) for k in range(self._values.size())]).reshape(-1, 6, 6)

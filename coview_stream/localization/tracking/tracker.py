@@ -127,7 +127,7 @@ class Tracker:
         drifted = self.odometry.drift.covariance(
             self.odometry.travelled - travelled, abs(yaw_of(inverse(T_odom_keyframe) @ T_odom_body))
         )
-        drifted += self._calibration.motion_covariance(step)
+        drifted += self._calibration.calibration.motion_covariance(step)
         covariance = propagate(registered + _START, step) + drifted
         self._restart(self._of_cloud(registration.T_map_source @ T_odom_body), covariance, T_odom_body)
 
@@ -222,8 +222,9 @@ class Tracker:
         driven, turned = self.odometry.since_keyframe()
         spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self.odometry.motion(T_odom_body)
-        spread += self._calibration.motion_covariance(self._belief().T_map_body[:3, :3] @ motion[:3, 3])
-        level = self._calibration.calibration.T_body_cloud
+        calibration = self._calibration.calibration
+        spread += calibration.motion_covariance(self._belief().T_map_body[:3, :3] @ motion[:3, 3])
+        level = calibration.T_body_cloud
         self._graph.move(inverse(level) @ motion @ level, spread)
         self.odometry.set_keyframe(T_odom_body)
         return self._belief()
