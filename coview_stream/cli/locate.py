@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--export", metavar="A,B", help="also trajectory.csv, .kitti, .geojson or .gpx: csv,kitti,geojson,gpx"
     )
+    parser.add_argument(
+        "--smooth", action="store_true", help="poses by the whole run, also before the first fix and in interruptions"
+    )
     add_initial(parser)
     add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
@@ -41,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap.progress import progress_bar
     from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import InputError
-    from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, locate, summary, write
+    from coview_stream.localization.offline import DESCRIPTORS_PNG, FILTERED, TRAJECTORY_PNG, locate, summary, write
     from coview_stream.localization.registration.gicp import library
     from coview_stream.localization.result import Fix
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -83,13 +86,12 @@ def run(args: argparse.Namespace) -> int:
             if fix is not None:
                 bar.set_postfix_str(fix.state.reported)
 
-        located = locate(base_map, recorded, config, step, guess)
+        located = locate(base_map, recorded, config, step, guess, args.smooth)
     write(located, base_map, args.output)
-    written = ["trajectory.tum", "result.json"]
+    written = ["trajectory.tum", *([FILTERED] if args.smooth else []), "result.json"]
     if formats:
-        posed = located.posed
-        stamps, poses = [fix.stamp for fix in posed], [fix.T_map_body for fix in posed if fix.T_map_body is not None]
-        track = trajectory_of(args.run_path.name, stamps, poses, geo)
+        kinds = None if located.smoothed is None else [pose.kind.value for pose in located.smoothed]
+        track = trajectory_of(args.run_path.name, *located.trajectory, geo, kinds)
         written += [path.name for path in export(track, args.output, formats)]
     if draws:
         from coview_stream.report.plots import draw_run

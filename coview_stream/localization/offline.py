@@ -6,6 +6,7 @@ import json
 import os
 import time
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,17 +19,28 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
-from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.errors import CloudError, InputError, RunError, require_library
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, one_in
-from coview_stream.geometry.transforms import pose_from, pose_from_tum
+from coview_stream.geometry.transforms import Poses, pose_from, pose_from_tum
+from coview_stream.localization.backward import RecordedFrame, RecordingLocalizer
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.hints import PlaceGuess
+from coview_stream.localization.smoothing import PoseKind, SmoothedPose, smooth_run
 from coview_stream.localization.state import State
 from coview_stream.recordings.run import Run
 
+_KINDS = {
+    PoseKind.SMOOTHED: "frames with a live pose",
+    PoseKind.BACKWARD: "tracked backwards from a later fix",
+    PoseKind.BRIDGED: "bridged by odometry",
+}
 _TOLD = 3  # stretches without a pose that a summary names
+
+TRAJECTORY, FILTERED = "trajectory.tum", "filtered.tum"
+"""Trajectories of a run: the best, and with smoothing the live one beside it."""
 
 TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 """Pictures of a run; ``report.run_pictures`` draws them."""
@@ -55,6 +67,30 @@ class Interruption:
         return {"first_stamp": self.first, "last_stamp": self.last, "frames": self.frames, "reason": self.reason}
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """Successive smoothed poses of one kind; frames without a pose may lie between.
+
+    Attributes:
+        kind: of the poses.
+        first: stamp of the first frame, seconds.
+        last: stamp of the last frame.
+        frames: number of poses.
+        protection_m: their greatest protection level, metres.
+    """
+
+    kind: PoseKind
+    first: float
+    last: float
+    frames: int
+    protection_m: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data of ``result.json``."""
+        about = {"kind": self.kind.value, "first_stamp": self.first, "last_stamp": self.last, "frames": self.frames}
+        return {**about, "protection_m": round(self.protection_m, 4)}
+
+
 @dataclass
 class RunResult:
     """Result of localizing a run.
@@ -70,6 +106,7 @@ class RunResult:
         sources: recognizers that named places: "coview", "learned"; empty if not known.
         driven: metres that odometry had driven at the first fix; None if not known.
         mount: of the run's lidar; None for the body itself.
+        smoothed: poses by the whole run, in order; None unless they were asked for.
     """
 
     frames: int
@@ -82,11 +119,35 @@ class RunResult:
     sources: tuple[str, ...] = ()
     driven: float | None = None
     mount: Mount | None = None
+    smoothed: list[SmoothedPose] | None = None
 
     @property
     def posed(self) -> list[Fix]:
         """Fixes that have a pose."""
         return [fix for fix in self.fixes if fix.T_map_body is not None]
+
+    @property
+    def filtered(self) -> tuple[Floats, Poses]:
+        """Stamps (P,) and poses (P, 4, 4) map <- body as they were live, of the frames that had one."""
+        return _trajectory(self.posed)
+
+    @property
+    def trajectory(self) -> tuple[Floats, Poses]:
+        """The same by the whole run, if it is :attr:`smoothed`."""
+        return self.filtered if self.smoothed is None else _trajectory(self.smoothed)
+
+    @property
+    def stretches(self) -> list[Stretch]:
+        """Successive smoothed poses of one kind, in order."""
+        out: list[Stretch] = []
+        for pose in self.smoothed or ():
+            metres = pose.protection.metres
+            if out and out[-1].kind is pose.kind:
+                worst = max(out[-1].protection_m, metres)
+                out[-1] = replace(out[-1], last=pose.stamp, frames=out[-1].frames + 1, protection_m=worst)
+            else:
+                out.append(Stretch(pose.kind, pose.stamp, pose.stamp, 1, metres))
+        return out
 
     @property
     def calibration(self) -> Calibration | None:
@@ -137,6 +198,7 @@ class RunResult:
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
             "frames": self.frames,
             "posed": len(self.posed),
+            "smoothed": None if self.smoothed is None else [stretch.to_json() for stretch in self.stretches],
             "interruptions": [gap.to_json() for gap in self.interruptions],
             "skipped": self.skipped,
             "sources": list(self.sources),
@@ -152,8 +214,9 @@ def locate(
     config: LocalizerConfig | None = None,
     progress: Callable[[int, int, Fix | None], None] | None = None,
     guess: PlaceGuess | None = None,
+    smooth: bool = False,
 ) -> RunResult:
-    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
+    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead; then perhaps smooth it.
 
     A frame that cannot be read is skipped and noted.
 
@@ -163,12 +226,17 @@ def locate(
         config: of the localizer.
         progress: called with the number of finished frames, of all frames, and the newest fix.
         guess: of the place at the first frame; tried, and only its circle is trusted.
+        smooth: add poses by the whole run, also of frames that had none live (``smoothed``).
 
     Raises:
+        DependencyError: gtsam is missing.
         InputError: no frame could be used (the message ends with the first frame's), or the map has no ground at the
             guess.
     """
-    localizer = Localizer(base_map, config)
+    if smooth:
+        require_library("gtsam", "gtsam>=4.3", "smoothing")  # before the run
+    localizer = RecordingLocalizer(base_map, config) if smooth else Localizer(base_map, config)
+    recorded: list[RecordedFrame] = []
     if guess is not None:
         localizer.guess_place(guess)
     localizer.prepare()
@@ -186,6 +254,8 @@ def locate(
                 progress(index + 1, len(run), None)
             continue
         located.seconds.append(time.perf_counter() - begin)
+        if isinstance(localizer, RecordingLocalizer):
+            recorded.append(RecordedFrame(index, frame.T_odom_body, frame.origin, fix, localizer.registered))
         here = frame.T_odom_body[:3, 3]
         driven, before = driven + (0.0 if before is None else float(np.linalg.norm(here - before))), here
         if frame.origin.any() and fix.T_map_body is not None and fix.T_map_odom is not None:
@@ -201,6 +271,8 @@ def locate(
             progress(index + 1, len(run), fix)
     if not located.fixes:
         raise InputError(f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}")
+    if isinstance(localizer, RecordingLocalizer):
+        located.smoothed = smooth_run(localizer, run, recorded)
     return located
 
 
@@ -238,17 +310,19 @@ def from_stream(
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
     """Write ``trajectory.tum`` (posed frames only) and ``result.json`` into ``out``; remove an earlier run's pictures.
 
+    With smoothed poses the trajectory has these, and ``filtered.tum`` the live ones.
+
     Raises:
         InputError: the directory cannot be written.
     """
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG):  # they would contradict the new trajectory
+        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG, FILTERED):  # they would contradict the new trajectory
             (folder / name).unlink(missing_ok=True)
-        posed = located.posed
-        poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
-        write_tum(folder / "trajectory.tum", np.array([fix.stamp for fix in posed]), poses)
+        write_tum(folder / TRAJECTORY, *located.trajectory)
+        if located.smoothed is not None:
+            write_tum(folder / FILTERED, *located.filtered)
         text = json.dumps(located.to_json(base_map), indent=1) + "\n"
         with atomic_file(folder / "result.json") as stream:
             stream.write(text.encode())
@@ -266,16 +340,26 @@ def summary(located: RunResult) -> str:
         where = "" if located.driven is None else f"after {located.driven:.1f} m: "
         lines.append(f"{'found':<18} {where}wrong {one_in(1.0 - posed[0].confidence)}")
         lines.extend(f"{'without a pose':<18} {text}" for text in _interrupted(located))
+        if located.smoothed is not None:
+            counts = Counter(pose.kind for pose in located.smoothed)
+            lines.append(f"{'smoothed':<18} {', '.join(f'{counts[kind]} {_KINDS[kind]}' for kind in PoseKind)}")
         if located.calibration is not None:
             lines.extend(f"{'calibration':<18} {clause}" for clause in located.calibration.describe(located.mount))
     elif located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    if located.smoothed is not None and not posed:
+        lines.append(f"{'smoothed':<18} nothing: there was no fix to smooth from")
     if located.skipped:
         lines.append(f"{'skipped':<18} {len(located.skipped)} frames; first: {located.skipped[0]}")
     if located.seconds:
         p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
         lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
     return "\n".join(lines)
+
+
+def _trajectory(posed: Sequence[Fix] | Sequence[SmoothedPose]) -> tuple[Floats, Poses]:
+    poses = np.array([pose.T_map_body for pose in posed], dtype=np.float64).reshape(-1, 4, 4)
+    return np.array([pose.stamp for pose in posed], dtype=np.float64), poses
 
 
 def _interrupted(located: RunResult) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.reference_system import GeoReference
@@ -32,11 +33,14 @@ class Trajectory:
     """(N, 4, 4) map <- body, metres."""
     geodetic: Floats | None = None
     """(N, 3) latitude, longitude and height; None where the map has no reference system."""
+    kinds: Sequence[str] | None = None
+    """(N,) kinds of the poses; None unless they are smoothed."""
 
 
 def csv(trajectory: Trajectory) -> str:
-    """Return one line a pose: stamp, position, quaternion and, if known, latitude, longitude and height."""
+    """Return one line a pose: stamp, position, quaternion; latitude, longitude, height and kind where known."""
     titles = "stamp,x,y,z,qx,qy,qz,qw" + ("" if trajectory.geodetic is None else ",latitude,longitude,height")
+    titles += "" if trajectory.kinds is None else ",kind"
     lines = [titles]
     for k, (stamp, T) in enumerate(zip(trajectory.stamps, trajectory.poses, strict=True)):
         row = pose_to_tum(T)
@@ -44,6 +48,7 @@ def csv(trajectory: Trajectory) -> str:
         if trajectory.geodetic is not None:
             latitude, longitude, height = trajectory.geodetic[k]
             text += f",{latitude:.9f},{longitude:.9f},{height:.3f}"
+        text += "" if trajectory.kinds is None else f",{trajectory.kinds[k]}"
         lines.append(text)
     return "\n".join(lines) + "\n"
 
@@ -57,13 +62,14 @@ def geojson(trajectory: Trajectory) -> str:
     """Return a line and a point a pose, longitude first (RFC 7946)."""
     places = _geodetic(trajectory)
     coordinates = [[round(lon, 9), round(lat, 9), round(height, 3)] for lat, lon, height in places.tolist()]
+    kinds = [{} for _ in coordinates] if trajectory.kinds is None else [{"kind": kind} for kind in trajectory.kinds]
     features = [
         {
             "type": "Feature",
             "geometry": {"type": "Point", "coordinates": place},
-            "properties": {"stamp": round(float(stamp), 6)} | _time(float(stamp)),
+            "properties": {"stamp": round(float(stamp), 6)} | _time(float(stamp)) | kind,
         }
-        for stamp, place in zip(trajectory.stamps, coordinates, strict=True)
+        for stamp, place, kind in zip(trajectory.stamps, coordinates, kinds, strict=True)
     ]
     if len(coordinates) > 1:
         line = {"type": "LineString", "coordinates": coordinates}
@@ -129,11 +135,13 @@ def export(trajectory: Trajectory, folder: Path, names: Sequence[str]) -> list[P
     return written
 
 
-def trajectory_of(name: str, stamps: Sequence[float], poses: Sequence[Floats], geo: GeoReference | None) -> Trajectory:
-    """Return the trajectory of poses (4, 4), with their places on Earth if there is a reference."""
-    stack = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+def trajectory_of(
+    name: str, stamps: npt.ArrayLike, poses: npt.ArrayLike, geo: GeoReference | None, kinds: Sequence[str] | None = None
+) -> Trajectory:
+    """Return the trajectory of poses (N, 4, 4), with their places on Earth if there is a reference."""
+    stack = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     places = None if geo is None else geo.geodetic(stack[:, :3, 3])
-    return Trajectory(name, np.array(stamps, dtype=np.float64), stack, places)
+    return Trajectory(name, np.asarray(stamps, dtype=np.float64), stack, places, kinds)
 
 
 def _geodetic(trajectory: Trajectory) -> Floats:

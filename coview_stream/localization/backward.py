@@ -1,0 +1,151 @@
+"""Tracking backwards: from a fix to the frames before it, once a run is recorded.
+
+Frames before the first fix and within interruptions have no live pose. Once a later fix is known they are tracked in
+reverse: the same registration, verification and loss monitor, with the clock running backwards. So a slip, a robot
+that was carried or odometry that began anew ends it just as it ends live tracking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_kernels import Registration
+from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Points, Pose, inverse
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration.register import swap_rotation_translation
+from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.state import State
+from coview_stream.localization.tracking.map_matching import MapMatch
+from coview_stream.localization.tracking.monitor import Ruling
+from coview_stream.recordings.run import Run
+
+
+@dataclass(frozen=True, eq=False)
+class BelievedRegistration:
+    """A verified registration of one frame.
+
+    Attributes:
+        T_map_cloud: (4, 4) of the cloud in the sensor's axes, about the map's origin, the prior removed.
+        covariance: (6, 6) over (rx, ry, rz, x, y, z), map axes, of this registration alone.
+        shared: (6, 6) likewise, of the error that neighbouring registrations share.
+        doubt: times as wide as usual its protection level is.
+        slipped: odometry has slipped since the registration before it, in the order of tracking.
+        backward: tracked backwards.
+    """
+
+    T_map_cloud: Pose
+    covariance: Floats
+    shared: Floats
+    doubt: float
+    slipped: bool
+    backward: bool
+
+
+@dataclass(eq=False)
+class RecordedFrame:
+    """One usable frame of a run, with the results of tracking.
+
+    Attributes:
+        index: in the run.
+        T_odom_body: (4, 4) odometry as it came.
+        origin: (3,) of its cloud, zero unless a single scan is stored far from its zero.
+        fix: live.
+        registered: the frame's registration, live or backwards; None without one.
+        backward: the fix of the backward pass; None if it had no pose, or there was none.
+    """
+
+    index: int
+    T_odom_body: Pose
+    origin: Floats
+    fix: Fix
+    registered: BelievedRegistration | None
+    backward: Fix | None = None
+
+
+class RecordingLocalizer(Localizer):
+    """Localizer that keeps the newest frame's registration, and can begin at a known place.
+
+    Attributes:
+        registered: believed registration of the newest frame; None without one.
+    """
+
+    registered: BelievedRegistration | None = None
+    _slipped = _backward = False
+
+    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
+        """See :meth:`Localizer.step`."""
+        self.registered = None
+        return super().step(cloud, T_odom_body, stamp)
+
+    def begin_at(
+        self, T_map_cloud: Pose, confidence: float, calibration: Calibration, cloud: Points, T_odom_body: Pose,
+        stamp: float,
+    ) -> None:  # fmt: skip
+        """Forget everything and track from the registered pose of a frame; its arguments as of :meth:`step`."""
+        self.reset()
+        self._slipped, self._backward = False, True
+        self.hint_calibration(calibration)
+        frame, _ = self._predict(cloud, T_odom_body, stamp)
+        level = self._frames.calibration
+        leader = T_map_cloud @ inverse(frame.T_odom_body @ level.T_body_cloud)
+        place = Hypothesis(leader, registration=Registration(leader, 1e4 * np.eye(6), 0.0, 0, 0, True))
+        evidence = KeyframeEvidence(stamp, State.TRACKING, "a later fix", confidence=confidence)
+        self.apply_search_result(
+            SearchResult(
+                place, evidence, self._tracker.odometry.travelled, self._requests.epoch, leader=leader,
+                T_odom_body=frame.T_odom_body, calibration=level,
+            )
+        )  # fmt: skip
+
+    def _update(self, match: MapMatch, ruling: Ruling) -> None:
+        T_map_cloud = match.T_map_body @ self._frames.calibration.T_body_cloud  # before the calibration learns
+        super()._update(match, ruling)
+        self._slipped |= match.moves_place
+        if ruling.believed and not match.moves_place:
+            level = self._tracker.protection_level()
+            shared = swap_rotation_translation(self._tracker.reported_covariance())
+            shared -= self._tracker.predicted_covariance()
+            self.registered = BelievedRegistration(
+                T_map_cloud, match.covariance, shared, level.doubt, self._slipped, self._backward
+            )
+            self._slipped = False
+
+
+def track_backward(
+    localizer: RecordingLocalizer, run: Run, frames: Sequence[RecordedFrame], begin: int, stop: int,
+    calibration: Calibration,
+) -> None:  # fmt: skip
+    """Track from the registered frame ``begin`` back to the one after ``stop``; note poses and registrations.
+
+    Poses before the earliest registration are kept only at the run's beginning (``stop`` is -1): elsewhere tracking
+    ended in doubt, or meets live tracking there.
+    """
+    start = frames[begin]
+    assert start.registered is not None
+    cloud = run.read(start.index, calibration.sweep).points
+    confidence, stamp = start.fix.confidence, start.fix.stamp
+    localizer.begin_at(start.registered.T_map_cloud, confidence, calibration, cloud, start.T_odom_body, stamp)
+    earliest, fix = begin, None
+    for k in range(begin - 1, stop, -1):
+        frame = frames[k]
+        try:
+            cloud = run.read(frame.index, localizer.calibration.sweep).points
+            fix = localizer.step(cloud, frame.T_odom_body, 2.0 * stamp - frame.fix.stamp)
+        except (CloudError, RunError):
+            continue
+        if not fix.state.has_place:
+            break
+        frame.backward = fix if fix.T_map_body is not None else None
+        if localizer.registered is not None:
+            frame.registered, earliest = localizer.registered, k
+    arrived = stop < 0 and fix is not None and fix.state is State.TRACKING
+    for k in range(stop + 1, 0 if arrived else earliest):
+        frames[k].backward = None

@@ -1,0 +1,236 @@
+"""Smoothing, offline: the poses of a whole run at once, from the registrations before and after each frame.
+
+The graph has a node per usable frame: the pose X_k of the body. With e(A, B) = log(A^-1 B) the poses are the most
+probable ones given
+
+* odometry:       e(Z_k, X_(k-1)^-1 X_k) ~ N(0, Q_k), corrected by the calibration at the end of the run
+* registrations:  e(Y_k, X_k) ~ N(0, R_k), live ones and those of tracking backwards, under Huber's kernel
+
+Where odometry is broken there is no factor, and nothing is smoothed across: tracking noticed a slip, or the
+registrations on both sides contradict odometry (a robot that was carried, odometry that jumped or began anew). Q has
+the drift that tracking measured, and the uncertainty of scale and heading rate over the way between two registrations.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, ProtectionLevel, protection_level
+from coview_stream.geometry.transforms import (
+    Pose,
+    Poses,
+    along_body,
+    along_map,
+    boxminus,
+    inverse,
+    pose_from,
+    skew,
+    yaw_of,
+)
+from coview_stream.localization.backward import BelievedRegistration, RecordedFrame, RecordingLocalizer, track_backward
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.frame import OdometryCorrection
+from coview_stream.localization.registration.register import swap_rotation_translation
+from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.tracking.pose_graph import BatchGraph, Constraint
+from coview_stream.recordings.run import Run
+
+
+class PoseKind(StrEnum):
+    """Kind of a smoothed pose; frames of the first kind alone had a pose live."""
+
+    SMOOTHED = "smoothed"
+    """The frame had a live pose, and later registrations have corrected it."""
+    BACKWARD = "backward"
+    """Tracked backwards from a later fix: registered to the map and verified as live poses are."""
+    BRIDGED = "bridged"
+    """By odometry alone, between registrations on both sides that agree with it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedPose:
+    """Pose of one frame by the whole run; offline only, so it is no :class:`coview_stream.Fix`.
+
+    Attributes:
+        stamp: of the frame, seconds.
+        kind: how the pose came about.
+        T_map_body: (4, 4) float64 in the frame of the map's sources.
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2, as of a Fix.
+        protection: metres and degrees that the error exceeds at most once in a thousand.
+        confidence: probability that the robot is at this place, by the fix that the pose goes back to.
+    """
+
+    stamp: float
+    kind: PoseKind
+    T_map_body: Pose
+    covariance: Floats
+    protection: ProtectionLevel
+    confidence: float
+
+
+def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[RecordedFrame]) -> list[SmoothedPose]:
+    """Return the smoothed poses of a recorded run, in order; none without a fix.
+
+    Args:
+        localizer: that has localized the run; it is used again to track backwards.
+        run: to read the frames without a live pose again.
+        frames: all usable ones; registrations of the backward pass are added.
+    """
+    live = [k for k, frame in enumerate(frames) if frame.registered is not None]
+    if not live:
+        return []
+    calibration = frames[-1].fix.calibration or Calibration()
+    for before, after in pairwise([-1, *live]):
+        registered, between = frames[after].registered, frames[before + 1 : after]
+        assert registered is not None
+        if registered.slipped or any(frame.fix.T_map_body is None for frame in between):
+            track_backward(localizer, run, frames, after, before, calibration)
+    drift = next((f.fix.drift for f in reversed(frames) if f.fix.drift), Drift.of(localizer.config.tracking))
+    chain = _Chain.of(frames, calibration, drift, localizer.config.acceptance.max_innovation)
+    return chain.solved(localizer.config.graph.huber, localizer.base_map.origin)
+
+
+@dataclass(eq=False)
+class _Chain:
+    """All frames of a run, in order (N), with the odometry between them and their registrations."""
+
+    frames: Sequence[RecordedFrame]
+    odometry: Poses  # (N, 4, 4) corrected
+    registered: dict[int, BelievedRegistration]  # by frame, in order
+    measured: dict[int, Pose]  # (4, 4) of their bodies
+    driven: Floats  # (N,) metres up to each frame
+    spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
+    broken: set[int]  # frames whose motion from the frame before is unknown
+    unknown: set[int]  # frames at a break that may lie on either side of it
+
+    @classmethod
+    def of(
+        cls, frames: Sequence[RecordedFrame], calibration: Calibration, drift: Drift, max_innovation: float
+    ) -> _Chain:
+        """Correct the odometry, and find where it is broken."""
+        correction, level = OdometryCorrection(), inverse(calibration.T_body_cloud)
+        odometry = np.array([correction.correct(frame.T_odom_body, calibration) for frame in frames])
+        registered = {k: frame.registered for k, frame in enumerate(frames) if frame.registered is not None}
+        measured = {k: kept.T_map_cloud @ level for k, kept in registered.items()}
+        steps = np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1)
+        driven, spread = np.append(0.0, np.cumsum(steps)), np.zeros((len(frames), 6, 6))
+        for k, (a, b) in enumerate(pairwise(odometry), start=1):
+            spread[k] = drift.covariance(float(steps[k - 1]), abs(yaw_of(inverse(a) @ b)))
+        chain = cls(frames, odometry, registered, measured, driven, spread, set(), set())
+        chain._spread_calibration(calibration)
+        live = [k for k, kept in registered.items() if not kept.backward]
+        for before, after in pairwise(live):
+            chain._break([k for k in registered if before <= k <= after], max_innovation)
+        chain._break([k for k in registered if k <= live[0]], max_innovation)
+        return chain
+
+    def _predicted(self, known: int, k: int) -> Pose:
+        """Return the pose (4, 4) of frame ``k`` by odometry from a registered one."""
+        return np.asarray(self.measured[known] @ inverse(self.odometry[known]) @ self.odometry[k])
+
+    def _spread_calibration(self, calibration: Calibration) -> None:
+        """Add the calibration's error over the way between two registrations, in shares of the metres."""
+        ends = sorted({0, *self.registered, len(self.frames) - 1})
+        for before, after in pairwise(ends):
+            metres = self.driven[after] - self.driven[before]
+            if metres > 0.0:
+                known = before if before in self.measured else next(iter(self.measured))
+                way = self._predicted(known, after)[:3, 3] - self._predicted(known, before)[:3, 3]
+                shares = np.diff(self.driven[before : after + 1]) / metres
+                self.spread[before + 1 : after + 1] += shares[:, None, None] * calibration.motion_covariance(way)
+
+    def _break(self, registered: Sequence[int], max_innovation: float) -> None:
+        """Find the breaks up to a live registration, the last of ``registered``; those before it are backward ones.
+
+        The first one is the live registration before, if there is one.
+        """
+        slipped_back = [self.registered[k].backward and self.registered[k].slipped for k in registered]
+        slipped = self.registered[registered[-1]].slipped and not any(slipped_back)
+        for number, (before, after) in enumerate(pairwise(registered)):
+            if (number == 0 and slipped) or slipped_back[number] or self._innovation(before, after) > max_innovation:
+                at = after
+                while at - 1 > before and self.frames[at - 1].backward is not None:
+                    at -= 1
+                self.broken.add(at)
+                self.unknown.update(range(before + 1, after if slipped_back[number] else at))
+
+    def _innovation(self, before: int, after: int) -> float:
+        """Squared Mahalanobis distance of a registration from odometry since an earlier one, 6 degrees of freedom."""
+        first, second = self.registered[before], self.registered[after]
+        R_map_odom = self.measured[before][:3, :3] @ self.odometry[before, :3, :3].T
+        left = (self.odometry[after, :3, 3] - self.odometry[before : after + 1, :3, 3]) @ R_map_odom.T
+        J = np.tile(np.eye(6), (len(left), 1, 1))
+        J[:, 3:, :3] = -skew(left)
+        parts = np.concatenate([(first.covariance + first.shared)[None], self.spread[before + 1 : after + 1]])
+        spread = np.einsum("kij,kjl,kml->im", J, parts, J) + second.covariance + second.shared
+        gap = boxminus(self.measured[after], self._predicted(before, after))
+        return float(gap @ np.linalg.solve(spread, gap))
+
+    def _initial(self) -> Poses:
+        """Return poses (N, 4, 4) by odometry from the registration before each frame, or the next within its part."""
+        keys = list(self.registered)
+        out = np.empty_like(self.odometry)
+        for first, end in pairwise(sorted({0, *self.broken, len(self.frames)})):
+            known = keys[bisect_left(keys, first)]
+            for k in range(first, end):
+                known = k if k in self.registered else known
+                out[k] = self._predicted(known, k)
+        return out
+
+    def solved(self, huber: float, origin: Floats) -> list[SmoothedPose]:
+        """Solve the graph; return the poses in the frame of the map's sources, whose origin is ``origin`` (3,)."""
+        start = self._initial()
+        graph = BatchGraph(start, "locate --smooth")
+        steps = enumerate(pairwise(self.odometry), start=1)
+        graph.add([
+            Constraint(k, k - 1, inverse(a) @ b, along_body(self.spread[k], start[k]))
+            for k, (a, b) in steps if k not in self.broken
+        ])  # fmt: skip
+        registrations = [
+            Constraint(k, -1, self.measured[k], along_body(kept.covariance, self.measured[k]))
+            for k, kept in self.registered.items()
+        ]
+        graph.add(registrations, ("Huber", huber))
+        poses = graph.solve()
+        covariances = graph.covariances()
+        kinds = [self._kind(k) for k in range(len(poses))]
+        found = [
+            self._pose(k, kind, T, along_map(covariance, T), origin)
+            for k, (kind, T, covariance) in enumerate(zip(kinds, poses, covariances, strict=True))
+            if kind is not None
+        ]
+        return [pose for pose in found if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
+
+    def _kind(self, k: int) -> PoseKind | None:
+        """Return the kind of a frame's pose; None if it has none."""
+        if self.frames[k].fix.T_map_body is not None:
+            return PoseKind.SMOOTHED
+        if k in self.unknown:
+            return None
+        if self.frames[k].backward is not None:
+            return PoseKind.BACKWARD
+        keys = list(self.registered)
+        return PoseKind.BRIDGED if keys[0] < k < keys[-1] else None
+
+    def _pose(self, k: int, kind: PoseKind, T: Pose, covariance: Floats, origin: Floats) -> SmoothedPose:
+        """Return a pose with the error that registrations share, as that of the nearest one."""
+        frame, keys = self.frames[k], list(self.registered)
+        nearest = keys[int(np.abs(self.driven[keys] - self.driven[k]).argmin())]
+        kept = self.registered[nearest]
+        fix = frame.backward if frame.fix.T_map_body is None else frame.fix
+        fix = fix or self.frames[nearest].backward or self.frames[nearest].fix
+        reported = swap_rotation_translation(covariance + kept.shared)
+        T_map_body = pose_from(T[:3, :3], T[:3, 3] + origin) @ pose_from(np.eye(3), -frame.origin)
+        level = protection_level(reported, kept.doubt)
+        return SmoothedPose(frame.fix.stamp, kind, T_map_body, reported, level, fix.confidence)
+
+
+def _within_alert_limit(level: ProtectionLevel) -> bool:
+    return level.metres <= ALERT_METRES and level.degrees <= ALERT_DEGREES
