@@ -59,6 +59,7 @@ BENCHMARKS = {
     "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
     "ablation": Benchmark("accuracy.ablation", "effect of each choice of the method"),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
+    "smooth": Benchmark("tracking.smoothing", "locate --smooth against live poses and the truth"),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors"),

@@ -17,19 +17,23 @@ import numpy as np
 from bench.accuracy.scores import Track
 from bench.tracking.worlds import Recorded, World, in_gap
 from coview_stream import BaseMap, Localizer
+from coview_stream.clouds.cloud import Cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.localization.result import Fix
+from coview_stream.odometry.deskew import SweepCorrection
+from coview_stream.recordings.run import Run
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.sensors import FRAME_PERIOD
 
 SEGMENT = 100.0  # metres over which drift is measured
 EVENT_AT = 90.0  # metres
-CLEAR, CLOTH, DUST = 0, 1, 2  # cover of the sensor: nothing; a cloth at 0.5 to 0.9 m; only 20 returns are left
+CLEAR, CLOTH, DUST, FOG = range(4)  # cover: nothing; a cloth at 0.5 to 0.9 m; 20 returns are left; nothing beyond 12 m
 _DUST_POINTS = 20
+_SIGHT = 12.0  # metres, in fog
 _MIN_GAP = 20.0  # metres in the gap that count as an event
 _COVERED_S = 30.0
 _FIRST_STAMP = 1000.0
@@ -253,18 +257,39 @@ def scenarios(seeds: int = SEEDS, quick: bool = False) -> tuple[Scenario, ...]:
     )
 
 
-def follow(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig | None = None) -> Track:
-    """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
-    localizer, fixes = Localizer(BaseMap.load(site), config), list[Fix | None]()
-    for frame, cover, odometry, stamp in zip(drive.frames, drive.cover, drive.odometry, drive.stamps, strict=True):
-        cloud, rng = recorded.read(int(frame)), np.random.default_rng([frame, 51])
+@dataclass(frozen=True)
+class DriveClouds:
+    """Clouds of a drive, as the source of a run."""
+
+    recorded: Recorded
+    drive: Drive
+
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
+        """Frame as the robot gets it: under a cover, perhaps."""
+        frame, cover = int(self.drive.frames[index]), self.drive.cover[index]
+        cloud, rng = self.recorded.read(frame), np.random.default_rng([frame, 51])
         if cover == DUST:
             cloud = cloud[np.sort(rng.choice(len(cloud), min(_DUST_POINTS, len(cloud)), replace=False))]
         if cover == CLOTH:
             near = rng.uniform(0.5, 0.9, len(cloud)) / np.linalg.norm(cloud, axis=1)
             cloud = (cloud * near[:, None]).astype(np.float32)
+        if cover == FOG:
+            cloud = cloud[np.linalg.norm(cloud, axis=1) < _SIGHT]
+        return Cloud(cloud, np.zeros(3))
+
+
+def run_of(recorded: Recorded, drive: Drive) -> Run:
+    """Return a drive as a run."""
+    clouds = DriveClouds(recorded, drive)
+    return Run(Path("drive"), (Path("drive"),) * len(drive), drive.stamps, drive.odometry, clouds)
+
+
+def follow(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig | None = None) -> Track:
+    """Feed frames and odometry of a drive to a new localizer, and nothing else; collect its answers."""
+    localizer, fixes = Localizer(BaseMap.load(site), config), list[Fix | None]()
+    for frame in run_of(recorded, drive):
         try:
-            fixes.append(localizer.step(cloud, odometry, float(stamp)))
+            fixes.append(localizer.step(frame.points, frame.T_odom_body, frame.stamp))
         except (CloudError, RunError):
             fixes.append(None)
     return Track.of(fixes, drive.stamps)
