@@ -15,7 +15,7 @@ import numpy as np
 from coview_kernels import Registration
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, transform
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.register import swap_rotation_translation
@@ -25,6 +25,7 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import Ruling
+from coview_stream.localization.tracking.slip import share_on_map
 from coview_stream.recordings.run import Run
 
 
@@ -104,6 +105,13 @@ class RecordingLocalizer(Localizer):
                 T_odom_body=frame.T_odom_body, calibration=level,
             )
         )  # fmt: skip
+
+    def fit(self, cloud: Points, T_map_body: Pose) -> float:
+        """Share of a frame's structure (N, 3), body frame, that is on the map at a pose (4, 4); 0 for too little."""
+        target = self._local_maps.around(T_map_body[:3, 3])
+        points = transform(pose_from(T_map_body[:3, :3], np.zeros(3)), self._frames.calibration.level(cloud))
+        shift = pose_from(np.eye(3), T_map_body[:3, 3])
+        return 0.0 if target is None else share_on_map(points, np.zeros(3), shift, target) or 0.0
 
     def _update(self, match: MapMatch, ruling: Ruling) -> None:
         T_map_cloud = match.T_map_body @ self._frames.calibration.T_body_cloud  # before the calibration learns

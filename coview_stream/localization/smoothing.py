@@ -13,15 +13,14 @@ the drift that tracking measured, and the uncertainty of scale and heading rate 
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
 
 import numpy as np
 
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import (
     Pose,
@@ -94,6 +93,11 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
             track_backward(localizer, run, frames, after, before, calibration)
     drift = next((f.fix.drift for f in reversed(frames) if f.fix.drift), Drift.of(localizer.config.tracking))
     chain = _Chain.of(frames, calibration, drift, localizer.config.acceptance.max_innovation)
+
+    def fit(k: int, T_map_body: Pose) -> float:
+        return localizer.fit(run.read(frames[k].index, calibration.sweep).points, T_map_body)
+
+    chain.settle_breaks(fit)
     return chain.solved(localizer.config.graph.huber, localizer.base_map.origin)
 
 
@@ -104,10 +108,11 @@ class _Chain:
     frames: Sequence[RecordedFrame]
     odometry: Poses  # (N, 4, 4) corrected
     registered: dict[int, BelievedRegistration]  # by frame, in order
+    keys: Ints  # (M,) frames of these
     measured: dict[int, Pose]  # (4, 4) of their bodies
     driven: Floats  # (N,) metres up to each frame
     spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
-    broken: set[int]  # frames whose motion from the frame before is unknown
+    broken: dict[int, tuple[int, int]]  # frames whose motion from the one before is unknown; registrations around
     unknown: set[int]  # frames at a break that may lie on either side of it
 
     @classmethod
@@ -123,12 +128,12 @@ class _Chain:
         driven, spread = np.append(0.0, np.cumsum(steps)), np.zeros((len(frames), 6, 6))
         for k, (a, b) in enumerate(pairwise(odometry), start=1):
             spread[k] = drift.covariance(float(steps[k - 1]), abs(yaw_of(inverse(a) @ b)))
-        chain = cls(frames, odometry, registered, measured, driven, spread, set(), set())
+        keys = np.array(list(registered))
+        chain = cls(frames, odometry, registered, keys, measured, driven, spread, {}, set())
         chain._spread_calibration(calibration)
-        live = [k for k, kept in registered.items() if not kept.backward]
-        for before, after in pairwise(live):
-            chain._break([k for k in registered if before <= k <= after], max_innovation)
-        chain._break([k for k in registered if k <= live[0]], max_innovation)
+        live = [at for at, kept in enumerate(registered.values()) if not kept.backward]
+        for before, after in pairwise([0, *live]):
+            chain._break(keys[before : after + 1].tolist(), max_innovation)
         return chain
 
     def _predicted(self, known: int, k: int) -> Pose:
@@ -141,7 +146,7 @@ class _Chain:
         for before, after in pairwise(ends):
             metres = self.driven[after] - self.driven[before]
             if metres > 0.0:
-                known = before if before in self.measured else next(iter(self.measured))
+                known = before if before in self.measured else int(self.keys[0])
                 way = self._predicted(known, after)[:3, 3] - self._predicted(known, before)[:3, 3]
                 shares = np.diff(self.driven[before : after + 1]) / metres
                 self.spread[before + 1 : after + 1] += shares[:, None, None] * calibration.motion_covariance(way)
@@ -158,7 +163,7 @@ class _Chain:
                 at = after
                 while at - 1 > before and self.frames[at - 1].backward is not None:
                     at -= 1
-                self.broken.add(at)
+                self.broken[at] = before, after
                 self.unknown.update(range(before + 1, after if slipped_back[number] else at))
 
     def _innovation(self, before: int, after: int) -> float:
@@ -173,40 +178,57 @@ class _Chain:
         gap = boxminus(self.measured[after], self._predicted(before, after))
         return float(gap @ np.linalg.solve(spread, gap))
 
-    def _initial(self) -> Poses:
-        """Return poses (N, 4, 4) by odometry from the registration before each frame, or the next within its part."""
-        keys = list(self.registered)
-        out = np.empty_like(self.odometry)
-        for first, end in pairwise(sorted({0, *self.broken, len(self.frames)})):
-            known = keys[bisect_left(keys, first)]
-            for k in range(first, end):
-                known = k if k in self.registered else known
-                out[k] = self._predicted(known, k)
-        return out
+    def settle_breaks(self, fit: Callable[[int, Pose], float]) -> None:
+        """Move breaks before the frames with a live pose that fit the map better from the registration after them.
+
+        ``fit`` returns how well a frame fits at a pose (4, 4).
+        """
+        for at, (before, after) in list(self.broken.items()):
+            first = at
+            while first - 1 > before and self.frames[first - 1].fix.T_map_body is not None:
+                k = first - 1
+                if fit(k, self._predicted(after, k)) <= fit(k, self._predicted(before, k)):
+                    break
+                first = k
+            self.broken[first] = self.broken.pop(at)
+            self.unknown.difference_update(range(first, at))
 
     def solved(self, huber: float, origin: Floats) -> list[SmoothedPose]:
         """Solve the graph; return the poses in the frame of the map's sources, whose origin is ``origin`` (3,)."""
-        start = self._initial()
+        nodes, start = self._nodes()
+        number = {k: at for at, k in enumerate(nodes)}
         graph = BatchGraph(start, "locate --smooth")
-        steps = enumerate(pairwise(self.odometry), start=1)
         graph.add([
-            Constraint(k, k - 1, inverse(a) @ b, along_body(self.spread[k], start[k]))
-            for k, (a, b) in steps if k not in self.broken
+            Constraint(at, at - 1, inverse(self.odometry[k - 1]) @ self.odometry[k], along_body(self.spread[k], T))
+            for at, (k, T) in enumerate(zip(nodes, start, strict=True))
+            if k - 1 in number and k not in self.broken
         ])  # fmt: skip
         registrations = [
-            Constraint(k, -1, self.measured[k], along_body(kept.covariance, self.measured[k]))
+            Constraint(number[k], -1, self.measured[k], along_body(kept.covariance, self.measured[k]))
             for k, kept in self.registered.items()
         ]
         graph.add(registrations, ("Huber", huber))
-        poses = graph.solve()
-        covariances = graph.covariances()
-        kinds = [self._kind(k) for k in range(len(poses))]
-        found = [
-            self._pose(k, kind, T, along_map(covariance, T), origin)
-            for k, (kind, T, covariance) in enumerate(zip(kinds, poses, covariances, strict=True))
-            if kind is not None
-        ]
+        solved = zip(nodes, graph.solve(), graph.covariances(), strict=True)
+        found = [self._pose(k, T, along_map(covariance, T), origin) for k, T, covariance in solved]
         return [pose for pose in found if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
+
+    def _nodes(self) -> tuple[list[int], Poses]:
+        """Return the frames (M) that get a pose, and poses (M, 4, 4) by odometry from a registration before or after."""
+        parts: list[list[int]] = []
+        for k in range(len(self.frames)):
+            if self._kind(k) is not None:
+                if not parts or parts[-1][-1] != k - 1 or k in self.broken:
+                    parts.append([])
+                parts[-1].append(k)
+        nodes, poses = [], []
+        for part in parts:
+            keys = [k for k in part if k in self.registered]
+            # a single registration without a live pose that contradicts odometry on both sides is no evidence
+            if len(keys) > 1 or any(self._kind(k) is PoseKind.SMOOTHED for k in part):
+                nodes += part
+                near = np.clip(np.searchsorted(keys, part, "right") - 1, 0, None)
+                poses += [self._predicted(keys[at], k) for at, k in zip(near.tolist(), part, strict=True)]
+        return nodes, np.array(poses)
 
     def _kind(self, k: int) -> PoseKind | None:
         """Return the kind of a frame's pose; None if it has none."""
@@ -216,13 +238,15 @@ class _Chain:
             return None
         if self.frames[k].backward is not None:
             return PoseKind.BACKWARD
-        keys = list(self.registered)
-        return PoseKind.BRIDGED if keys[0] < k < keys[-1] else None
+        return PoseKind.BRIDGED if self.keys[0] < k < self.keys[-1] else None
 
-    def _pose(self, k: int, kind: PoseKind, T: Pose, covariance: Floats, origin: Floats) -> SmoothedPose:
-        """Return a pose with the error that registrations share, as that of the nearest one."""
-        frame, keys = self.frames[k], list(self.registered)
-        nearest = keys[int(np.abs(self.driven[keys] - self.driven[k]).argmin())]
+    def _pose(self, k: int, T: Pose, covariance: Floats, origin: Floats) -> SmoothedPose:
+        """Return the pose of a frame that has one; the error that registrations share is that of the nearest one."""
+        frame, kind = self.frames[k], self._kind(k)
+        assert kind is not None
+        at = int(np.searchsorted(self.keys, k))
+        around = self.keys[max(at - 1, 0) : at + 1].tolist()
+        nearest = min(around, key=lambda key: abs(self.driven[key] - self.driven[k]))
         kept = self.registered[nearest]
         fix = frame.backward if frame.fix.T_map_body is None else frame.fix
         fix = fix or self.frames[nearest].backward or self.frames[nearest].fix

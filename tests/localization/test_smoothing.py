@@ -1,0 +1,191 @@
+"""Smoothing a recorded run: poses of frames that had none live, and none that the run does not speak for."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+from trackers import garbage
+
+from coview_stream.cli import build_parser
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.trajectory import read_tum
+from coview_stream.errors import ConfigError
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.backward import RecordedFrame, RecordingLocalizer
+from coview_stream.localization.offline import RunResult, locate, summary, write
+from coview_stream.localization.result import Fix
+from coview_stream.localization.smoothing import PoseKind, smooth_run
+from coview_stream.localization.state import State
+from coview_stream.recordings.run import Run
+from coview_stream.report.export import csv, trajectory_of
+
+pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")
+BLIND = np.tile(np.float32([0.6, 0.0, 0.0]), (15, 1))
+
+
+@dataclass
+class Clouds:
+    """Clouds in memory, as the source of a run."""
+
+    clouds: list[np.ndarray]
+
+    def read(self, index, correction=None):
+        return Cloud(self.clouds[index], np.zeros(3))
+
+
+def run_of(clouds, odometry):
+    count = len(clouds)
+    stamps = 100.0 + 0.5 * np.arange(count)
+    return Run(Path("run"), (Path("run"),) * count, stamps, np.array(odometry), Clouds(list(clouds)))
+
+
+def searched_from(world_map, run, first):
+    """Localize a run whose search answers from frame ``first`` on; smooth it."""
+    localizer, frames = RecordingLocalizer(world_map), []
+    localizer.prepare()
+    for k, frame in enumerate(run):
+        if k < first:
+            localizer.add_frame(frame.points, frame.T_odom_body, frame.stamp)
+            fix = localizer.fix()
+        else:
+            fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
+        frames.append(RecordedFrame(k, frame.T_odom_body, frame.origin, fix, localizer.registered))
+    return frames, smooth_run(localizer, run, frames)
+
+
+def by_frame(poses):
+    return {round((pose.stamp - 100.0) / 0.5): pose for pose in poses}
+
+
+def assert_right(poses, truth, metres=0.1):
+    for k, pose in by_frame(poses).items():
+        assert pose_error(pose.T_map_body, truth[k])[0] < metres, (k, pose.kind)
+
+
+@pytest.fixture(scope="module")
+def way(scene):
+    """A drive of 19 metres, a frame every 0.4 m."""
+    return small_world.record_along(scene, small_world.drive(10), 0.4)
+
+
+def jumped(odometry, at, metres=4.0):
+    """Odometry that begins anew at a frame, elsewhere and turned."""
+    return [T if k < at else pose_from(rot_z(0.9), [metres, 9.0, 0.0]) @ T for k, T in enumerate(odometry)]
+
+
+@pytest.mark.slow
+def test_frames_before_a_late_fix_are_tracked_backwards(world_map, way):
+    frames, poses = searched_from(world_map, run_of(way.clouds, way.T_odom_body), 25)
+    first = next(k for k, frame in enumerate(frames) if frame.fix.T_map_body is not None)
+    assert first >= 25
+    found = by_frame(poses)
+    assert sorted(found) == list(range(len(way.clouds)))
+    assert {found[k].kind for k in range(first)} == {PoseKind.BACKWARD}
+    assert {found[k].kind for k in range(first, len(frames))} == {PoseKind.SMOOTHED}
+    assert_right(poses, way.T_map_body)
+
+
+@pytest.mark.slow
+def test_nothing_is_made_up_before_odometry_began_anew(world_map, way):
+    run = run_of(way.clouds, jumped(way.T_odom_body, 10))
+    _, poses = searched_from(world_map, run, 25)
+    found = by_frame(poses)
+    assert min(found) >= 9
+    assert PoseKind.BACKWARD in {pose.kind for pose in poses}
+    assert_right(poses, way.T_map_body)
+
+
+@pytest.mark.slow
+def test_a_blind_stretch_is_bridged_and_its_protection_level_grows(world_map, way):
+    clouds = [BLIND if 15 <= k < 25 else cloud for k, cloud in enumerate(way.clouds)]
+    located = locate(world_map, run_of(clouds, way.T_odom_body), smooth=True)
+    found = by_frame(located.smoothed)
+    blind = [k for k in range(15, 25) if k in found and found[k].kind is PoseKind.BRIDGED]
+    assert len(blind) >= 8
+    assert not set(blind) & {round((fix.stamp - 100.0) / 0.5) for fix in located.posed}
+    assert found[20].protection.metres > 1.5 * found[30].protection.metres
+    assert_right(located.smoothed, way.T_map_body)
+
+
+@pytest.mark.slow
+def test_a_robot_that_was_carried_is_not_smoothed_across(world_map, way):
+    """It is put down eight metres on; by its odometry it stood still."""
+    rows = [*range(14), *range(34, len(way.clouds))]
+    odometry = [way.T_odom_body[k] for k in rows]
+    back = odometry[13] @ np.linalg.inv(odometry[14])
+    odometry = [T if k < 14 else back @ T for k, T in enumerate(odometry)]
+    located = locate(world_map, run_of([way.clouds[k] for k in rows], odometry), smooth=True)
+    assert len(located.smoothed) >= 14
+    assert PoseKind.BRIDGED not in {pose.kind for pose in located.smoothed}
+    assert_right(located.smoothed, [way.T_map_body[k] for k in rows])
+
+
+@pytest.mark.slow
+def test_smoothed_poses_are_no_worse_with_odometry_that_drifts(world_map, way):
+    rng = np.random.default_rng(2)
+    odometry = [way.T_odom_body[0]]
+    for a, b in zip(way.T_odom_body[:-1], way.T_odom_body[1:], strict=True):
+        step = np.linalg.inv(a) @ b
+        step[:3, 3] *= 1.04
+        odometry.append(odometry[-1] @ step @ pose_from(rot_z(rng.normal(0.0, 0.01)), np.zeros(3)))
+    located = locate(world_map, run_of(way.clouds, odometry), smooth=True)
+    both = {k: pose for k, pose in by_frame(located.smoothed).items() if pose.kind is PoseKind.SMOOTHED}
+    live = by_frame(located.posed)
+    assert sorted(both) == sorted(live)
+    off = [
+        np.sqrt(np.mean([pose_error(pose.T_map_body, way.T_map_body[k])[0] ** 2 for k, pose in poses.items()]))
+        for poses in (both, live)
+    ]
+    assert off[0] <= 1.02 * off[1]
+
+
+def test_a_run_without_a_fix_has_no_smoothed_poses_and_says_so(world_map):
+    clouds = [garbage(seed) for seed in range(3)]
+    located = locate(world_map, run_of(clouds, [pose_from(np.eye(3), [k, 0.0, 0.0]) for k in range(3)]), smooth=True)
+    assert located.smoothed == []
+    assert not len(located.trajectory[0])
+    assert "nothing: there was no fix" in summary(located)
+
+
+def test_a_single_fix_is_enough(world_map, world_drive):
+    located = locate(world_map, run_of(world_drive.clouds[3:4], world_drive.T_odom_body[3:4]), smooth=True)
+    (pose,) = located.smoothed
+    assert pose.kind is PoseKind.SMOOTHED
+    assert pose_error(pose.T_map_body, world_drive.T_map_body[3])[0] < 0.1
+    assert pose.confidence == located.posed[0].confidence
+
+
+@pytest.mark.slow
+def test_files_mark_each_pose_and_keep_the_live_ones(world_map, way, tmp_path):
+    frames, poses = searched_from(world_map, run_of(way.clouds[:30], way.T_odom_body[:30]), 20)
+    located = RunResult(30, [frame.fix for frame in frames], smoothed=poses)
+    write(located, world_map, tmp_path)
+    kinds = Counter(pose.kind.value for pose in poses)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert [part["kind"] for part in result["smoothed"]] == ["backward", "smoothed"]
+    assert {part["kind"]: part["frames"] for part in result["smoothed"]} == kinds
+    assert all(0.0 < part["protection_m"] < 1.0 for part in result["smoothed"])
+    np.testing.assert_allclose(read_tum(tmp_path / "trajectory.tum")[0], [pose.stamp for pose in poses])
+    np.testing.assert_allclose(read_tum(tmp_path / "filtered.tum")[0], [fix.stamp for fix in located.posed])
+    text = csv(trajectory_of("run", *located.trajectory, None, [pose.kind for pose in poses])).splitlines()
+    assert text[0].endswith(",kind")
+    assert [line.rsplit(",", 1)[1] for line in text[1:]] == [pose.kind.value for pose in poses]
+    assert f"{kinds['backward']} tracked backwards" in summary(located)
+    write(RunResult(1, [Fix(0.0, State.SEARCHING)]), world_map, tmp_path)
+    assert not (tmp_path / "filtered.tum").exists()
+    assert json.loads((tmp_path / "result.json").read_text())["smoothed"] is None
+
+
+@pytest.mark.parametrize("words", [("serve", "site.coview"), ("replay", "run", "--robot", "rover")])
+def test_live_commands_have_no_smoothing(words):
+    parser = build_parser()
+    parser.parse_args(words)
+    with pytest.raises(ConfigError, match="--smooth"):
+        parser.parse_args([*words, "--smooth"])
