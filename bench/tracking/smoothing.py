@@ -56,6 +56,9 @@ DRIVES: Mapping[str, tuple[World, Callable[[Drive], Drive]]] = {
 }
 """World, and the change of its drive."""
 
+REAL = tuple(f"{name}, {condition}" for name in SETS for condition in ("base", "drift", "near30", "back"))
+"""Sets under conditions of ``python -m bench conditions``."""
+
 
 def options(parser: ArgumentParser) -> None:
     """Add the runs."""
@@ -66,8 +69,8 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per run, then the targets."""
     found = []
-    for name in (*DRIVES, *SETS):
-        if any(part in name for part in asked.names or ("",)) and not (asked.quick and name in DRIVES):
+    for name in (*DRIVES, *REAL):
+        if any(part in name for part in asked.names or ("",)) and not (asked.quick and not name.endswith(", base")):
             found.append({"name": name, **measure(folder(), name, asked.data)})
             rmse = found[-1]["smoothed_m"]
             yield informs(f"smooth/{name}", np.nan if rmse is None else rmse, "m", found[-1])
@@ -86,10 +89,12 @@ def measure(below: Path, name: str, data: Path) -> dict[str, Any]:
     spec = {"code": fingerprint(), "bench": bench, "run": repr(DRIVES.get(name, name))}
 
     def work() -> dict[str, Any]:
-        if name in SETS:
-            real = RealSet(data / name)
-            site = built(real.survey, below / "conditions" / "maps" / f"{name}.coview")
-            return figures(BaseMap.load(site), open_run(real.folder / "run"), read_tum(real.folder / "truth.tum")[1])
+        if name in REAL:
+            place, condition = name.split(", ")
+            real, out = RealSet(data / place), below / "smoothing-runs" / place / condition
+            real.spoil(condition, out)
+            site = built(real.survey, below / "conditions" / "maps" / f"{place}.coview")
+            return figures(BaseMap.load(site), open_run(out / "run"), read_tum(out / "truth.tum")[1])
         world, change = DRIVES[name]
         recorded = open_world(below, world)
         drive = change(start(recorded.truth, world.drift, world.seed))
@@ -117,6 +122,7 @@ def figures(base_map: BaseMap, run: Run, truth: Floats) -> dict[str, Any]:
     return {
         "frames": len(run),
         "live": int(had.sum()),
+        "without": int((~had).sum()),
         "only": int((has & ~had).sum()),
         **_statistics("live", before, _levels(fixes), had & has),
         **_statistics("smoothed", after, _levels(answers), had & has),
@@ -156,12 +162,17 @@ def _columns(title: str, name: str) -> tuple[tuple[str, str, int | None], ...]:
     return tuple((f"{title}{text}", f"{name}_{key}", digits) for text, key, digits in keys)
 
 
-COLUMNS = (
-    ("run", "name", None), ("frames", "frames", 0), ("live", "live", 0), *_columns("live: ", "live"),
-    *_columns("smoothed: ", "smoothed"), ("only smoothed", "only", 0), *_columns("", "only"),
-)  # fmt: skip
-
-
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs."""
-    return {"": listed(COLUMNS, [row.details for row in rows if row.details])}
+    """Live and smoothed poses of the same frames, and poses of the other frames."""
+    runs = [row.details for row in rows if row.details]
+    same = (("run", "name", None), ("frames", "frames", 0), ("live", "live", 0))
+    other = (
+        ("run", "name", None),
+        ("frames", "frames", 0),
+        ("without a live pose", "without", 0),
+        ("smoothed", "only", 0),
+    )
+    return {
+        "same frames": listed((*same, *_columns("live: ", "live"), *_columns("smoothed: ", "smoothed")), runs),
+        "frames without a live pose": listed((*other, *_columns("", "only")), [run for run in runs if run["without"]]),
+    }

@@ -213,7 +213,7 @@ class _Chain:
         return [pose for pose in found if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
 
     def _nodes(self) -> tuple[list[int], Poses]:
-        """Return the frames (M) that get a pose, and poses (M, 4, 4) by odometry from a registration before or after."""
+        """Return the frames (M) that get a pose, and poses (M, 4, 4) by odometry from a registration near them."""
         parts: list[list[int]] = []
         for k in range(len(self.frames)):
             if self._kind(k) is not None:
