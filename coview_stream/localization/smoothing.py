@@ -206,6 +206,7 @@ class _Chain:
         registrations = [
             Constraint(number[k], -1, self.measured[k], along_body(kept.covariance, self.measured[k]))
             for k, kept in self.registered.items()
+            if k in number
         ]
         graph.add(registrations, ("Huber", huber))
         solved = zip(nodes, graph.solve(), graph.covariances(), strict=True)
