@@ -14,7 +14,7 @@ the drift that tracking measured, and the uncertainty of scale and heading rate 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
 
@@ -112,8 +112,10 @@ class _Chain:
     measured: dict[int, Pose]  # (4, 4) of their bodies
     driven: Floats  # (N,) metres up to each frame
     spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
-    broken: dict[int, tuple[int, int]]  # frames whose motion from the one before is unknown; registrations around
-    unknown: set[int]  # frames at a break that may lie on either side of it
+    broken: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Frames whose motion from the one before is unknown, and the registered frames before and after."""
+    unknown: set[int] = field(default_factory=set)
+    """Frames at a break that may lie on either side of it."""
 
     @classmethod
     def of(
@@ -129,7 +131,7 @@ class _Chain:
         for k, (a, b) in enumerate(pairwise(odometry), start=1):
             spread[k] = drift.covariance(float(steps[k - 1]), abs(yaw_of(inverse(a) @ b)))
         keys = np.array(list(registered))
-        chain = cls(frames, odometry, registered, keys, measured, driven, spread, {}, set())
+        chain = cls(frames, odometry, registered, keys, measured, driven, spread)
         chain._spread_calibration(calibration)
         live = [at for at, kept in enumerate(registered.values()) if not kept.backward]
         for before, after in pairwise([0, *live]):
