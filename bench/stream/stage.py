@@ -16,6 +16,7 @@ from bench.harness.node import Node
 from bench.harness.rows import Row, bounded, informs, judged, reached
 from bench.stream import scores
 from bench.stream.processes import Drive, Helper, Recorder, RobotPlan, Sent, free_port, route, send, wait_until
+from coview_stream.sim import SimulationConfig
 
 _READY = 90.0  # seconds in which the node must announce all its robots
 MAX_JITTER, RATE, RATE_SHARE, MIN_POSED, MAX_FIRST_FIX = 15.0, 10.0, 0.02, 0.95, 20.0
@@ -26,8 +27,9 @@ MAX_LAG = 0.3
 
 
 class Setting(NamedTuple):
-    """Common to all scenarios: the world, another one, the first one's map, and whether times are short."""
+    """Configuration of the world, the world, another one, the first one's map, and whether times are short."""
 
+    home: SimulationConfig
     world: Path
     stranger: Path
     site: Path
@@ -78,9 +80,9 @@ class Stage:
         """Return a sender that waits for its beginning."""
         return self.helper(send, self.endpoint, world or self.setting.world, plans)
 
-    def measure(self, plan: RobotPlan, sent: Sent, start: float) -> dict[str, Any]:
+    def measure(self, plan: RobotPlan, sent: Sent, start: float, world: Path | None = None) -> dict[str, Any]:
         """Return all numbers of a robot's stream that began at ``start``; NaN without poses."""
-        recorder, drive, end = self.recorder, Drive(self.setting.world, plan), start + plan.seconds
+        recorder, drive, end = self.recorder, Drive(world or self.setting.world, plan), start + plan.seconds
         time.sleep(max(0.0, end + 0.5 - time.monotonic()))
         poses, told = recorder.poses(plan.robot, start, end), recorder.told(plan.robot, start, end)
         arrivals = [pose.arrival for pose in poses]
@@ -92,9 +94,13 @@ class Stage:
             "poses": len(poses),
             "wrong": scores.false_poses(metres, degrees) + recorder.unreadable,
             "first_fix_m": drive.metres(poses[0].stamp_ns) if poses else math.nan,
+            "first_fix_s": poses[0].arrival - start if poses else math.nan,
             "rmse_m": rms(metres) if poses else math.nan,
+            "median_m": float(np.median(metres)) if poses else math.nan,
+            "median_deg": float(np.median(degrees)) if poses else math.nan,
             "rate_hz": scores.rate_hz(intervals),
             "jitter_ms": scores.jitter_ms(intervals),
+            "jitter_p50_ms": scores.percentile_ms(np.abs(intervals - 0.1), 50),
             "machine_jitter_ms": scores.jitter_ms(ticks),
             "share_posed": scores.share_posed(arrivals, arrivals[0], end) if poses else 0.0,
             "cloud_to_pose_ms": scores.percentile_ms(scores.reaction(puts, scores.corrected(poses)), 95),

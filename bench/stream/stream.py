@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import traceback
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,10 +17,10 @@ import numpy as np
 
 from bench.harness import worlds
 from bench.harness.files import folder
-from bench.harness.rows import Row, bounded, failed, informs, judged, reached
+from bench.harness.rows import Row, bounded, failed, informs, judged, listed, reached
 from bench.stream import scores
 from bench.stream.processes import RobotPlan, vandalise
-from bench.stream.stage import MAX_FIRST_FIX, Setting, Stage, punctual, rated, served
+from bench.stream.stage import MAX_FIRST_FIX, MAX_JITTER, Setting, Stage, punctual, rated, served
 from coview_stream.sim import SimulationConfig
 
 FLEET, FLEET_POINTS, MAX_STARVATION, MIN_JAIN = 16, 16_000, 1.0, 0.95
@@ -85,12 +85,46 @@ def robots(stage: Stage) -> Iterator[Row]:
     yield informs("jitter p99, median", float(np.nanmedian(all_of("jitter_ms"))), "ms")
 
 
+LIDARS = {
+    "terrestrial": ("blk360", {"cloud_period": 10 / 3, "frame_seconds": 10 / 3}),  # a scan each 5 m, taken at once
+    "spinning": ("vlp16", {}),
+    "solid-state": ("mid360", {}),
+    "hemispherical": ("bpearl", {}),
+}
+"""Sensors of :func:`lidars`, and how they stream."""
+
+
+def lidars(stage: Stage) -> Iterator[Row]:
+    """Serve four robots at once, each with another kind of lidar, on its own drive over the same map."""
+    seconds, home = 25.0 if stage.setting.quick else 53.0, stage.setting.home
+    plans, drives = [], []
+    for k, (sensor, words) in enumerate(LIDARS.values()):
+        plans.append(RobotPlan(stage.robots[k], seconds, **words))
+        config = replace(home, sensor=sensor, length=1.5 * (seconds + 15.0), drive_seed=k + 1)
+        drives.append(worlds.prepared_run(folder(), config))
+    senders = [stage.sender(plan, world=drive) for plan, drive in zip(plans, drives, strict=True)]
+    start = senders[0].begin()
+    for helper in senders[1:]:
+        helper.begin(start)
+    for kind, plan, drive, helper in zip(LIDARS, plans, drives, senders, strict=True):
+        numbers = stage.measure(plan, helper.result(), start, drive)
+        about = {"scene": home.scene, "kind": kind, "sensor": LIDARS[kind][0]}
+        yield replace(punctual(f"{kind}: ", numbers["late_s"]), details=about | numbers)
+        yield judged(f"{kind}: found", f"{numbers['first_fix_m']:.1f} m", "found", numbers["poses"] > 0)
+        wrong = numbers["wrong"]
+        yield judged(f"{kind}: false or unreadable poses", f"{wrong} of {numbers['poses']}", "0", wrong == 0)
+        yield rated(f"{kind}: rate while TRACKING", [numbers["rate_hz"]])
+        yield bounded(f"{kind}: jitter p99", numbers["jitter_ms"], "ms", MAX_JITTER)
+    yield informs("the machine's jitter p99", numbers["machine_jitter_ms"], "ms")
+
+
 class Scenario(NamedTuple):
-    """A play on a stage, its robots, and further arguments of the node."""
+    """A play on a stage, its robots, further arguments of the node, and the scene."""
 
     play: Callable[[Stage], Iterator[Row]]
     robots: tuple[str, ...] = ("r1",)
     arguments: tuple[str, ...] = ()
+    scene: str = "town"
 
 
 _FAST = functools.partial(
@@ -103,6 +137,7 @@ SCENARIOS: dict[str, tuple[Scenario, ...]] = {
     "protobuf": (Scenario(functools.partial(steady, cloud="foxglove"), arguments=("--pose-encoding", "foxglove")),),
     "jitter": (Scenario(jitter, ("r1", "r2")),),
     "robots": (Scenario(robots, tuple(f"r{k + 1}" for k in range(FLEET))),),
+    "lidars": (Scenario(lidars, ("r1", "r2", "r3", "r4")),),
 }
 
 
@@ -115,15 +150,30 @@ def options(parser: ArgumentParser) -> None:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Run the scenarios one after the other, in a simulated world; the node's logs stay in its folder."""
-    home, stranger = (SimulationConfig(seed=asked.seed + k, size=220.0, length=80.0 / (1 + k)) for k in (0, 1))
-    main, other = (worlds.prepare(folder(), config) for config in (home, stranger))
-    setting = Setting(main, other, worlds.map_of(folder(), home), asked.quick)
+    stranger = worlds.prepared_run(folder(), SimulationConfig(seed=asked.seed + 1, size=220.0, length=40.0))
     for name in asked.names or SCENARIOS:
         try:
             for scenario in SCENARIOS[name]:
+                home = SimulationConfig(scenario.scene, seed=asked.seed, size=220.0, length=80.0)
+                main, site = worlds.prepare(folder(), home), worlds.map_of(folder(), home)
+                setting = Setting(home, main, stranger, site, asked.quick)
                 with Stage(setting, f"{name}.log", scenario.robots, *scenario.arguments) as stage:
                     for row in scenario.play(stage):
                         yield replace(row, name=f"stream/{name}/{row.name}")
         except Exception as error:  # a target missed; the next scenario runs all the same
             traceback.print_exc()
             yield failed(f"stream/{name}", f"{type(error).__name__}: {error}".splitlines()[0])
+
+
+COLUMNS = (
+    ("scene", "scene", None), ("lidar", "kind", None), ("sensor", "sensor", None), ("clouds", "clouds_sent", 0),
+    ("first fix m", "first_fix_m", 1), ("s", "first_fix_s", 1), ("poses", "poses", 0), ("false", "wrong", 0),
+    ("median error m", "median_m", 3), ("deg", "median_deg", 2), ("Hz", "rate_hz", 2),
+    ("jitter p50 ms", "jitter_p50_ms", 1), ("p99", "jitter_ms", 1), ("posed after it", "share_posed", 3),
+)  # fmt: skip
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Return a table of the robots of :func:`lidars`, which one node serves at once."""
+    kinds = [row.details for row in rows if "kind" in row.details]
+    return {"lidars": listed(COLUMNS, kinds)} if kinds else {}

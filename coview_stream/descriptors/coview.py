@@ -19,6 +19,9 @@ Descriptor = npt.NDArray[np.float32]
 _VERTICAL: Literal["max", "off"] = "max"  # ``off`` keeps what eq. 2 alone does; bench ablation compares them
 _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
+EYE = 1.7
+"""Metres of the sensor above the ground, where nothing tells its height."""
+
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
@@ -50,12 +53,13 @@ def ground_below(points: Points, position: Floats) -> float:
     """Estimate the height of the ground below ``position`` (3,) from the points around it, metres in their frame.
 
     The median of the lowest points below the sensor in 1 m cells within 6 m: robust to clutter, and independent of the
-    sensor's mounting height. Without such points it is the sensor's height.
+    sensor's mounting height. Without such points, as below a hemisphere that looks up, it is :data:`EYE` below the
+    sensor.
     """
     x, y = points[:, 0] - position[0], points[:, 1] - position[1]
     near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2]))
     if not len(near):
-        return float(position[2])
+        return float(position[2] - EYE)
     reach = int(np.ceil(_GROUND_RADIUS))
     column, row = (np.floor(axis[near]).astype(np.int64) + reach for axis in (x, y))
     lowest = np.full((2 * reach) ** 2, np.inf, dtype=np.float32)

@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.basemap.stations import aligned_corner, describe_stations, rasterise
 from coview_stream.config import DescriptorConfig
-from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.descriptors.coview import EYE, describe, ground_below
 
 ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "paper"))
 
@@ -104,7 +104,7 @@ def test_ground_below_uses_points_near_the_robot_only():
     assert ground_below(np.concatenate([near, far]) + shift, np.array([300.0, -200.0, 52.0])) == pytest.approx(50.0)
 
 
-def test_without_ground_points_sensor_height_is_returned():
+def test_without_ground_points_the_sensor_stands_at_the_usual_height():
     sensor = np.array([0.0, 0.0, 2.0])
-    assert ground_below(np.empty((0, 3), np.float32), sensor) == 2.0
-    assert ground_below(polar(3.0, np.arange(0.0, 360, 5), 5.0), sensor) == 2.0
+    assert ground_below(np.empty((0, 3), np.float32), sensor) == 2.0 - EYE
+    assert ground_below(polar(3.0, np.arange(0.0, 360, 5), 5.0), sensor) == 2.0 - EYE

@@ -17,6 +17,7 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.progress import Progress
 from coview_stream.config import LocalizerConfig, RegistrationConfig
+from coview_stream.descriptors.coview import EYE
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, norms, pose_from, yaw_of
@@ -42,8 +43,6 @@ _STOREY = 2.5  # metres
 _KEPT_SCANS = 8
 
 # of a virtual scan
-EYE = 1.7
-"""Metres of the sensor above the ground."""
 _RANGE = 40.0  # metres
 _NEAREST = 1.0  # metres
 _BEAM = np.radians(1.0)  # cell of the range image that hides what lies behind

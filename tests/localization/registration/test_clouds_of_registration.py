@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import RegistrationConfig
+from coview_stream.descriptors.coview import EYE
 from coview_stream.localization.registration.clouds import height_above_lowest, prepare_scan, thinned
 
 
@@ -34,6 +35,16 @@ def test_facade_without_ground_uses_neighbouring_ground():
     floating = wall()[wall()[:, 2] > 7.0]
     height = height_above_lowest(np.concatenate([floating, ground()]))
     np.testing.assert_allclose(height[: len(floating)], floating[:, 2] - 5.0, atol=1e-5)
+
+
+def test_foot_of_a_wall_is_no_ground_for_a_sensor_that_sees_none():
+    position = np.array([0.0, 0.0, 6.5])
+    seen = wall()[wall()[:, 2] > 6.9]  # by a hemisphere that looks up
+    source = prepare_scan(seen, position, RegistrationConfig())
+    assert source.above.all()
+    np.testing.assert_allclose(source.height, source.points[:, 2] - 6.5 + EYE, atol=1e-5)
+    both = prepare_scan(np.concatenate([seen, ground()]), position, RegistrationConfig(source_points=50_000))
+    assert not both.above[both.points[:, 2] < 5.3].any()
 
 
 def test_range_and_count_are_limited_deterministically():

@@ -12,7 +12,8 @@ from small_world import Box
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
-from coview_stream.localization.search.ambiguity import EYE, FARTHEST, ambiguity, sample, virtual_scan
+from coview_stream.descriptors.coview import EYE
+from coview_stream.localization.search.ambiguity import FARTHEST, ambiguity, sample, virtual_scan
 
 PLACES = 8
 
