@@ -3,8 +3,9 @@
 Each set of ``--data`` (``base.laz``, ``run/``, ``truth.tum``; not part of the repository) is spoilt as the condition
 says. ``coview-stream locate`` localizes it in a process of its own, on the map that ``coview-stream build`` makes of
 ``base.laz``. ``--densities`` adds maps as an aircraft might have seen the same place, without facades, made as
-``coview-stream airborne`` does. ``--paper`` localizes the same runs by the first paper's method, too. Results stay in
-``--work``.
+``coview-stream airborne`` does. ``--overlaps`` takes squares out of the map instead, until it holds no more than so
+much of what the robot sees. A set that is not there is simulated: ``town-vlp16-4201`` is SCENE-SENSOR-SEED. ``--paper``
+localizes the same runs by the first paper's method, too. Results stay in ``--work``.
 
 A frame is false if its pose is more than 1 m or 5 degrees off; *share* is the share of frames with a pose, per cent of
 the unspoilt run's. A condition is a name with its figures, ``pitch:2``; several joined by ``+`` follow one another;
@@ -37,19 +38,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import paper
 from bench.accuracy.scores import Track, errors, score
+from bench.harness import worlds
 from bench.harness.files import PYTHON, ROOT, built, environment, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed, number
 from coview_stream import BaseMap
 from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats, Indices
-from coview_stream.geometry.transforms import Points, Poses, inverse, pose_from
+from coview_stream.geometry.transforms import Points, Poses, inverse, pose_from, transform
 from coview_stream.recordings.open_run import open_run
 from coview_stream.report.evaluation import MAX_STAMP_GAP, driven
+from coview_stream.sim import SENSORS, SimulationConfig
 from coview_stream.sim.airborne import Survey, airborne_survey, surface_of
 
 _RINGS, _KEPT = 64, 16  # of elevation
@@ -161,6 +165,9 @@ LEAST_SHARE = 85.0  # per cent of the unspoilt run's poses
 MOST_METRES, MOST_DEGREES = 0.3, 1.0  # of every first fix
 _ASKED = ("pitch", "roll", "odo", "drift")  # conditions that LEAST_SHARE is asked of
 _AIRBORNE = ("coview_stream/sim/airborne.py", "coview_stream/clouds")
+_LESS = 5.0  # per cent
+_SQUARE = 8.0  # metres, of the map that is left out as one
+_NEAR, _SCANS = 0.5, 12  # metres to a map point; scans of a run of which the overlap is measured
 _NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 
@@ -188,6 +195,35 @@ class RealSet:
         spec = {"set": self.name, "bytes": self.survey.stat().st_size, "density": density}
         return file, remembered(file.with_suffix(".json"), spec | {"code": fingerprint(*_AIRBORNE)}, make)
 
+    def cut(self, percent: float) -> tuple[Path, float]:
+        """Return the survey without as many of its squares as leave the overlap of the run, and that overlap, per cent.
+
+        Squares of :data:`_SQUARE` are left out in a random order, on the whole site alike. The overlap is the share of
+        the run's points that have a map point within half a metre at the true pose.
+        """
+        file = folder() / "conditions" / "cut" / f"{self.name}-{percent:g}.laz"
+
+        def make() -> dict[str, Any]:
+            cloud, run = read_cloud(self.survey), open_run(self.folder / "run")
+            truth = read_tum(self.folder / "truth.tum")[1]
+            truth[:, :3, 3] -= cloud.origin
+            every = max(1, len(run) // _SCANS)
+            scans = [transform(truth[k], run.read(k).points[::7].astype(np.float64)) for k in range(0, len(run), every)]
+            seen = np.concatenate(scans)
+            matched = cKDTree(cloud.points).query(seen, distance_upper_bound=_NEAR)[0] < _NEAR
+            squares, of = np.unique(np.floor(cloud.points[:, :2] / _SQUARE), axis=0, return_inverse=True)
+            rank = np.random.default_rng(zlib.crc32(self.name.encode())).permutation(len(squares))
+            where = cKDTree(squares).query(np.floor(seen[matched, :2] / _SQUARE))[1]
+            left = np.cumsum(np.bincount(rank[where], minlength=len(squares))) / len(seen)
+            kept = cloud.points[rank[of.ravel()] <= np.searchsorted(left, percent / 100.0)]
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_cloud(file, kept, origin=cloud.origin)
+            return {"overlap": 100.0 * float((cKDTree(kept).query(seen, distance_upper_bound=_NEAR)[0] < _NEAR).mean())}
+
+        spec = {"set": self.name, "bytes": self.survey.stat().st_size, "percent": percent}
+        code = fingerprint("bench/accuracy/conditions.py")
+        return file, remembered(file.with_suffix(".json"), spec | {"code": code}, make)["overlap"]
+
     def spoil(self, condition: str, out: Path) -> None:
         """Write ``run/`` and ``truth.tum`` of a condition below ``out``."""
         seed, run = zlib.crc32(f"{self.name} {condition}".encode()), open_run(self.folder / "run")
@@ -202,6 +238,16 @@ class RealSet:
         for row, k in enumerate(variant.frames):
             write_cloud(frames / f"{row:06d}.pcd", variant.cloud(run.read(int(k)).points))
         write_tum(out / "run" / "odometry.tum", variant.stamps, variant.odometry)
+
+
+def set_of(name: str, data: Path) -> RealSet:
+    """Return a set of ``data``, or else the world that SCENE-SENSOR-SEED names: 120 m wide, a drive of 24 m."""
+    scene, *words = name.split("-", 1)
+    sensor, _, seed = "".join(words).rpartition("-")
+    if (data / name).exists() or sensor not in SENSORS or not seed.isdecimal():
+        return RealSet(data / name)
+    config = SimulationConfig(scene, sensor, seed=int(seed), size=120.0, length=24.0, density=10.0)
+    return RealSet(worlds.prepared_run(folder(), config))
 
 
 def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:
@@ -266,11 +312,18 @@ def options(parser: ArgumentParser) -> None:
         "--densities", nargs="+", type=float, default=[], metavar="PER_M2", help="also on airborne-like maps: 4 8 20"
     )
     parser.add_argument("--paper", action="store_true", help="also by the first paper's method")
+    parser.add_argument(
+        "--overlaps", nargs="+", type=float, default=[], metavar="PER_CENT",
+        help="instead: unspoilt runs on maps with holes, that hold so much of what the robot sees",
+    )  # fmt: skip
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per set, map and condition, then the targets."""
-    sets = [RealSet(asked.data / name) for name in (asked.sets[-1:] if asked.quick else asked.sets)]
+    sets = [set_of(name, asked.data) for name in (asked.sets[-1:] if asked.quick else asked.sets)]
+    if asked.overlaps:
+        yield from _overlapping(sets, asked.overlaps)
+        return
     conditions = list(dict.fromkeys(("base", *(asked.conditions[:2] if asked.quick else asked.conditions))))
     below, results = folder() / "conditions", []
     for real in sets:
@@ -293,6 +346,22 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 name = f"conditions/{real.name}{per}, {condition}: posed"
                 yield informs(name, 100.0 * scores["posed"] / scores["frames"], "%", results[-1])
     yield from verdicts(results)
+
+
+def _overlapping(sets: Sequence[RealSet], overlaps: Sequence[float]) -> Iterator[Row]:
+    """Yield a row per set and overlap, then the number of false frames."""
+    below, false = folder() / "conditions", 0
+    for real in sets:
+        for percent in overlaps:
+            cloud, overlap = real.cut(percent)
+            if overlap < percent - _LESS:  # not even the whole map holds so much
+                continue
+            scores = located(real, "base", built(cloud, below / "maps" / f"{real.name}-cut-{percent:g}.coview"), below)
+            false += scores["false_frames"]
+            about = {"set": real.name, "overlap": overlap, "asked": percent}
+            name = f"conditions/{real.name}, overlap {overlap:.0f} %: posed"
+            yield informs(name, 100.0 * scores["posed"] / scores["frames"], "%", {**about, **scores})
+    yield judged("conditions/false frames", str(false), "0", false == 0, false)
 
 
 def share(scores: dict[str, Any], base: dict[str, Any]) -> float | None:
@@ -328,9 +397,30 @@ COLUMNS = (
 )  # fmt: skip
 
 
+OVERLAP = ("overlap %", "overlap", 0)
+BINS = (
+    ("overlap %", "asked", 0), ("runs", "runs", 0), ("found", "found", 0), ("first fix m, median", "first_m", 1),
+    ("frames posed %", "posed", 0), ("false frames", "false", 0),
+)  # fmt: skip
+
+
+def _bin(percent: float, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of the runs with an overlap."""
+    runs = [run for run in runs if run["asked"] == percent]
+    first = [run["first_fix_m"] for run in runs if run["posed"]]
+    return {
+        "asked": percent, "runs": len(runs), "found": len(first), "first_m": np.median(first or [np.nan]),
+        "posed": 100.0 * np.mean([run["posed"] / run["frames"] for run in runs] or [np.nan]),
+        "false": sum(run["false_frames"] for run in runs),
+    }  # fmt: skip
+
+
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs; with ``--paper`` they stand beside the paper's."""
+    """All runs; with ``--paper`` they stand beside the paper's, with ``--overlaps`` below a summary."""
     runs = [row.details for row in rows if row.details]
+    if asked.overlaps:
+        bins = listed(BINS, [_bin(percent, runs) for percent in asked.overlaps])
+        return {"by overlap": bins, "": listed((COLUMNS[0], OVERLAP, *COLUMNS[3:5], *COLUMNS[6:]), runs)}
     if not asked.paper:
         return {"": listed(COLUMNS, runs)}
     ways = tuple((way, way, None) for way in paper.WAYS)

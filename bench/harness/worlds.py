@@ -43,7 +43,8 @@ MAPPER = (*(f"coview_stream/{part}" for part in ("sim", "basemap", "clouds", "de
 def world_name(config: SimulationConfig) -> str:
     """Directory of a world below the benchmark's folder."""
     dirt = REAL if config.dirt.kinds == KINDS_OF_DIRT else "+".join(config.dirt.kinds)
-    return f"{config.scene}-{config.sensor}-{config.seed}" + (f"-{dirt}" if dirt else "")
+    drive = f"-drive{config.drive_seed}" if config.drive_seed else ""
+    return f"{config.scene}-{config.sensor}-{config.seed}{drive}" + (f"-{dirt}" if dirt else "")
 
 
 def map_of(below: Path, config: SimulationConfig) -> Path:
