@@ -35,7 +35,8 @@ from coview_stream.report.evaluation import driven
 EPOCH_NS = 1_700_000_000 * 10**9
 """The begin of the robots' sensor clocks, which is no time of the machine."""
 
-_APART = 31  # frames between the starts of neighbouring robots
+APART = 31
+"""Frames between the starts of neighbouring robots."""
 
 Kind = Literal["odom", "cloud"]
 
@@ -70,7 +71,7 @@ class Drive:
 
     def __init__(self, world: Path, plan: RobotPlan) -> None:
         self._world, self._plan = world, plan
-        self._start = _APART * (int(plan.robot.lstrip("r")) - 1)
+        self._start = APART * (int(plan.robot.lstrip("r")) - 1)
         self._truth = read_tum(world / "truth.tum")[1]
 
     def _at(self, content: float) -> float:

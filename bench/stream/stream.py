@@ -19,9 +19,11 @@ from bench.harness import worlds
 from bench.harness.files import folder
 from bench.harness.rows import Row, bounded, failed, informs, judged, listed, reached
 from bench.stream import scores
-from bench.stream.processes import RobotPlan, vandalise
+from bench.stream.processes import APART, RobotPlan, vandalise
 from bench.stream.stage import MAX_FIRST_FIX, MAX_JITTER, Setting, Stage, punctual, rated, served
+from coview_stream.errors import InputError
 from coview_stream.sim import SimulationConfig
+from coview_stream.sim.simulate import scene_of, trajectories
 
 FLEET, FLEET_POINTS, MAX_STARVATION, MIN_JAIN = 16, 16_000, 1.0, 0.95
 
@@ -94,21 +96,36 @@ LIDARS = {
 """Sensors of :func:`lidars`, and how they stream."""
 
 
+def _drive_of(home: SimulationConfig, k: int, frames: int) -> tuple[int, str]:
+    """Return the seed of a drive of the k-th robot, and where it leads: in a depot into the hall, or out of it."""
+    scene = scene_of(home)
+    if (hall := scene.passage) is None:
+        return k + 1, "outdoors"
+    for seed in range(k + 1, 1000):
+        truth = trajectories(scene, replace(home, drive_seed=seed))[1][APART * k : APART * k + frames]
+        inside = hall.holds(truth[:, :2, 3])
+        if len(inside) == frames and inside[0] == k % 2 and 0.25 < inside.mean() < 0.75:
+            return seed, "out of the hall" if k % 2 else "into the hall"
+    raise InputError(f"{home}: no drive leads through the gate of the hall")
+
+
 def lidars(stage: Stage) -> Iterator[Row]:
     """Serve four robots at once, each with another kind of lidar, on its own drive over the same map."""
     seconds, home = 25.0 if stage.setting.quick else 53.0, stage.setting.home
-    plans, drives = [], []
+    plans, drives, ways = [], [], []
     for k, (sensor, words) in enumerate(LIDARS.values()):
         plans.append(RobotPlan(stage.robots[k], seconds, **words))
-        config = replace(home, sensor=sensor, length=1.5 * (seconds + 15.0), drive_seed=k + 1)
-        drives.append(worlds.prepared_run(folder(), config))
+        length = 1.5 * (seconds + 15.0)
+        seed, way = _drive_of(replace(home, length=length), k, round(10 * seconds))
+        ways.append(way)
+        drives.append(worlds.prepared_run(folder(), replace(home, sensor=sensor, length=length, drive_seed=seed)))
     senders = [stage.sender(plan, world=drive) for plan, drive in zip(plans, drives, strict=True)]
     start = senders[0].begin()
     for helper in senders[1:]:
         helper.begin(start)
-    for kind, plan, drive, helper in zip(LIDARS, plans, drives, senders, strict=True):
+    for kind, way, plan, drive, helper in zip(LIDARS, ways, plans, drives, senders, strict=True):
         numbers = stage.measure(plan, helper.result(), start, drive)
-        about = {"scene": home.scene, "kind": kind, "sensor": LIDARS[kind][0]}
+        about = {"scene": home.scene, "way": way, "kind": kind, "sensor": LIDARS[kind][0]}
         yield replace(punctual(f"{kind}: ", numbers["late_s"]), details=about | numbers)
         yield judged(f"{kind}: found", f"{numbers['first_fix_m']:.1f} m", "found", numbers["poses"] > 0)
         wrong = numbers["wrong"]
@@ -137,7 +154,7 @@ SCENARIOS: dict[str, tuple[Scenario, ...]] = {
     "protobuf": (Scenario(functools.partial(steady, cloud="foxglove"), arguments=("--pose-encoding", "foxglove")),),
     "jitter": (Scenario(jitter, ("r1", "r2")),),
     "robots": (Scenario(robots, tuple(f"r{k + 1}" for k in range(FLEET))),),
-    "lidars": (Scenario(lidars, ("r1", "r2", "r3", "r4")),),
+    "lidars": tuple(Scenario(lidars, ("r1", "r2", "r3", "r4"), scene=scene) for scene in ("town", "depot")),
 }
 
 
@@ -158,15 +175,16 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 main, site = worlds.prepare(folder(), home), worlds.map_of(folder(), home)
                 setting = Setting(home, main, stranger, site, asked.quick)
                 with Stage(setting, f"{name}.log", scenario.robots, *scenario.arguments) as stage:
+                    place = f"{name}/{scenario.scene}" if len({s.scene for s in SCENARIOS[name]}) > 1 else name
                     for row in scenario.play(stage):
-                        yield replace(row, name=f"stream/{name}/{row.name}")
+                        yield replace(row, name=f"stream/{place}/{row.name}")
         except Exception as error:  # a target missed; the next scenario runs all the same
             traceback.print_exc()
             yield failed(f"stream/{name}", f"{type(error).__name__}: {error}".splitlines()[0])
 
 
 COLUMNS = (
-    ("scene", "scene", None), ("lidar", "kind", None), ("sensor", "sensor", None), ("clouds", "clouds_sent", 0),
+    ("scene", "scene", None), ("drive", "way", None), ("lidar", "kind", None), ("sensor", "sensor", None), ("clouds", "clouds_sent", 0),
     ("first fix m", "first_fix_m", 1), ("s", "first_fix_s", 1), ("poses", "poses", 0), ("false", "wrong", 0),
     ("median error m", "median_m", 3), ("deg", "median_deg", 2), ("Hz", "rate_hz", 2),
     ("jitter p50 ms", "jitter_p50_ms", 1), ("p99", "jitter_ms", 1), ("posed after it", "share_posed", 3),

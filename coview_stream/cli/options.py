@@ -220,7 +220,9 @@ def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/1
 
 def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> None:
     """Declare the options of a simulated world that ``demo`` and ``simulate`` share, with their defaults in metres."""
-    parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
+    parser.add_argument(
+        "--scene", default="town", help="town, campus, village, industrial, depot (with a hall) or forest (town)"
+    )
     parser.add_argument(
         "--sensor",
         default="vlp16",

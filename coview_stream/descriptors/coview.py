@@ -22,6 +22,9 @@ _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan h
 EYE = 1.7
 """Metres of the sensor above the ground, where nothing tells its height."""
 
+LOWEST_EYE = 0.3
+"""Metres of a sensor above the ground at least: points less below it stand on walls, down the slope or behind it."""
+
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
@@ -57,7 +60,7 @@ def ground_below(points: Points, position: Floats) -> float:
     sensor.
     """
     x, y = points[:, 0] - position[0], points[:, 1] - position[1]
-    near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2]))
+    near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2] - LOWEST_EYE))
     if not len(near):
         return float(position[2] - EYE)
     reach = int(np.ceil(_GROUND_RADIUS))

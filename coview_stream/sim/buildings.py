@@ -130,6 +130,27 @@ def hall(rng: np.random.Generator, w: float, d: float) -> Mesh:
     return join(parts)
 
 
+def passage(rng: np.random.Generator, w: float, d: float) -> Mesh:
+    """Draw a hall that a road leads through along x: gates at both ends; columns, racks and an office inside."""
+    h, wall, gate, lintel = rng.uniform(5.5, 7.0), 0.3, 9.0, 4.6
+    parts = [placed(box(w, wall, h + _FOOTING), 0, s * (d - wall) / 2, -_FOOTING) for s in (-1, 1)]
+    jamb = (d - gate) / 2
+    for x in (-(w - wall) / 2, (w - wall) / 2):
+        parts += [placed(box(wall, jamb, h + _FOOTING), x, s * (gate + jamb) / 2, -_FOOTING) for s in (-1, 1)]
+        parts.append(placed(box(wall, gate, h - lintel), x, 0, lintel))
+    parts += [placed(box(w, d, 0.3), 0, 0, h), placed(_flat_roof(rng, w, d, h), 0, 0, 0.3)]
+    parts += [placed(box(0.4, 0.4, h + _FOOTING), x, s * 5.2, -_FOOTING)
+              for x in np.arange(-0.4 * w, 0.41 * w, 8.0).tolist() for s in (-1, 1)]  # fmt: skip
+    side = float(rng.choice([-1.0, 1.0]))
+    parts.append(placed(box(9.0, 4.0, 3.0 + _FOOTING), rng.uniform(-0.3, 0.3) * w, side * (d / 2 - 2.3), -_FOOTING))
+    for x in np.arange(-0.44 * w, 0.42 * w, 4.0).tolist():
+        if rng.random() < 0.6:
+            tall, deep = rng.uniform(0.8, 4.5), rng.uniform(0.8, 2.4)
+            rack = box(rng.uniform(1.0, 3.5), deep, tall + _FOOTING)
+            parts.append(placed(rack, x, -side * (d / 2 - wall - deep / 2 - rng.uniform(0.0, 1.0)), -_FOOTING))
+    return join(parts)
+
+
 def tanks(rng: np.random.Generator, w: float, d: float) -> Mesh:
     """Draw a row of tanks or silos with a pipe bridge."""
     radius = min(w, d) / rng.uniform(3.0, 5.0)

@@ -1,4 +1,4 @@
-"""Kinds of scene: the streets, buildings and vegetation of towns, campuses, villages, industry and forests.
+"""Kinds of scene: streets, buildings and vegetation of towns, campuses, villages, industry, depots and forests.
 
 All numbers are plausible values, not measured ones.
 """
@@ -46,6 +46,7 @@ class Kind(NamedTuple):
     cars: float = 0.0  # share of the parking places that are taken
     pole_spacing: float = 0.0  # mean distance between poles on one side of a street; 0 for none
     hedges: float = 0.0  # share of the plots with a hedge or fence in front
+    passage: tuple[float, float] = (0.0, 0.0)  # length and width of a hall that the robots' route leads through
 
 
 _HOUSE = Plot(buildings.house, 1.0, (8.0, 15.0), (8.0, 13.0))
@@ -141,3 +142,5 @@ KINDS: dict[str, Kind] = {
         logs=0.0012,
     ),
 }
+KINDS["depot"] = KINDS["industrial"]._replace(passage=(48.0, 22.0))
+"""Industry with a hall on the robots' route, whose inside the map has from a terrestrial scanner."""

@@ -191,8 +191,12 @@ class Site:
         wide = self._footprint(x, y, w + 2 * margin, d + 2 * margin, yaw)
         if np.abs(wide).max() >= self.half or self._taken[self._cells(*wide.T)].any():
             return False
-        self._taken[self._cells(*self._footprint(x, y, w, d, yaw).T)] = True
+        self.occupy(x, y, w, d, yaw)
         return True
+
+    def occupy(self, x: float, y: float, w: float, d: float, yaw: float) -> None:
+        """Occupy a w x d rectangle, free or not."""
+        self._taken[self._cells(*self._footprint(x, y, w, d, yaw).T)] = True
 
     def _footprint(self, x: float, y: float, w: float, d: float, yaw: float) -> Floats:
         u, v = np.arange(-w / 2, w / 2 + _CELL, 0.8 * _CELL), np.arange(-d / 2, d / 2 + _CELL, 0.8 * _CELL)

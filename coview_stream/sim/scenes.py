@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from coview_stream.errors import ConfigError
-from coview_stream.geometry.arrays import Floats
-from coview_stream.sim import furniture, vegetation
+from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.sim import buildings, furniture, vegetation
 from coview_stream.sim.kinds import KINDS, Kind, Plot
 from coview_stream.sim.layout import Site, directions, resample
 from coview_stream.sim.mesh import Mesh, join, placed
@@ -38,6 +38,12 @@ class Footprint:
     yaw: float  # heading, radians
     ground: float  # height of the ground
     top: float  # height of the ridge
+
+    def holds(self, xy: Floats, margin: float = 0.0) -> Bools:
+        """Tell which of (N, 2) places lie inside or within ``margin`` metres of it."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        across = np.abs((xy - (self.x, self.y)) @ np.array([[c, -s], [s, c]]))
+        return np.asarray((across < (self.w / 2 + margin, self.d / 2 + margin)).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,7 @@ class Scene:
     # its parts when the map was made and now; None for a scene not drawn by e
     parts: tuple[Parts, Parts] | None = None
     houses: tuple[int, ...] = ()  # for each footprint the index of its building among Parts.built
+    passage: Footprint | None = None  # the hall that the route leads through
 
 
 @dataclass(frozen=True)
@@ -112,12 +119,15 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     rng = [np.random.default_rng([seed, sum(kind.encode()), stream]) for stream in range(5)]
     layout = spec.streets(rng[_GROUND], size, half)
     site = Site(rng[_GROUND], layout, half, relief=spec.relief, roughness=spec.roughness, ditch=spec.ditch)
+    passage, hall = _passage(rng[_BUILT], site, spec) if any(spec.passage) else (None, None)
     footprints, houses, built = _buildings(rng[_BUILT], site, spec)
+    if passage is not None and hall is not None:
+        footprints, houses, built = [*footprints, passage], [*houses, len(built)], [*built, hall]
     area, extent = (2 * site.half) ** 2, site.half - 2.0
     rocks = vegetation.rocks(rng[_GREEN], site, int(spec.rocks * area), extent)
     logs = vegetation.logs(rng[_GREEN], site, int(spec.logs * area), extent)
     bushes = vegetation.undergrowth(rng[_GREEN], site, int(spec.undergrowth * area), extent)
-    cars, poles = _street_furniture(rng[_STREET], site, spec)
+    cars, poles = _street_furniture(rng[_STREET], site, spec, passage)
     trees = _trees(rng[_GREEN], rng[_SPARE], site, spec, changed)
 
     def parts(pick: Callable[[_Movable], Floats]) -> Parts:
@@ -128,8 +138,22 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     mapped = before.state(site)
     now = after.state(site) if changed else mapped
     return Scene(
-        kind, size, mapped, now, site, layout.route, tuple(footprints), parts=(before, after), houses=tuple(houses)
+        kind, size, mapped, now, site, layout.route, tuple(footprints), (before, after), tuple(houses), passage
     )
+
+
+def _passage(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[Footprint, Mesh]:
+    """Put a hall over the straightest part of the route."""
+    route, (w, d) = site.layout.route, spec.passage
+    heading, step = np.unwrap(directions(route)), float(np.linalg.norm(route[1] - route[0]))
+    half = int(0.7 * w / step)
+    bends = [float(np.ptp(heading[k - half : k + half])) for k in range(half, len(route) - half)]
+    k = half + int(np.argmin(bends))
+    x, y, yaw = float(route[k, 0]), float(route[k, 1]), float(heading[k])
+    site.occupy(x, y, w, d, yaw)
+    mesh, ground = buildings.passage(rng, w, d), site.height(x, y)
+    top = ground + float(mesh.vertices[:, 2].max())
+    return Footprint(x, y, w, d, yaw, ground, top), placed(mesh, x, y, ground, yaw)
 
 
 def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[int], list[Mesh]]:
@@ -220,10 +244,13 @@ def _trees(
     return _Movable(plant(rng, count), plant(spare_rng, int(count * changed)))
 
 
-def _street_furniture(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[_Movable, _Movable]:
+def _street_furniture(
+    rng: np.random.Generator, site: Site, spec: Kind, passage: Footprint | None
+) -> tuple[_Movable, _Movable]:
     parked = furniture.spots(rng, site.layout, _PARKING, site.layout.half_width - 0.6)
-    taken = int(spec.cars * len(parked))
     spacing = spec.pole_spacing or 40.0
     posts = furniture.spots(rng, site.layout, spacing / 2, site.layout.half_width + 1.1)
-    used = len(posts) // 2 if spec.pole_spacing else 0
+    if passage is not None:
+        parked, posts = (rows[~passage.holds(rows[:, :2], 3.0)] for rows in (parked, posts))
+    taken, used = int(spec.cars * len(parked)), len(posts) // 2 if spec.pole_spacing else 0
     return _Movable(parked[:taken], parked[taken:] if taken else parked[:0]), _Movable(posts[:used], posts[used:])

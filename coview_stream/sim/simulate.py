@@ -1,6 +1,6 @@
 """A simulated world on disk: a base map, a run of a robot, and the truth.
 
-OUT/base.laz                   airborne scan, map frame
+OUT/base.laz                   airborne scan, map frame; of a depot also terrestrial scans of its hall
 OUT/run/frames/000000.pcd ...  deskewed frames, sensor frame (the body's, without a mount)
 OUT/run/odometry.tum           odom <- body, drifting
 OUT/sweeps                     of a world with motion: a ROS recording with the raw sweeps and more odometry
@@ -28,7 +28,7 @@ from coview_stream.config.checks import within
 from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.geometry.transforms import Points, Pose, pose_from, transform
 from coview_stream.sim.airborne import airborne_scan
 from coview_stream.sim.dirt.config import Dirt
 from coview_stream.sim.dirt.scan import Recording, Scanner, Stream, seasonal_caster, stream
@@ -36,7 +36,7 @@ from coview_stream.sim.dirt.scene import aged, drawn_parts
 from coview_stream.sim.dirt.survey import Thinning, spoilt_strips
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry, drive
-from coview_stream.sim.scenes import Scene, build_scene
+from coview_stream.sim.scenes import Footprint, Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster, MeshCaster
 
 
@@ -48,7 +48,7 @@ class SimulationConfig:
         ConfigError: unknown scene or sensor, or a value out of its range.
     """
 
-    scene: str = "town"  # town, campus, village, industrial or forest
+    scene: str = "town"  # town, campus, village, industrial, depot or forest
     sensor: str = "vlp16"  # vlp16, vlp16-inclined, os64, os64-2048, mid360, bpearl or blk360
     seed: int = 1  # of all random numbers; equal configurations give equal files
     size: float = 240.0  # side of the square map, metres
@@ -95,7 +95,7 @@ class SimulationConfig:
 
 
 _FIRST_STAMP = 1000.0  # seconds
-_AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams; the scene uses lower numbers
+_AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY, _INDOORS = range(100, 105)  # random streams; the scene uses lower numbers
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,22 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
         strips.append(points)
         bar.advance(int(100 * done) - before)
         before = int(100 * done)
+    if scene.passage is not None:
+        strips.append(_indoors(scene, scene.passage, _stream(config, _INDOORS)))
     return np.concatenate(strips)
+
+
+def _indoors(scene: Scene, hall: Footprint, rng: np.random.Generator) -> Floats:
+    """Scan a hall from stands on the route in it: (N, 3) float64 metres, scene frame."""
+    scanner, caster = SENSORS["blk360"](), Caster(scene.mapped)
+    ahead = np.array([np.cos(hall.yaw), np.sin(hall.yaw)])
+    clouds = []
+    for along in np.arange(-0.4, 0.41, 0.2) * hall.w:
+        x, y = (hall.x, hall.y) + along * ahead
+        T = pose_from(np.eye(3), [x, y, scene.site.height(x, y) + 1.5])
+        cloud = transform(T, scanner.scan(caster, T, 0, rng).astype(np.float64))
+        clouds.append(cloud[hall.holds(cloud[:, :2], 1.0)])
+    return np.concatenate(clouds)
 
 
 def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats, Floats]:
@@ -234,7 +249,8 @@ def _dirt_stream(config: SimulationConfig, purpose: Stream) -> np.random.Generat
 
 
 def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
-    apart = [config.drive_seed] if config.drive_seed and purpose != _AIRBORNE else []
+    of_map = purpose in (_AIRBORNE, _INDOORS)
+    apart = [config.drive_seed] if config.drive_seed and not of_map else []
     return np.random.default_rng([config.seed, purpose, *apart])
 
 
