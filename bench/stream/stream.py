@@ -87,7 +87,7 @@ def robots(stage: Stage) -> Iterator[Row]:
     yield informs("jitter p99, median", float(np.nanmedian(all_of("jitter_ms"))), "ms")
 
 
-LIDARS = {
+LIDARS: dict[str, tuple[str, dict[str, Any]]] = {
     "terrestrial": ("blk360", {"cloud_period": 10 / 3, "frame_seconds": 10 / 3}),  # a scan each 5 m, taken at once
     "spinning": ("vlp16", {}),
     "solid-state": ("mid360", {}),
@@ -184,9 +184,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 COLUMNS = (
-    ("scene", "scene", None), ("drive", "way", None), ("lidar", "kind", None), ("sensor", "sensor", None), ("clouds", "clouds_sent", 0),
-    ("first fix m", "first_fix_m", 1), ("s", "first_fix_s", 1), ("poses", "poses", 0), ("false", "wrong", 0),
-    ("median error m", "median_m", 3), ("deg", "median_deg", 2), ("Hz", "rate_hz", 2),
+    ("scene", "scene", None), ("drive", "way", None), ("lidar", "kind", None), ("sensor", "sensor", None),
+    ("clouds", "clouds_sent", 0), ("first fix m", "first_fix_m", 1), ("s", "first_fix_s", 1), ("poses", "poses", 0),
+    ("false", "wrong", 0), ("median error m", "median_m", 3), ("deg", "median_deg", 2), ("Hz", "rate_hz", 2),
     ("jitter p50 ms", "jitter_p50_ms", 1), ("p99", "jitter_ms", 1), ("posed after it", "share_posed", 3),
 )  # fmt: skip
 
