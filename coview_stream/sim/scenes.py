@@ -121,8 +121,8 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     site = Site(rng[_GROUND], layout, half, relief=spec.relief, roughness=spec.roughness, ditch=spec.ditch)
     passage, hall = _passage(rng[_BUILT], site, spec) if any(spec.passage) else (None, None)
     footprints, houses, built = _buildings(rng[_BUILT], site, spec)
-    if passage is not None and hall is not None:
-        footprints, houses, built = [*footprints, passage], [*houses, len(built)], [*built, hall]
+    if hall is not None:
+        built.append(hall)
     area, extent = (2 * site.half) ** 2, site.half - 2.0
     rocks = vegetation.rocks(rng[_GREEN], site, int(spec.rocks * area), extent)
     logs = vegetation.logs(rng[_GREEN], site, int(spec.logs * area), extent)
@@ -138,8 +138,9 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     mapped = before.state(site)
     now = after.state(site) if changed else mapped
     return Scene(
-        kind, size, mapped, now, site, layout.route, tuple(footprints), (before, after), tuple(houses), passage
-    )
+        kind, size, mapped, now, site, layout.route, tuple(footprints),
+        parts=(before, after), houses=tuple(houses), passage=passage,
+    )  # fmt: skip
 
 
 def _passage(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[Footprint, Mesh]:

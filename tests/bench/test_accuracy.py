@@ -11,6 +11,7 @@ from bench.accuracy.choices import Seen, TableVote, nearest_place, over_common, 
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
 from bench.tracking.drives import scenarios
+from coview_stream.clouds import read_cloud, write_cloud, write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.search.retrieval import exact_distances
@@ -251,6 +252,28 @@ def test_scores_of_a_trajectory_and_the_verdict_names_the_worst_run(run):
     least = rows["conditions/least share, tilt and odometry, %"]
     assert (least.holds, least.text) == (False, "25.0 (street, pitch:2)")
     assert rows["conditions/false frames"].holds
+
+
+@pytest.mark.slow
+def test_holes_leave_so_much_of_the_map_as_is_asked(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_BENCH", str(tmp_path / "work"))
+    floor = np.stack(np.meshgrid(*[np.arange(-60.0, 60.0, 0.5)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    frames = tmp_path / "floor" / "run" / "frames"
+    frames.mkdir(parents=True)
+    write_cloud(tmp_path / "floor" / "base.laz", floor, origin=(1000.0, 2000.0, 0.0))
+    poses, near = np.tile(np.eye(4), (3, 1, 1)), np.hypot(*floor[:, :2].T) < 50.0
+    write_tum(tmp_path / "floor" / "run" / "odometry.tum", np.arange(3.0), poses)
+    poses[:, :3, 3] = (1000.0, 2000.0, 0.0)
+    write_tum(tmp_path / "floor" / "truth.tum", np.arange(3.0), poses)
+    for k in range(3):
+        write_cloud(frames / f"{k}.pcd", floor[near].astype(np.float32))
+    real = conditions.set_of("floor", tmp_path)
+    for percent in (100.0, 65.0, 20.0):
+        cloud, overlap = real.cut(percent)
+        assert overlap == pytest.approx(percent, abs=6.0)
+        assert len(read_cloud(cloud).points) == pytest.approx(percent / 100.0 * len(floor), rel=0.15)
+    with pytest.raises(InputError, match=r"moon-vlp16.*not there"):
+        conditions.set_of("moon-vlp16", tmp_path)
 
 
 def test_lidar_odometry_leans_and_shakes():

@@ -9,6 +9,8 @@ from coview_stream.errors import ConfigError
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.layout import arc_lengths
 from coview_stream.sim.scenes import build_scene
+from coview_stream.sim.sensors import Caster
+from coview_stream.sim.simulate import SimulationConfig, base_map
 
 
 @pytest.fixture(scope="module", params=sorted(KINDS))
@@ -42,6 +44,25 @@ def test_nothing_solid_blocks_the_robot(any_scene):
     steps = any_scene.route[::8]
     nearest = min(np.hypot(*(in_the_way[:, :2] - step).T).min() for step in steps)
     assert nearest > 0.9
+
+
+def test_robots_drive_through_the_hall_of_a_depot_and_the_map_has_its_inside():
+    config = SimulationConfig("depot", seed=3, size=100.0, density=2.0)
+    scene = build_scene("depot", 3, 100.0)
+    hall = scene.passage
+    inside = hall.holds(scene.route)
+    assert arc_lengths(scene.route)[-1] * inside.mean() > 35.0
+    up = np.tile(np.float32([0, 0, 1]), (inside.sum(), 1))
+    x, y = scene.route[inside].T
+    eyes = np.column_stack([x, y, scene.site.z(x, y) + 1.5]).astype(np.float32)
+    roof = Caster(scene.now).trace(eyes, up, np.random.default_rng(0), 0.0).distance
+    assert ((roof > 2.5) & (roof < 6.5)).all()
+    assert build_scene("industrial", 3, 100.0).passage is None
+    base = base_map(scene, config)
+    within = base[hall.holds(base[:, :2], -0.5)]
+    lift = within[:, 2] - scene.site.z(*within[:, :2].T)
+    assert (np.abs(lift) < 0.2).sum() > 5000  # its floor, which no aircraft sees
+    assert ((lift > 0.5) & (lift < 4.0)).sum() > 5000
 
 
 def test_scene_triangles_are_valid(any_scene):
