@@ -167,7 +167,8 @@ _ASKED = ("pitch", "roll", "odo", "drift")  # conditions that LEAST_SHARE is ask
 _AIRBORNE = ("coview_stream/sim/airborne.py", "coview_stream/clouds")
 _LESS = 5.0  # per cent
 _SQUARE = 8.0  # metres, of the map that is left out as one
-_NEAR, _SCANS = 0.5, 12  # metres to a map point; scans of a run of which the overlap is measured
+_NEAR = 0.5  # metres to a map point
+_SCANS, _POINTS = 12, 10_000  # of a run, of which the overlap is measured
 _NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 
@@ -210,15 +211,16 @@ class RealSet:
             every = max(1, len(run) // _SCANS)
             scans = [transform(truth[k], run.read(k).points[::7].astype(np.float64)) for k in range(0, len(run), every)]
             seen = np.concatenate(scans)
-            matched = cKDTree(cloud.points).query(seen, distance_upper_bound=_NEAR)[0] < _NEAR
+            seen = seen[:: max(1, len(seen) // _POINTS)]
             squares, of = np.unique(np.floor(cloud.points[:, :2] / _SQUARE), axis=0, return_inverse=True)
-            rank = np.random.default_rng(zlib.crc32(self.name.encode())).permutation(len(squares))
-            where = cKDTree(squares).query(np.floor(seen[matched, :2] / _SQUARE))[1]
-            left = np.cumsum(np.bincount(rank[where], minlength=len(squares))) / len(seen)
-            kept = cloud.points[rank[of.ravel()] <= np.searchsorted(left, percent / 100.0)]
+            rank = np.random.default_rng(zlib.crc32(self.name.encode())).permutation(len(squares))[of.ravel()]
+            partners = cKDTree(cloud.points).query_ball_point(seen, _NEAR)
+            first = np.array([rank[rows].min() if rows else len(squares) for rows in partners])
+            shares = 100.0 * np.searchsorted(np.sort(first), np.arange(len(squares)), side="right") / len(seen)
+            last = int(np.abs(shares - percent).argmin())
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_cloud(file, kept, origin=cloud.origin)
-            return {"overlap": 100.0 * float((cKDTree(kept).query(seen, distance_upper_bound=_NEAR)[0] < _NEAR).mean())}
+            write_cloud(file, cloud.points[rank <= last], origin=cloud.origin)
+            return {"overlap": float(shares[last])}
 
         spec = {"set": self.name, "bytes": self.survey.stat().st_size, "percent": percent}
         code = fingerprint("bench/accuracy/conditions.py")
