@@ -33,7 +33,8 @@ COMMANDS = {
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
-    "overlap": "conditions --overlaps 5 20 35 50 65 85 --sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
+    "overlap": "conditions --overlaps 5 20 35 50 65 85 "
+    "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
     "lidars": "stream lidars",
     "forest_drives": "forest_drives dense-forest long-forest --plots docs/images",
     "forest_times": "forest_drives times",
