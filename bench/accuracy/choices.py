@@ -276,10 +276,15 @@ class Registering:
         if self.way == "product":
             found = register(source, start, target, self.config, self.config.search, centre=centre)
         else:
-            steps = [kernels.Scale(m, max(RESIDUAL_SCALE, m / 3.0), 1e-4, 1e-5, 1) for m in self.config.search]
+            scales, keep = self.config.search, self.config.keep
+            shares = [*([1.0] * (len(scales) - 1)), keep]  # coarse scales keep all, as the product's
+            steps = [
+                kernels.Scale(m, max(RESIDUAL_SCALE, m / 3.0), 1e-4, 1e-5, 1, share)
+                for m, share in zip(scales, shares, strict=True)
+            ]
             found = kernels.align_planes(
                 target.grid, np.zeros_like(target.normals), source.points, source.above, start, centre, steps,
-                keep=self.config.keep, iterations=200, min_pairs=MIN_PAIRS, prior=None,
+                iterations=200, min_pairs=MIN_PAIRS,
             )  # fmt: skip
         return None if found is None else found.T_map_source
 
