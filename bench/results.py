@@ -26,10 +26,12 @@ from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
 
+ABLATION = ("channels", "bins", "scan", "vote", "registration", "localizer")
 COMMANDS = {
-    **{name: name for name in BENCHMARKS if name not in ("odometry", "ground")},
+    **{name: name for name in BENCHMARKS if name not in ("odometry", "ground", "ablation")},
     "city": "city --side 2 4",
-    "ablation": "ablation --picture docs/images/spacing.png",
+    **{f"ablation, {group}": f"ablation --only {group}" for group in ABLATION},
+    "ablation, spacing": "ablation --only spacing --picture docs/images/spacing.png",
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",

@@ -130,6 +130,12 @@ LOCALIZER = {
 """Choices of the whole localizer."""
 
 GROUPS = (*SEARCH, "registration", "localizer")
+SITES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(GROUPS, (*WORLDS, *REAL)),
+    **dict.fromkeys(SEARCH, ("airborne-like", "repetitive", "sparse", "forest", "riverside_a")),
+    "spacing": ("airborne-like", "sparse", "riverside_a"),
+}
+"""Sites of each group, so that all groups together take less than 40 minutes of one core."""
 
 
 def sites(names: Sequence[str], data: Path) -> dict[str, Path]:
@@ -255,21 +261,22 @@ def options(parser: ArgumentParser) -> None:
     here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
     groups = ", ".join(GROUPS)
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), metavar="GROUP", help=groups)
-    parser.add_argument("--sites", nargs="+", choices=(*WORLDS, *REAL), default=[*WORLDS, *REAL], metavar="SITE")
+    every = (*WORLDS, *REAL)
+    parser.add_argument("--sites", nargs="+", choices=every, metavar="SITE", help=f"(by group) {', '.join(every)}")
     parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the group spacing")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per variant."""
-    chosen = asked.sites[:1] if asked.quick else asked.sites
-    places = sites(chosen, asked.data)
+    chosen = {group: tuple(asked.sites or SITES[group])[: 1 if asked.quick else None] for group in asked.only}
+    places = sites(list(dict.fromkeys(name for names in chosen.values() for name in names)), asked.data)
     code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy")}
     for group in asked.only:
         measured: dict[str, dict[str, Any]] = {}
-        for name, place in places.items():
+        for name in chosen[group]:
             spec = {"site": name, "group": group, **code}
-            make = partial(isolated, measure, place, metres(name), group)
+            make = partial(isolated, measure, places[name], metres(name), group)
             measured[name] = remembered(folder() / "results" / f"ablation-{group}-{name}.json", spec, make)
         cpu = sum(each.pop("cpu") for each in measured.values())
         variants = next(iter(measured.values()))

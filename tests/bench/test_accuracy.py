@@ -10,6 +10,7 @@ from bench.accuracy import ablation, accuracy, conditions, odometry
 from bench.accuracy.choices import Seen, TableVote, nearest_place, over_common, right
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
+from bench.results import COMMANDS
 from bench.tracking.drives import scenarios
 from coview_stream.clouds import read_cloud, write_cloud, write_tum
 from coview_stream.errors import InputError
@@ -124,6 +125,12 @@ def test_every_group_begins_with_the_default_and_changes_it_otherwise():
         assert first[1] == type(first[1])()
         assert all(choice != first[1] for _, choice in others)
         assert len({repr(choice) for choice in choices.values()}) == len(choices), group
+
+
+def test_every_group_of_the_ablation_has_sites_and_a_table_of_results():
+    assert set(ablation.SITES) == set(ablation.GROUPS)
+    assert {site for names in ablation.SITES.values() for site in names} == {*ablation.WORLDS, *ablation.REAL}
+    assert {f"ablation, {group}" for group in ablation.GROUPS} == {n for n in COMMANDS if n.startswith("ablation")}
 
 
 def test_rows_of_the_ablation_add_sites_up():
