@@ -116,6 +116,8 @@ class _Chain:
     """Frames whose motion from the one before is unknown, and the registered frames before and after."""
     unknown: set[int] = field(default_factory=set)
     """Frames at a break that may lie on either side of it."""
+    refuted: set[int] = field(default_factory=set)
+    """Frames whose live pose the scan speaks against."""
 
     @classmethod
     def of(
@@ -181,17 +183,23 @@ class _Chain:
         return float(gap @ np.linalg.solve(spread, gap))
 
     def settle_breaks(self, fit: Callable[[int, Pose], float]) -> None:
-        """Move breaks before the frames with a live pose that fit the map better from the registration after them.
+        """Compare the last live poses before each break with the poses that the registration after it leads to.
 
-        ``fit`` returns how well a frame fits at a pose (4, 4).
+        Where these fit the map better the break moves before the frame; a frame that is not beside it gets no pose, nor
+        does one that fits at neither. ``fit`` returns how well a frame fits at a pose (4, 4).
         """
         for at, (before, after) in list(self.broken.items()):
             first = at
-            while first - 1 > before and self.frames[first - 1].fix.T_map_body is not None:
-                k = first - 1
-                if fit(k, self._predicted(after, k)) <= fit(k, self._predicted(before, k)):
+            for k in range(at - 1, before, -1):
+                if self.frames[k].fix.T_map_body is None:
+                    continue
+                here, there = fit(k, self._predicted(before, k)), fit(k, self._predicted(after, k))
+                if here > 0.0 and here >= there:
                     break
-                first = k
+                if here < there and k == first - 1:
+                    first = k
+                else:
+                    self.refuted.add(k)
             self.broken[first] = self.broken.pop(at)
             self.unknown.difference_update(range(first, at))
 
@@ -236,7 +244,7 @@ class _Chain:
     def _kind(self, k: int) -> PoseKind | None:
         """Return the kind of a frame's pose; None if it has none."""
         if self.frames[k].fix.T_map_body is not None:
-            return PoseKind.SMOOTHED
+            return None if k in self.refuted else PoseKind.SMOOTHED
         if k in self.unknown:
             return None
         if self.frames[k].backward is not None:
