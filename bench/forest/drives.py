@@ -282,7 +282,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 COLUMNS = (
     ("drive", "drive", None), ("variant", "variant", None), ("posed %", "posed", 1), ("first m", "first_m", 1),
     *((f"{key} m", f"{key}_m", 3) for key in _KEYS), *((f"{key} deg", f"{key}_deg", 2) for key in _KEYS),
-    ("false", "false", 0), ("lost", "lost", 0),
+    ("> 1 m or 5 deg", "false", 0), ("lost", "lost", 0),
 )  # fmt: skip
 _TIMED = (
     ("part", "part", None), ("n", "n", 0), ("mean ms", "mean", 1), ("std ms", "std", 1), ("median ms", "median", 1),
