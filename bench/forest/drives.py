@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 from coview_stream.localization.tracking.tracker import Tracker
-from coview_stream.report.plots import ACCENT, STATE_COLOURS, draw_base_map, figure
+from coview_stream.report.plots import ACCENT, STATE_COLOURS, TRUTH, draw_base_map, figure
 
 WORLDS = (
     World("dense-forest", "vlp16", 6001, 300.0, 400.0, 2.0, 0.01),
@@ -43,7 +43,7 @@ _QUICK = 60.0  # metres of the first
 _TIMES = "times"
 _AGAIN = 30.0  # metres of driving after which the robot is searched anew for the times
 
-_POINTS = 150_000  # of a map, behind a track
+_POINTS, _BESIDE = 12_000, 25.0  # of a map behind a track, and metres of it that are shown beside
 _FARTHEST = 98  # percentile of the errors at which the colours end
 _LOWEST = 1e-3  # metres or degrees: the boxes' axis begins there
 
@@ -195,12 +195,14 @@ def times(world: World) -> dict[str, list[float]]:
 
 def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
     """Draw a row of two panels for each drive, metres and degrees: a box per variant, whiskers at 1 and 99 %."""
-    options = {"figsize": (9.0, 0.6 + 2.4 * len(drives)), "nrows": len(drives), "ncols": 2, "axes": {"squeeze": False}}
+    options = {"figsize": (9.0, 0.6 + 2.4 * len(drives)), "nrows": len(drives), "ncols": 2}
+    options["axes"] = {"squeeze": False, "sharey": "row", "sharex": "col"}
     with figure(path, **options) as (_, panels):
         for line, (drive, variants) in zip(panels, drives.items(), strict=True):
             colours = [STATE_COLOURS["TRACKING"], ACCENT]
             for axes, unit, part, colour in zip(line, ("m", "deg"), ("metres", "degrees"), colours, strict=True):
-                values = [np.maximum(_known(getattr(error, part)), _LOWEST) for error in variants.values()]
+                every = [getattr(error, part) for error in variants.values()]
+                values = [np.maximum(each[np.isfinite(each)], _LOWEST) for each in every]
                 boxes = axes.boxplot(values, orientation="horizontal", whis=(1, 99), showfliers=False, widths=0.6,
                                      tick_labels=list(variants), patch_artist=True)  # fmt: skip
                 for box in boxes["boxes"]:
@@ -209,27 +211,26 @@ def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
                     median.set(color="#000000")
                 axes.set_xscale("log")
                 axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
-                axes.invert_yaxis()
                 axes.set_xlabel(f"error [{unit}]")
+            line[0].invert_yaxis()
             line[0].set_title(drive)
 
 
 def draw_tracks(drives: Sequence[tuple[BaseMap, Floats, Errors]], path: Path) -> None:
     """Draw the true track (N, 4, 4) of each drive over its map, in the colour of the error in metres."""
-    options = {"figsize": (5.2 * len(drives), 5.0), "ncols": len(drives), "axes": {"squeeze": False}}
+    options = {"figsize": (4.6 * len(drives), 4.0), "ncols": len(drives), "axes": {"squeeze": False}}
     with figure(path, **options) as (drawing, panels):
         for axes, (site, truth, error) in zip(panels[0], drives, strict=True):
-            shift = draw_base_map(axes, site.sampled_points(_POINTS) + site.origin)
+            low, high = truth[:, :2, 3].min(axis=0) - _BESIDE, truth[:, :2, 3].max(axis=0) + _BESIDE
+            points = site.sampled_points(10 * _POINTS) + site.origin
+            points = points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)]
+            shift = draw_base_map(axes, points[:: len(points) // _POINTS + 1])
             at, known = truth[:, :3, 3] - shift, np.isfinite(error.metres)
-            axes.plot(at[:, 0], at[:, 1], color="#000000", linewidth=0.7)
+            axes.plot(at[:, 0], at[:, 1], color=TRUTH, linewidth=0.7)
             most = float(np.percentile(error.metres[known], _FARTHEST)) if known.any() else 1.0
             dots = axes.scatter(at[known, 0], at[known, 1], s=5, c=error.metres[known], cmap="plasma", vmin=0.0,
                                 vmax=most, linewidths=0, zorder=3)  # fmt: skip
-            drawing.colorbar(dots, ax=axes, shrink=0.7, label="error [m]", extend="max")
-
-
-def _known(values: Floats) -> Floats:
-    return np.asarray(values[np.isfinite(values)])
+            drawing.colorbar(dots, ax=axes, shrink=0.8, label="error [m]", extend="max")
 
 
 def options(parser: ArgumentParser) -> None:
