@@ -38,7 +38,7 @@ COMMANDS = {
     "overlap": "conditions --overlaps 5 20 35 50 65 85 "
     "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
     "lidars": "stream lidars",
-    "forest_drives": "forest_drives dense-forest long-forest --plots docs/images",
+    "forest_drives": "forest_drives dense-forest long-forest closed-forest --plots docs/images",
     "forest_times": "forest_drives times",
     "fuzz": "fuzz --seconds 60",
     "soak": "soak --minutes 600",

@@ -96,12 +96,12 @@ def lidar_odometry(truth: Floats) -> LidarOdometry:
     return LidarOdometry(LidarOdometryConfig(gravity=(float(down[0]), float(down[1]), float(down[2]))))
 
 
-def by_lidar(recorded: Recorded, stamps: Floats) -> Floats:
+def by_lidar(recorded: Recorded, drive: Drive) -> Floats:
     """Odometry (N, 4, 4) of the lidar's own frames; one that it refuses has the pose of the one before."""
-    odometry, poses = lidar_odometry(recorded.truth), [np.eye(4)]
-    for index, stamp in enumerate(stamps):
+    odometry, poses = lidar_odometry(drive.truth), [np.eye(4)]
+    for frame, stamp in zip(drive.frames, drive.stamps, strict=True):
         try:
-            poses.append(odometry.step(recorded.read(index), None, float(stamp)))
+            poses.append(odometry.step(recorded.read(int(frame)), None, float(stamp)))
         except CloudError:
             poses.append(poses[-1])
     return np.array(poses[1:])

@@ -28,6 +28,7 @@ from coview_stream.report.evaluation import driven
 from coview_stream.sim import KINDS, SimulationConfig
 from coview_stream.sim.layout import Layout, loop_layout, resample
 from coview_stream.sim.scenes import Scene, build_scene
+from coview_stream.sim.vegetation import TreeMix
 
 STEP = 0.004  # metres, to which frames are rounded
 GAP, GAP_RADIUS = (120.0, 220.0), 40.0  # metres of the drive between which a gap's map holds nothing so near
@@ -84,10 +85,14 @@ def _lonely_path(rng: np.random.Generator, size: float, half: float) -> Layout:
 
 
 PATHS = {
-    "dense-forest": _FOREST._replace(streets=_lonely_path, trees=0.16),
+    "dense-forest": _FOREST._replace(
+        streets=_lonely_path, trees=0.15, species=TreeMix((14.0, 24.0), spread=(0.07, 0.12), conifers=0.5)
+    ),
     "long-forest": _FOREST._replace(streets=winding_path, trees=0.06),
+    "closed-forest": _FOREST._replace(streets=_lonely_path, trees=0.16),
 }
-"""Forests for the second paper's tables, with a path of 2.4 m: 940 stems per hectare, and 450 along two kilometres."""
+"""Forests for the second paper's tables, with a path of 2.4 m: about 900 stems per hectare of one age with crowns of
+1 to 2 m, 450 along two kilometres, and 940 of all ages, whose crowns overlap from 2 m above the ground on."""
 
 FORESTS = {"sparse-forest": _FOREST._replace(trees=0.012, undergrowth=0.008), **PATHS}
 """Forests beside the simulator's own, which has 360 stems per hectare; ``sparse-forest`` has 120."""

@@ -13,7 +13,7 @@ from bench.forest.drives import statistics
 from bench.forest.gnss import Receiver, fused
 from bench.forest.variants import Unfused, of_poses
 from bench.tracking.drives import drifting
-from bench.tracking.worlds import PATHS, World, winding_path
+from bench.tracking.worlds import World, winding_path
 from coview_stream.geometry.transforms import exp_so3, pose_from
 from coview_stream.sim.layout import arc_lengths
 
@@ -91,4 +91,3 @@ def test_forests_of_the_tables_are_as_dense_as_stated_and_have_changed_since_the
     assert len(before) / (2 * scene.site.half) ** 2 > 0.08
     kept = {tuple(row) for row in now[:, :2]} & {tuple(row) for row in before[:, :2]}
     assert len(kept) / len(before) == pytest.approx(0.9, abs=0.01)
-    assert set(PATHS) == {"dense-forest", "long-forest"}
