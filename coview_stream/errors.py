@@ -81,7 +81,6 @@ EXTRA_OF = {
     "CSF": "build",
     "matplotlib": "plot",
     "pye57": "e57",
-    "small_gicp": "gicp",
     "kiss_icp": "kiss-icp",
     "cryptography": "sign",
     "rerun": "viz",

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--smooth", action="store_true", help="poses by the whole run, also before the first fix and in interruptions"
     )
     add_initial(parser)
-    add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
+    add_shared(parser, "--reloc", "--risk", "--verify-key")
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     add_shared(parser, "--progress")
 
@@ -42,10 +42,9 @@ def run(args: argparse.Namespace) -> int:
 
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.progress import progress_bar
-    from coview_stream.config import LocalizerConfig, RegistrationConfig
+    from coview_stream.config import LocalizerConfig
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import DESCRIPTORS_PNG, FILTERED, TRAJECTORY_PNG, locate, summary, write
-    from coview_stream.localization.registration.gicp import library
     from coview_stream.localization.result import Fix
     from coview_stream.odometry.lidar_odometry import LidarOdometry
     from coview_stream.recordings.open_run import open_run
@@ -57,8 +56,6 @@ def run(args: argparse.Namespace) -> int:
     guess = initial_guess(args.initial, args.within)
     lidar_options = lidar_config(args.odometry, args.gravity)
     lidar = None if lidar_options is None else LidarOdometry(lidar_options)  # now: its library may be missing
-    if args.registration == "gicp":
-        library()  # likewise
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     draws = not args.no_pictures and _can_draw()
@@ -74,10 +71,7 @@ def run(args: argparse.Namespace) -> int:
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = LocalizerConfig(
-        registration=RegistrationConfig(method=args.registration),
-        acceptance=acceptance,
-        reloc=args.reloc if missing is None else "coview",
-        sensor_leans=lidar is None,
+        acceptance=acceptance, reloc=args.reloc if missing is None else "coview", sensor_leans=lidar is None
     )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown) as bar:
 

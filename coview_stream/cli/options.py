@@ -170,11 +170,6 @@ SHARED: dict[str, dict[str, Any]] = {
     "--progress": {"action": "store_true", "help": "draw progress bars even without a terminal"},
     "--json": {"action": "store_true", "help": "print JSON"},
     "--quiet": {"action": "store_true", "help": "log errors only"},
-    "--registration": {
-        "choices": ("trimmed-icp", "gicp"),
-        "default": "trimmed-icp",
-        "help": "how scans are registered while tracking; gicp is slower, extra gicp (default: trimmed-icp)",
-    },
     "--reloc": {
         "choices": ("auto", "coview", "learned"),
         "default": "auto",

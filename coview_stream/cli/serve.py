@@ -66,7 +66,7 @@ NOT_IN_TABLES = {"sensor_leans": ("localizer", "odometry decides it"), "mount": 
 """Fields that a table may not set, with the reason."""
 
 _DEFAULTS = {
-    "preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "registration": None, "reloc": None,
+    "preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "reloc": None,
     "risk": None,
 }  # fmt: skip
 """Options whose defaults --config may replace; None: the configuration's."""
@@ -74,7 +74,6 @@ _DEFAULTS = {
 _TWICE = {
     "risk": ("localizer", "acceptance", "risk"),
     "reloc": ("localizer", "reloc"),
-    "registration": ("localizer", "registration", "method"),
     "gravity": ("lidar_odometry", "gravity"),
     **{name: ("node", name) for name in _LIMITS},
 }
@@ -82,7 +81,7 @@ _TWICE = {
 
 _RARE = (
     *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
-    *("pose_encoding", "geo", "gravity", "no_deskew", "registration", "reloc", "log_json", "around", "foxglove"),
+    *("pose_encoding", "geo", "gravity", "no_deskew", "reloc", "log_json", "around", "foxglove"),
     *("record", "rerun", *_LIMITS),
 )
 """Options that are left to --help-all."""
@@ -119,7 +118,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
     add_shared(parser, "--mount")
     add_initial(parser, of_robots=True)
-    add_shared(parser, "--registration", "--reloc", "--risk", "--verify-key")
+    add_shared(parser, "--reloc", "--risk", "--verify-key")
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operate.md)")
     operation.add_argument("--node", dest="node_name", metavar="NAME", help="node's name in keys (the first robot's)")
@@ -216,8 +215,6 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
             raise ConfigError(f"{args.config}: [{name}]: {key} cannot be set here: {remedy}")
     localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
     localizer = replace(localizer, reloc=args.reloc or localizer.reloc)
-    if args.registration is not None:
-        localizer = replace(localizer, registration=replace(localizer.registration, method=args.registration))
     if args.risk is not None:
         localizer = replace(localizer, acceptance=replace(localizer.acceptance, risk=acceptance_config(args.risk).risk))
     node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")

@@ -14,7 +14,6 @@ from coview_stream.config.localizer import (
     LearnedConfig,
     LocalizerConfig,
     RegistrationConfig,
-    RegistrationMethod,
     Reloc,
     TrackingConfig,
 )
@@ -34,7 +33,6 @@ __all__ = [
     "Mount",
     "Preset",
     "RegistrationConfig",
-    "RegistrationMethod",
     "Reloc",
     "TrackingConfig",
     "config_of_map",

@@ -43,12 +43,9 @@ class AcceptanceConfig:
         positive(self, "max_tilt", "max_innovation", "max_doubt_s", "max_blind_s")
 
 
-RegistrationMethod = Literal["trimmed-icp", "gicp"]
-
-
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
+    """Trimmed ICP (eq. 13): point-to-plane, coarse to fine.
 
     Points above the ground and points on it are trimmed apart, else the ground, which fits anywhere, pushes out the
     facades that fix the position (once on KITTI 04: 0.25 m median error against 0.05 m).
@@ -57,7 +54,6 @@ class RegistrationConfig:
     often the truth lies within 1, 2 and 3 sigma. A real map's own error comes on top. The rest is set by hand.
 
     Attributes:
-        method: ``trimmed-icp``, or ``gicp`` (extra gicp), for tracking only: the search uses trimmed ICP.
         keep: overlap, the share of the pairs that the last scale keeps, the nearest; the paper keeps 0.6. The scales
             before it keep all: far from the end the nearest pairs are those that hold a wrong pose.
         search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
@@ -73,7 +69,6 @@ class RegistrationConfig:
         gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
     """
 
-    method: RegistrationMethod = "trimmed-icp"
     keep: float = 0.7
     search: tuple[float, ...] = (3.0, 1.5, 0.8, 0.4)
     track: tuple[float, ...] = (0.8, 0.4)
@@ -87,11 +82,9 @@ class RegistrationConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        methods = get_args(RegistrationMethod)
-        require(self.method in methods, self, "method", f"one of {', '.join(methods)}")
         fraction(self, "keep")
         counts(self, "iterations", "source_points")
-        all_positive(self, "method", "search", "track")
+        all_positive(self, "search", "track")
         for name in ("search", "track"):
             scales = getattr(self, name)
             falling = bool(scales) and all(a >= b > 0 for a, b in zip(scales, (*scales[1:], scales[-1]), strict=True))

@@ -1,4 +1,4 @@
-"""``--registration``, ``--risk`` and ``--reloc`` of ``locate`` and ``serve``, and ``build --learned``."""
+"""``--risk`` and ``--reloc`` of ``locate`` and ``serve``, and ``build --learned``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,6 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.node.engine_queue import SearchJob
-
-
-def test_locate_registration_option_names_missing_library(world_file, tmp_path, monkeypatch, refused):
-    monkeypatch.setitem(sys.modules, "small_gicp", None)
-    run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
-    said = refused("locate", world_file, run, "-o", out, "--registration", "gicp")
-    assert "pip install 'coview-stream[gicp]'" in said
 
 
 @pytest.mark.parametrize("given", ["0", "0.5", "-1e-4", "1", "nan", "inf", "1e-400", "0.99e-6", "small", ""])

@@ -23,8 +23,6 @@ def options_of(*argv):
         (["--reloc", "learned"], lambda o: o.localizer.reloc, "learned"),
         ([], lambda o: o.localizer.acceptance.risk, 1e-4),
         (["--risk", "1e-6"], lambda o: o.localizer.acceptance.risk, 1e-6),
-        ([], lambda o: o.localizer.registration.method, "trimmed-icp"),
-        (["--registration", "gicp"], lambda o: o.localizer.registration.method, "gicp"),
         ([], lambda o: o.node.mount, NodeConfig().mount),
         (["--mount=180,10,90,0.3,-0.2,0.5"], lambda o: o.node.mount, parse_mount("180,10,90,0.3,-0.2,0.5")),
         (["--odometry-timeout", "1.5"], lambda o: (o.node.odometry_timeout, o.node.max_gap), (1.5, 1.5)),
@@ -72,7 +70,7 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robt = "a"\n', "unknown key 'robt'; did you mean 'robot'?"),
         ('robot = "a"\npose_rate = "fast"\n', "pose_rate is 'fast'"),
         ('robot = "a"\nquiet = 1\n', "quiet is 1; write true or false"),
-        ('robot = "a"\nregistration = "icp"\n', "registration is 'icp'; choose one of trimmed-icp, gicp"),
+        ('robot = "a"\nreloc = "icp"\n', "reloc is 'icp'; choose one of auto, coview, learned"),
         ('robot = "a"\nlocalizer = 3\n', "localizer is 3; write a table [localizer]"),
         ('robot = "a"\n[node]\npose_rte = 3\n', "[node]: unknown key 'pose_rte'; did you mean 'pose_rate'?"),
         ('robot = "a"\n[localizer.keyframe]\ndistance = -1\n', "distance is -1"),
@@ -118,7 +116,7 @@ def test_help_fits_a_screen_and_help_all_has_the_rest(capsys):
     assert len(short.splitlines()) <= 50
     assert main(["serve", "--help-all"]) == 0
     everything = capsys.readouterr().out
-    for option in ("--cloud-key", "--domain", "--gravity", "--no-deskew", "--registration", "--reloc", "--max-speed"):
+    for option in ("--cloud-key", "--domain", "--gravity", "--no-deskew", "--reloc", "--max-speed"):
         assert option in everything
         assert option not in short
     for option in ("--robot", "--config", "--state", "--metrics"):

@@ -12,7 +12,7 @@ import numpy as np
 import coview_kernels as kernels
 from coview_kernels.cells import Cells
 from coview_stream.basemap.tiles import cut_points
-from coview_stream.config import KeyframeConfig, RegistrationConfig, RegistrationMethod
+from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.descriptors.coview import EYE, LOWEST_EYE
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
@@ -21,7 +21,6 @@ from coview_stream.geometry.transforms import Points, Pose, norms
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.localization.registration.gicp import Surfaces
 
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
@@ -56,14 +55,6 @@ class RegistrationCloud:
         """Return a thinner scan: every ``nth`` point of each kind."""
         order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
         return replace(self, points=self.points[order], above=self.above[order], height=self.height[order])
-
-    @cached_property
-    def surfaces(self) -> list[Surfaces]:
-        """The points above the ground and the points on it for GICP; kinds with too few points are left out."""
-        from coview_stream.localization.registration.gicp import surfaces
-
-        kinds = [surfaces(self.points[rows]) for rows in (self.above, ~self.above)]
-        return [kind for kind in kinds if kind is not None]
 
 
 def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -> RegistrationCloud:
@@ -151,19 +142,10 @@ class LocalMap:
         unit = np.asarray(normals / np.maximum(length, np.float32(1e-6))[:, None], dtype=np.float32)
         return unit, np.minimum(length, np.float32(1.0))
 
-    def prepare(self, method: RegistrationMethod = "trimmed-icp") -> None:
-        """Make the search structures for registration by ``method`` now."""
+    def prepare(self) -> None:
+        """Sort the points now."""
         if "grid" not in vars(self):
             kernels.nearest(self.grid, self.points[:1], 1.0)
-        if method == "gicp":
-            _ = self.surfaces
-
-    @cached_property
-    def surfaces(self) -> Surfaces | None:
-        """The points as GICP takes them; None where they are too few."""
-        from coview_stream.localization.registration.gicp import surfaces
-
-        return surfaces(self.points)
 
 
 class LocalMaps:

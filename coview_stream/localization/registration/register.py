@@ -1,4 +1,4 @@
-"""Registration of a scan to the map, coarse to fine: trimmed point-to-plane ICP (eq. 13), or GICP; its covariance.
+"""Registration of a scan to the map, coarse to fine: trimmed point-to-plane ICP (eq. 13); its covariance.
 
 Covariances and informations are (6, 6) over (rx, ry, rz, x, y, z), radians and metres: a turn about the body, then a
 shift, along the map's axes.
@@ -52,26 +52,22 @@ def register(
     centre: Floats | None = None,
     iterations: int | None = None,
 ) -> Registration | None:
-    """Register a scan from an initial pose, by ``config.method``; None where fewer than 50 points find a partner.
+    """Register a scan from an initial pose; None where fewer than 50 points find a partner.
 
     Args:
         source: the local scan.
         T_map_source: (4, 4) initial guess.
         target: the map around it.
-        config: method, overlap, residual scale, iterations.
+        config: overlap, iterations, inflation.
         scales: largest correspondence distance of each scale, metres.
         prior: fused with the pairs; about ``centre``, before inflation.
         centre: (3,) source-frame point that rotations are about (the body's position); default the mean.
         iterations: limit per scale; default the configuration's.
-
-    Raises:
-        DependencyError: the method is GICP and small_gicp is missing.
     """
     pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
     if prior is not None:  # the pairs claim too much by inflation^2, so the prior has to
         prior = Prior(prior.T_map_source, prior.information * config.inflation**2)
-    gicp = config.method == "gicp"
-    stride = 1 if gicp else max(1, len(source.points) // _COARSE_POINTS)
+    stride = max(1, len(source.points) // _COARSE_POINTS)
     last = len(scales) - 1
     steps = [
         kernels.Scale(
@@ -84,19 +80,9 @@ def register(
         )
         for k, scale in enumerate(scales)
     ]
-    limit = iterations or config.iterations
-    if gicp:
-        from coview_stream.localization.registration.gicp import register_surfaces
-
-        if target.surfaces is None:
-            return None
-        return register_surfaces(
-            source.surfaces, T_map_source, target.surfaces, target.grid, target.normals, pivot, steps,
-            iterations=limit, prior=prior,
-        )  # fmt: skip
     return kernels.align_planes(
         target.grid, target.normals, source.points, source.above, T_map_source, pivot, steps,
-        iterations=limit, min_pairs=MIN_PAIRS, prior=prior,
+        iterations=iterations or config.iterations, min_pairs=MIN_PAIRS, prior=prior,
     )  # fmt: skip
 
 

@@ -44,8 +44,7 @@ class GlobalSearch:
     ) -> None:
         """Search a map; searches of one map may share ``index``. Raises as :meth:`SearchIndex.of`."""
         self.base_map = base_map
-        # GICP would have to prepare the map at each of many places, and tracking starts with it anyway
-        self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
+        self.config = config
         self._index = index = index or SearchIndex.of(base_map, config)
         self.coview: CoViewRecognizer | None = None
         self.learned: PlaceRecognizer | None = None

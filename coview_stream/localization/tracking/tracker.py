@@ -87,7 +87,7 @@ class Tracker:
     def prefetch_map(self, T_odom_body: Pose) -> None:
         """Crop the map on a frame without a registration, as a new crop takes as long as one."""
         if (target := self._target(T_odom_body)) is not None:
-            target.prepare(self.config.registration.method)
+            target.prepare()
 
     def needs_registration(self, patience: float = 1.0) -> bool:
         """Whether the robot has driven or turned ``patience`` times as far as a registration needs."""

@@ -18,7 +18,6 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
@@ -201,14 +200,11 @@ def open_engine(
     unless it is the very file, untouched.
 
     Raises:
-        MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no
-            small_gicp where ``config`` wants it, or no ``cryptography``. InputError, DependencyError: it wants learned
-            features, which cannot be used.
+        MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or
+            no ``cryptography``. InputError, DependencyError: ``config`` wants learned features, which cannot be used.
     """
     if kind == "odometry":
         return OdometryEngine()
-    if config is not None and config.registration.method == "gicp":
-        gicp.library()
     base_map = BaseMap.load(map_path, check=False, verify_key=trust)
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node (serve) again")
