@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.accuracy.paper import TableVote
+from bench.accuracy.choices import TableVote
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.errors import MapError

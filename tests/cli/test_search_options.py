@@ -42,9 +42,9 @@ def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path
     """Whose result is none where nothing is that certain."""
     usual, asked = offline.locate, []
 
-    def never_sure(base_map, run, config, progress, guess):
+    def never_sure(base_map, run, config, *rest):
         asked.append(config.acceptance.risk)
-        return usual(base_map, run, replace(config, acceptance=NEVER), progress, guess)
+        return usual(base_map, run, replace(config, acceptance=NEVER), *rest)
 
     monkeypatch.setattr(offline, "locate", never_sure)
     out = tmp_path / "out"

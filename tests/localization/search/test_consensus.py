@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.accuracy.paper import TableVote
+from bench.accuracy.choices import TableVote
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.rasters import argsmallest

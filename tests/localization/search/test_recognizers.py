@@ -8,7 +8,7 @@ import small_world
 from made_up_places import name_instead
 from trackers import follow
 
-from bench.accuracy.paper import TableVote
+from bench.accuracy.choices import TableVote
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.transforms import inverse, pose_from, transform, yaw_of

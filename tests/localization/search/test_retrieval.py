@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from trackers import follow
 
-from bench.accuracy.paper import TableVote
+from bench.accuracy.choices import TableVote
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import DescriptorConfig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from bench.accuracy.paper import TableVote
+from bench.accuracy.choices import TableVote
 from coview_stream.basemap.stations import StationGrid
 from coview_stream.config import ConsensusConfig, LearnedConfig, LocalizerConfig
 from coview_stream.descriptors.feature_map import (
