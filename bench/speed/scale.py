@@ -8,6 +8,7 @@ search.
 
 from __future__ import annotations
 
+import math
 import pickle
 import tempfile
 import time
@@ -22,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from bench.accuracy.ablation import Seen, keyframes_of, right
+from bench.accuracy.choices import Seen, Site, right
 from bench.harness.files import folder, isolated, peak_megabytes
 from bench.harness.rows import Row, bounded, informs
 from bench.harness.worlds import WORLDS, opened, prepare, world_name
@@ -30,8 +31,8 @@ from bench.speed.search import bind_to_one_core
 from coview_stream import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import Channel, ConsensusConfig
-from coview_stream.descriptors.coview import describe
+from coview_stream.config import Channel, ConsensusConfig, KeyframeConfig
+from coview_stream.descriptors.coview import describe, on_ground
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
@@ -120,9 +121,10 @@ def voted(out: Path, radius: float | None = None, apart: int = 1) -> dict[str, A
 def described(world: Path, site: BaseMap) -> list[Keyframe]:
     """Return the keyframes of a world's drive, without their scans."""
     config, out = site.descriptor_config, list[Keyframe]()
-    for seen in keyframes_of(world, site.origin, config):
-        centre = np.array([*seen.position[:2], seen.ground])
-        out.append((replace(seen, scan=seen.scan[:0]), centre, describe(seen.scan, centre, config)))
+    for seen in Site(world, math.inf).keyframes(KeyframeConfig().distance):
+        scan = seen.scans[None]
+        centre = on_ground(scan, seen.position)
+        out.append((replace(seen, scans={}, submap=seen.submap[:0]), centre, describe(scan, centre, config)))
     return out
 
 
