@@ -325,11 +325,16 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
         InputError: a picture cannot be written.
     """
     no_position = np.full(3, np.nan)
-    positions = np.array([no_position if f.T_map_body is None else f.T_map_body[:3, 3] for f in result.fixes])
+    smoothed = {pose.stamp: pose for pose in result.smoothed or ()}
+    poses = [fix if result.smoothed is None else smoothed.get(fix.stamp) for fix in result.fixes]
+    positions = np.array([no_position if p is None or p.T_map_body is None else p.T_map_body[:3, 3] for p in poses])
     release_arrays(base_map.arrays)  # memory of the search, before pictures take as much
     points = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
     release_arrays(base_map.arrays)
-    states = [fix.state.reported for fix in result.fixes]
+    states = [
+        str(smoothed[fix.stamp].kind) if fix.T_map_body is None and fix.stamp in smoothed else fix.state.reported
+        for fix in result.fixes
+    ]
     plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth)
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:

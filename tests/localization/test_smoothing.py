@@ -115,16 +115,31 @@ def test_a_blind_stretch_is_bridged_and_its_protection_level_grows(world_map, wa
 
 
 @pytest.mark.slow
-def test_a_robot_that_was_carried_is_not_smoothed_across(world_map, way):
-    """It is put down eight metres on; by its odometry it stood still."""
-    rows = [*range(14), *range(34, len(way.clouds))]
+@pytest.mark.parametrize(("first", "blind"), [(14, range(0)), (15, range(15, 17))])
+def test_a_robot_that_was_carried_is_not_smoothed_across(world_map, way, first, blind):
+    """It is put down eight metres on; by its odometry it stood still. Blind meanwhile, its live pose is wrong."""
+    rows = [*range(first), *range(34, len(way.clouds))]
     odometry = [way.T_odom_body[k] for k in rows]
-    back = odometry[13] @ np.linalg.inv(odometry[14])
-    odometry = [T if k < 14 else back @ T for k, T in enumerate(odometry)]
-    located = locate(world_map, run_of([way.clouds[k] for k in rows], odometry), smooth=True)
+    back = odometry[first - 1] @ np.linalg.inv(odometry[first])
+    odometry = [T if k < first else back @ T for k, T in enumerate(odometry)]
+    clouds = [BLIND if at in blind else way.clouds[k] for at, k in enumerate(rows)]
+    located = locate(world_map, run_of(clouds, odometry), smooth=True)
+    truth = [way.T_map_body[k] for k in rows]
+    wrong = [k for k, fix in by_frame(located.posed).items() if pose_error(fix.T_map_body, truth[k])[0] > 0.5]
+    assert bool(wrong) == bool(blind)
     assert len(located.smoothed) >= 14
     assert PoseKind.BRIDGED not in {pose.kind for pose in located.smoothed}
-    assert_right(located.smoothed, [way.T_map_body[k] for k in rows])
+    assert_right(located.smoothed, truth)
+
+
+@pytest.mark.slow
+def test_a_slip_moves_no_pose_on_either_side(world_map, way):
+    slip = pose_from(rot_z(0.08), [0.3, 0.9, 0.0])
+    start = way.T_odom_body[20]
+    odometry = [T if k < 20 else start @ slip @ np.linalg.inv(start) @ T for k, T in enumerate(way.T_odom_body)]
+    located = locate(world_map, run_of(way.clouds, odometry), smooth=True)
+    assert len(located.smoothed) >= len(located.posed) >= 40
+    assert_right(located.smoothed, way.T_map_body, 0.03)
 
 
 @pytest.mark.slow
