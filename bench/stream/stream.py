@@ -97,15 +97,15 @@ LIDARS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def _drive_of(home: SimulationConfig, k: int, frames: int) -> tuple[int, str]:
-    """Return the seed of a drive of the k-th robot, and where it leads: in a depot into the hall, or out of it."""
+    """Return the seed of a drive of the k-th robot, and where it leads: into a depot's hall, or out of it (the second)."""
     scene = scene_of(home)
     if (hall := scene.passage) is None:
         return k + 1, "outdoors"
     for seed in range(k + 1, 1000):
         truth = trajectories(scene, replace(home, drive_seed=seed))[1][APART * k : APART * k + frames]
         inside = hall.holds(truth[:, :2, 3])
-        if len(inside) == frames and inside[0] == k % 2 and 0.25 < inside.mean() < 0.75:
-            return seed, "out of the hall" if k % 2 else "into the hall"
+        if len(inside) == frames and inside[0] == (k == 1) and 0.25 < inside.mean() < 0.5:
+            return seed, "out of the hall" if inside[0] else "into the hall"
     raise InputError(f"{home}: no drive leads through the gate of the hall")
 
 

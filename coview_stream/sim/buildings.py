@@ -143,11 +143,15 @@ def passage(rng: np.random.Generator, w: float, d: float) -> Mesh:
               for x in np.arange(-0.4 * w, 0.41 * w, 8.0).tolist() for s in (-1, 1)]  # fmt: skip
     side = float(rng.choice([-1.0, 1.0]))
     parts.append(placed(box(9.0, 4.0, 3.0 + _FOOTING), rng.uniform(-0.3, 0.3) * w, side * (d / 2 - 2.3), -_FOOTING))
-    for x in np.arange(-0.44 * w, 0.42 * w, 4.0).tolist():
-        if rng.random() < 0.6:
-            tall, deep = rng.uniform(0.8, 4.5), rng.uniform(0.8, 2.4)
-            rack = box(rng.uniform(1.0, 3.5), deep, tall + _FOOTING)
-            parts.append(placed(rack, x, -side * (d / 2 - wall - deep / 2 - rng.uniform(0.0, 1.0)), -_FOOTING))
+    for away in (-side, side):
+        for x in np.arange(-0.44 * w, 0.45 * w, 3.5).tolist():
+            if rng.random() < 0.75:
+                tall, deep = rng.uniform(0.8, 4.5), rng.uniform(0.8, 2.4)
+                from_wall = rng.uniform(0.0, 1.5) + (4.0 if away == side else 0.0)  # the office is 4 m deep
+                rack = box(rng.uniform(1.0, 3.2), deep, tall + _FOOTING)
+                parts.append(
+                    placed(rack, x + rng.uniform(-0.5, 0.5), away * (d / 2 - wall - deep / 2 - from_wall), -_FOOTING)
+                )
     return join(parts)
 
 
