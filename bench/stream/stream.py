@@ -97,7 +97,7 @@ LIDARS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def _drive_of(home: SimulationConfig, k: int, frames: int) -> tuple[int, str]:
-    """Return the seed of a drive of the k-th robot, and where it leads: into a depot's hall, or out of it (the second)."""
+    """Return the seed of a drive of the k-th robot, and where it leads: in a depot into the hall, the second out."""
     scene = scene_of(home)
     if (hall := scene.passage) is None:
         return k + 1, "outdoors"
