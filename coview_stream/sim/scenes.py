@@ -144,8 +144,9 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
 
 
 def _passage(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[Footprint, Mesh]:
-    """Put a hall over the straightest part of the route."""
+    """Put a hall over the straightest part of the route; on a small site it is shorter."""
     route, (w, d) = site.layout.route, spec.passage
+    w = min(w, 0.44 * (site.half - _MARGIN))
     heading, step = np.unwrap(directions(route)), float(np.linalg.norm(route[1] - route[0]))
     half = int(0.7 * w / step)
     bends = [float(np.ptp(heading[k - half : k + half])) for k in range(half, len(route) - half)]
