@@ -29,6 +29,7 @@ PAGE = ROOT / "docs" / "results.md"
 ABLATION = ("channels", "bins", "scan", "vote", "registration", "localizer")
 COMMANDS = {
     **{name: name for name in BENCHMARKS if name not in ("odometry", "ground", "ablation")},
+    "throughput": "engine --throughput",
     "city": "city --side 2 4",
     **{f"ablation, {group}": f"ablation --only {group}" for group in ABLATION},
     "ablation, spacing": "ablation --only spacing --picture docs/images/spacing.png",

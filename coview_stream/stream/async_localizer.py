@@ -118,8 +118,10 @@ class AsyncLocalizer:
         """
         self._check_usable()
         self._mailbox.add_frame(cloud, T_odom_body, stamp)
-        self._feed.wake_for(self._mailbox)
-        return self.fix()
+        try:
+            return self.fix()
+        finally:
+            self._feed.wake_for(self._mailbox)  # at last: a thread that works now would delay this one
 
     def fix(self) -> Fix:
         """Return the fix of the newest frame, by all results that have come; RuntimeError before the first frame.
@@ -149,6 +151,11 @@ class AsyncLocalizer:
     def state(self) -> State:
         """State of the newest fix."""
         return self._mailbox.state
+
+    @property
+    def searching(self) -> bool:
+        """Whether a search of the map waits or is under way."""
+        return self._mailbox.queue.searching
 
     @property
     def calibration(self) -> Calibration:

@@ -253,6 +253,11 @@ class EngineQueue:
         return self._search_result is not None and self._frame_under_way is None
 
     @property
+    def searching(self) -> bool:
+        """Whether a search waits or is under way."""
+        return self._request is not None or self._searching_since is not None
+
+    @property
     def idle(self) -> bool:
         """Whether nothing waits and nothing is under way."""
         waiting = (self._frame, self._frame_under_way, self._search_result, self._request, self._searching_since)
