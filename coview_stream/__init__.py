@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.summary import MapSummary
     from coview_stream.clouds.files import read_cloud
-    from coview_stream.config import LocalizerConfig, MapConfig
+    from coview_stream.config import AcceptanceConfig, LocalizerConfig, MapConfig
     from coview_stream.errors import (
         CloudError,
         ConfigError,
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from coview_stream.stream.maps.fetch_map import fetch_map
 
 __all__ = [
+    "AcceptanceConfig",
     "AsyncLocalizer",
     "BaseMap",
     "CloudError",
@@ -84,7 +85,7 @@ _NAMES = {
     "basemap.basemap": ("BaseMap",),
     "basemap.summary": ("MapSummary",),
     "clouds.files": ("read_cloud",),
-    "config": ("LocalizerConfig", "MapConfig"),
+    "config": ("AcceptanceConfig", "LocalizerConfig", "MapConfig"),
     "errors": tuple(name for name in __all__ if name.endswith(("Error", "Warning"))),
     "geometry.protection": ("ProtectionLevel",),
     "localization.localizer": ("Localizer",),

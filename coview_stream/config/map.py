@@ -95,6 +95,8 @@ def map_preset(name: Preset, **changes: Any) -> MapConfig:
     ``changes`` are fields of :class:`MapConfig` or :class:`DescriptorConfig` that replace the preset's. Raises
     :class:`ConfigError` for an unknown preset or field, or a value out of range.
     """
+    if isinstance(name, MapConfig):
+        raise ConfigError("preset is a MapConfig; give it as config=")
     if name not in get_args(Preset):
         raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(get_args(Preset))}")
     descriptor: dict[str, Any] = {"radius": 100.0 if name == "tls" else 50.0}

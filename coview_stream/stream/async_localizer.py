@@ -50,11 +50,12 @@ log = logging.getLogger("coview_stream")
 
 
 class AsyncLocalizer:
-    """A :class:`~coview_stream.localization.localizer.Localizer` whose calls wait for no search and no registration.
+    """A localizer whose calls never wait: search and registration run in child processes.
 
-    Two child processes do the work, one of them the searches; both map the map's file into memory, and both are new
-    interpreters: the script needs no ``__main__`` guard. :meth:`step` hands over a frame and returns the newest pose
-    that is known, carried on to that frame by odometry. Close it, or use it in a ``with`` block.
+    Two of them do the work of a :class:`~coview_stream.localization.localizer.Localizer`, one the searches, one the
+    rest. Both map the map's file into memory, and both are new interpreters: the script needs no ``__main__`` guard.
+    :meth:`step` hands over a frame and returns the newest pose that is known, carried on to that frame by odometry.
+    Close it, or use it in a ``with`` block.
 
     Attributes:
         base_map: the map.
@@ -89,7 +90,7 @@ class AsyncLocalizer:
         self._pid = os.getpid()
         self._end = weakref.finalize(self, _end, self._feed, self._pid)
 
-    def prepare(self, timeout: float | None = 120.0) -> None:
+    def prepare(self, timeout: float | None = None) -> None:
         """Wait until the processes have opened the map and compiled their kernels; the first time takes a minute.
 
         Raises:
