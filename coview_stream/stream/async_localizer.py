@@ -385,7 +385,7 @@ class Mailbox:
 
     def _fail(self, error: str, searches: bool) -> None:
         """Note an error; if the place is forgotten, begin another epoch with the last place as a hint."""
-        self._error = error
+        self._error = self._error or error  # the first one of a chain
         if not searches:
             return
         had_place = self._lost is not None or self.state.has_place

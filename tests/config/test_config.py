@@ -127,6 +127,8 @@ def test_map_presets():
     assert map_preset("slam") == MapConfig()
     assert map_preset("tls").descriptor.radius == 100.0
     assert map_preset("tls", radius=80.0).descriptor.radius == 80.0
+    with pytest.raises(ConfigError, match="give it as config="):
+        map_preset(MapConfig())
 
 
 def test_preset_options_reach_the_right_configuration():

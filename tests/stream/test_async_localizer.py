@@ -114,9 +114,14 @@ def test_failure_is_raised_once_and_the_last_place_is_a_hint(worked, world_fixes
 def test_failed_search_leaves_the_frames_alone(worked):
     worked.step(0, work=False)
     worked.do("track")
-    worked.mailbox.handle_failure(worked.mailbox.take_job("search"), "no memory")
-    with pytest.raises(CoViewError, match="a search failed: no memory"):
+    assert worked.mailbox.queue.searching
+    job = worked.mailbox.take_job("search")
+    worked.mailbox.engine_restarted("search", "the search engine died")
+    worked.mailbox.handle_failure(job, "the search engine died")
+    assert not worked.mailbox.queue.searching
+    with pytest.raises(CoViewError, match="the search engine died; it is started again"):
         worked.mailbox.raise_error()
+    worked.mailbox.raise_error()
     assert [worked.step(k) for k in (1, 2)][-1].state is State.TRACKING
 
 
