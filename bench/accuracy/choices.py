@@ -149,15 +149,15 @@ class Site:
             out.append(Seen({**thin, None: whole}, position, T_map_body @ inverse(T_odom_body), submap))
         return out
 
-    def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32]]:
-        """Zero (3,) of each keyframe, and its distances (M, S) by a choice of one channel."""
+    def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32, float]]:
+        """Zero (3,) of each keyframe, its distances (M, S) by a choice of one channel, and their processor seconds."""
         descriptor = choice.descriptor
         # the zero is the keyframe's affair: it does not change the stations
         stations = self.described(choice.spacing, replace(descriptor, ground_zero=True), choice.strict)
         keys = None if choice.nearest is None else paper.ring_key(np.float32(stations))
         out = []
         for seen in self.keyframes(choice.spacing):
-            scan, z = seen.scans[choice.gathered], float(seen.position[2])
+            begin, scan, z = time.process_time(), seen.scans[choice.gathered], float(seen.position[2])
             centre = np.array([*seen.position[:2], ground_below(scan, seen.position) if descriptor.ground_zero else z])
             with _co_visibility(choice.strict):
                 query = describe(scan, centre, descriptor)[descriptor.channels[0]]
@@ -168,16 +168,18 @@ class Site:
                 chosen = np.argsort(gap, kind="stable")[: choice.nearest]
                 volume = np.ones((len(stations), descriptor.sectors), dtype=np.float32)
                 volume[chosen] = exact_distances(stations[chosen], query)
-            out.append((centre, over_common(volume, np.float32(stations), query) if choice.common else volume))
+            if choice.common:
+                volume = over_common(volume, np.float32(stations), query)
+            out.append((centre, volume, time.process_time() - begin))
         return out
 
     def search(self, choice: Choice) -> dict[str, float]:
         """Count how often a choice names the right place along the run, with the seconds of all distances."""
-        begin, channels = time.process_time(), choice.descriptor.channels
+        channels = choice.descriptor.channels
         alone = {name: replace(choice, window=1, single=False) for name in channels}
         singles = [replace(c, descriptor=replace(c.descriptor, channels=(name,))) for name, c in alone.items()]
         by_channel = [self.volumes(one) for one in singles]
-        seconds = time.process_time() - begin
+        seconds = sum(took for volumes in by_channel for *_, took in volumes)
         grid = StationGrid(self.stations(choice.spacing), choice.spacing)
         one, together = (Consensus(grid, replace(ConsensusConfig(), window=n)) for n in (1, choice.window))
         smallest: deque[Hypothesis] = deque(maxlen=choice.window)
