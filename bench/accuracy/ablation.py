@@ -2,8 +2,8 @@
 
 Every variant changes one choice. Choices of the search are judged at single keyframes, those of registration from known
 starts, the others by the whole localizer. Sites: an airborne-like map of 6 pulses per square metre, streets of equal
-houses, a sparse sensor, a dirty world, a forest, and two real runs (``--data``). The first row of a group is the
-default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features, descriptors and both are
+houses, a sparse sensor, a dirty world, forests, one changed since the survey, and real runs (``--data``). The first row
+of a group is the default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features, descriptors and both are
 rows of ``python -m bench forest``; odometry alone, map alone and no graph are rows of ``python -m bench tracking``.
 Results stay in ``--work``.
 """
@@ -50,10 +50,12 @@ WORLDS: dict[str, dict[str, Any]] = {
     "sparse": {"scene": "campus", "sensor": "mid360", "seed": 2103, "density": 10.0},
     "dirty": {"scene": "industrial", "sensor": "os64", "seed": 2104, "dirt": "mounting,odometry,traffic,seasons,years"},
     "forest": {"scene": "forest", "sensor": "os64", "seed": 2105},
+    "changed": {"scene": "industrial", "sensor": "vlp16", "seed": 2107, "size": 224.0, "changed": 0.4},
+    "stand": {"scene": "forest", "sensor": "vlp16", "seed": 2108, "size": 224.0},
 }
 """Simulated sites; seeds held out, as those of ``python -m bench accuracy``."""
 
-REAL, _REAL_METRES, _AROUND = ("riverside_a", "kitti04"), 72.0, 110.0
+REAL, _REAL_METRES, _AROUND = ("riverside_a", "kitti04", "handheld_livox"), 72.0, 110.0
 """Real runs; metres of them that are used, and metres around these that the map holds."""
 
 
@@ -64,15 +66,19 @@ def _with(**changes: Any) -> DescriptorConfig:
 SPACINGS = (2.0, 1.0, 3.0, 4.0, 6.0, 8.0)
 
 CHANNELS: tuple[tuple[Channel, ...], ...] = (
-    ("scan_context",), ("coview",), ("paper",), ("scan_context", "coview"), ("scan_context", "paper"),
+    ("scan_context", "coview"), ("scan_context",), ("coview",), ("paper",), ("scan_context", "paper"),
     ("coview", "paper"), ("scan_context", "coview", "paper"),
 )  # fmt: skip
 """Channels and their sums."""
 
+
+def _channels(names: Sequence[Channel]) -> str:
+    return f"{'default: ' if names == _DEFAULT.channels else ''}{' + '.join(names)}"
+
+
 SEARCH: dict[str, dict[str, Choice]] = {
     "channels": {
-        f"default: {' + '.join(_DEFAULT.channels)}": Choice(),
-        **{" + ".join(names): Choice(_with(channels=names)) for names in CHANNELS if names != _DEFAULT.channels},
+        **{_channels(names): Choice(_with(channels=names)) for names in CHANNELS},
         "coview, eq. 2 alone": Choice(_with(channels=("coview",)), strict=True),
         "zero at the sensor": Choice(_with(ground_zero=False)),
     },
@@ -131,8 +137,9 @@ LOCALIZER = {
 
 GROUPS = (*SEARCH, "registration", "localizer")
 SITES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(GROUPS, (*WORLDS, *REAL)),
+    **dict.fromkeys(GROUPS, ("airborne-like", "repetitive", "sparse", "dirty", "forest", "riverside_a", "kitti04")),
     **dict.fromkeys(SEARCH, ("airborne-like", "repetitive", "sparse", "forest", "riverside_a")),
+    "channels": ("airborne-like", "repetitive", "sparse", "forest", "changed", "stand", *REAL),
     "spacing": ("airborne-like", "sparse", "forest", "riverside_a", "kitti04"),
 }
 """Sites of each group, so that all groups together take less than 40 minutes of one core."""
@@ -200,11 +207,14 @@ def measure(place: Path, length: float, group: str) -> dict[str, Any]:
         for name, choice in SEARCH[group].items():
             stations = site.stations(choice.spacing)
             out[name]["paper"] = paper.located(site.map, site.run, site.truth[1], choice.spacing, stations)
+    if group == "channels":
+        for channels in CHANNELS:
+            out[_channels(channels)]["located"] = site.located(Localizing(channels=channels))
     return out | {"cpu": time.process_time() - begin}
 
 
 def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Row of a choice of the search over all sites: shares of keyframes; of each site the best places' share."""
+    """Row of a choice of the search over all sites: shares of keyframes; of each site that of the best place."""
 
     def share(key: str, of: str, some: Sequence[Mapping[str, Any]]) -> float:
         return sum(each[key] for each in some) / max(1.0, sum(each[of] for each in some))
@@ -215,8 +225,12 @@ def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) 
         "top10": share("top10", "keyframes", every), "coarse": share("coarse", "windows", every),
         "keyframes": sum(each["keyframes"] for each in every),
         "ms": 1e3 * share("seconds", "keyframes", every),
-        **{site: share("coarse", "windows", [each]) for site, each in by_site.items()},
+        **{site: share("top1", "keyframes", [each]) for site, each in by_site.items()},
     }  # fmt: skip
+    if located := [each["located"] for each in every if "located" in each]:
+        first = [np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in located]
+        wrong = f"{sum(each['false_frames'] for each in located)} of {sum(each['posed'] for each in located)}"
+        details |= {"first": float(np.mean(first)), "worst": float(max(first)), "false": wrong}
     if group == "spacing":
         answers = [each["paper"] for each in every]
         for way in paper.WAYS:
@@ -294,6 +308,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 _SHARES = (("variant", "variant", None), ("top-1", "top1", 2), ("top-10", "top10", 2), ("five keyframes", "coarse", 2))
 COLUMNS = {
+    "channels": (
+        *_SHARES, ("mean first fix m", "first", 1), ("latest", "worst", 1), ("false frames", "false", None),
+    ),
     "spacing": (*_SHARES, *((way, way, 2) for way in paper.WAYS), ("stations", "stations", 0), ("ms", "ms", 0)),
     "registration": (
         ("variant", "variant", None), *((f"right from {off:g} m", f"{off:g}", None) for off in OFF),

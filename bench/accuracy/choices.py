@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,14 @@ from coview_stream import BaseMap
 from coview_stream.basemap.stations import StationGrid, describe_storeys, find_stations
 from coview_stream.clouds import read_tum
 from coview_stream.clouds.filters import remove_outliers
-from coview_stream.config import ConsensusConfig, DescriptorConfig, KeyframeConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config import (
+    Channel,
+    ConsensusConfig,
+    DescriptorConfig,
+    KeyframeConfig,
+    LocalizerConfig,
+    RegistrationConfig,
+)
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.descriptors import coview
 from coview_stream.descriptors.coview import describe, ground_below
@@ -67,6 +74,7 @@ NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a
 WINDOW, BEST = 5, 10  # keyframes that vote together, best places of one
 OFF, TURNED = (0.5, 1.0), float(np.radians(3.0))  # how far registrations start from the truth, metres and radians
 
+_DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
 _SAMPLE = 100_000  # distances that a median is taken of
 _GATHERED = (1, 2, WINDOW, None)  # newest keyframes whose points make a VLS; None: all
 
@@ -237,11 +245,23 @@ class Site:
             out.append({"off": off, "metres": metres, "degrees": degrees, "ms": ms})
         return out
 
+    def _map(self, channels: Sequence[Channel]) -> BaseMap:
+        """Return the map as if it had been built with other channels."""
+        descriptor = replace(self.map.descriptor_config, channels=tuple(channels))
+        if descriptor == self.map.descriptor_config:
+            return self.map
+        singles = {name: replace(descriptor, channels=(name,)) for name in channels}
+        arrays = {name: a for name, a in self.map.arrays.items() if not name.startswith(_DESCRIBED)}
+        arrays |= {f"descriptor.{n}": self.described(self.map.config.block, d, False) for n, d in singles.items()}
+        config = self.map.parameters["config"] | {"descriptor": asdict(descriptor)}
+        return BaseMap(arrays, self.map.parameters | {"config": config})
+
     def located(self, choice: Localizing) -> dict[str, Any]:
         """Localize the run; figures of ``evaluate``."""
         run = Filtered(**vars(self.run)) if choice.filtered else self.run
+        base_map = self._map(choice.channels or self.map.descriptor_config.channels)
         with choice.changed():
-            found = locate(self.map, run, choice.config)
+            found = locate(base_map, run, choice.config)
         poses = np.array([fix.T_map_body for fix in found.posed]).reshape(-1, 4, 4)
         estimate = np.array([fix.stamp for fix in found.posed]), poses
         errors = evaluate(estimate, self.truth)
@@ -299,11 +319,13 @@ class Localizing:
         config: of the localizer.
         changed: makes the change in the code, until it ends.
         filtered: frames without statistical outliers.
+        channels: of the map's descriptors; none: its own.
     """
 
     config: LocalizerConfig = field(default_factory=LocalizerConfig)
     changed: Callable[[], AbstractContextManager[Any]] = nullcontext
     filtered: bool = False
+    channels: tuple[Channel, ...] = ()
 
 
 class Filtered(Run):
