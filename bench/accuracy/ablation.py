@@ -3,9 +3,9 @@
 Every variant changes one choice. Choices of the search are judged at single keyframes, those of registration from known
 starts, the others by the whole localizer. Sites: an airborne-like map of 6 pulses per square metre, streets of equal
 houses, a sparse sensor, a dirty world, forests, one changed since the survey, and real runs (``--data``). The first row
-of a group is the default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features, descriptors and both are
-rows of ``python -m bench forest``; odometry alone, map alone and no graph are rows of ``python -m bench tracking``.
-Results stay in ``--work``.
+of a group is the default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features,
+descriptors and both are rows of ``python -m bench forest``; odometry alone, map alone and no graph are rows of
+``python -m bench forest_drives``. Results stay in ``--work``.
 """
 
 from __future__ import annotations
