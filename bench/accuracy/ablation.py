@@ -15,7 +15,7 @@ import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -43,7 +43,8 @@ _ROWS = KINDS["town"]._replace(
 
 _CONVERGED = 0.3  # metres; a registration within this has found the place
 
-_WORLD: dict[str, Any] = {"size": 180.0, "length": 24.0, "speed": 3.0, "changed": 0.2}
+_LENGTH = 24.0  # metres driven in a simulated site
+_WORLD: dict[str, Any] = {"size": 180.0, "length": _LENGTH, "speed": 3.0, "changed": 0.2}
 WORLDS: dict[str, dict[str, Any]] = {
     "airborne-like": {"scene": "town", "sensor": "vlp16", "seed": 2101, "density": 6.0},
     "repetitive": {"scene": "rows", "sensor": "vlp16", "seed": 2102},
@@ -191,26 +192,37 @@ def _real(below: Path, source: Path) -> Path:
 
 def metres(name: str) -> float:
     """Metres of a site's run that are used."""
-    return _REAL_METRES if name in REAL else float(_WORLD["length"])
+    return _REAL_METRES if name in REAL else _LENGTH
 
 
-def measure(place: Path, length: float, group: str) -> dict[str, Any]:
-    """Measure a group's variants on one site; by variant, with ``cpu`` seconds of them all."""
-    begin, site, out = time.process_time(), Site(place, length), {}
-    if group == "registration":
-        out = {name: {"errors": site.registrations(choice)} for name, choice in REGISTRATION.items()}
-    elif group == "localizer":
-        out = {name: site.located(choice) for name, choice in LOCALIZER.items()}
-    else:
-        out = {name: site.search(choice) for name, choice in SEARCH[group].items()}
-    if group == "spacing":
-        for name, choice in SEARCH[group].items():
-            stations = site.stations(choice.spacing)
-            out[name]["paper"] = paper.located(site.map, site.run, site.truth[1], choice.spacing, stations)
-    if group == "channels":
-        for channels in CHANNELS:
-            out[_channels(channels)]["located"] = site.located(Localizing(channels=channels))
-    return out | {"cpu": time.process_time() - begin}
+def measure(name: str, place: Path, groups: Sequence[str], code: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Measure groups on one site unless they are there; by group and variant, with ``cpu`` seconds of each group."""
+    site = cache(lambda: Site(place, metres(name)))
+
+    def make(group: str) -> dict[str, Any]:
+        begin, out = time.process_time(), {}
+        if group == "registration":
+            out = {variant: {"errors": site().registrations(choice)} for variant, choice in REGISTRATION.items()}
+        elif group == "localizer":
+            out = {variant: site().located(choice) for variant, choice in LOCALIZER.items()}
+        else:
+            out = {variant: site().search(choice) for variant, choice in SEARCH[group].items()}
+        if group == "spacing":
+            for variant, choice in SEARCH[group].items():
+                stations, truth = site().stations(choice.spacing), site().truth[1]
+                out[variant]["paper"] = paper.located(site().map, site().run, truth, choice.spacing, stations)
+        if group == "channels":
+            for channels in CHANNELS:
+                out[_channels(channels)]["located"] = site().located(Localizing(channels=channels))
+        return out | {"cpu": time.process_time() - begin}
+
+    return {
+        group: remembered(
+            folder() / "results" / f"ablation-{group}-{name}.json",
+            {"site": name, "group": group, **code}, partial(make, group),
+        )
+        for group in groups
+    }  # fmt: skip
 
 
 def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
@@ -285,13 +297,14 @@ def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per variant."""
     chosen = {group: tuple(asked.sites or SITES[group])[: 1 if asked.quick else None] for group in asked.only}
     places = sites(list(dict.fromkeys(name for names in chosen.values() for name in names)), asked.data)
-    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy")}
+    files = (f"bench/accuracy/{part}.py" for part in ("ablation", "choices", "paper"))
+    code = {"code": fingerprint(), "bench": fingerprint(*files)}
+    by_site_and_group = {}
+    for name, place in places.items():
+        groups = [group for group in asked.only if name in chosen[group]]
+        by_site_and_group[name] = isolated(measure, name, place, groups, code)
     for group in asked.only:
-        measured: dict[str, dict[str, Any]] = {}
-        for name in chosen[group]:
-            spec = {"site": name, "group": group, **code}
-            make = partial(isolated, measure, places[name], metres(name), group)
-            measured[name] = remembered(folder() / "results" / f"ablation-{group}-{name}.json", spec, make)
+        measured = {name: by_site_and_group[name][group] for name in chosen[group]}
         cpu = sum(each.pop("cpu") for each in measured.values())
         variants = next(iter(measured.values()))
         for variant in variants:
