@@ -35,6 +35,7 @@ COMMANDS = {
     "ablation, spacing": "ablation --only spacing --picture docs/images/spacing.png",
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
+    "peers, tracking": "peers --tracking",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
     "overlap": "conditions --overlaps 5 20 35 50 65 85 "
     "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",

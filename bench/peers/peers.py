@@ -424,13 +424,13 @@ def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
         yield informs(f"trial/query {k}", seconds, "s", said)
 
 
-def contest(count: int, limit_s: float) -> Iterator[Trial]:
+def contest(peers: Sequence[Peer], count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
     with tempfile.TemporaryDirectory() as scratch:
         for scene, config in WORLDS.items():
             file = Path(scratch) / scene
             file.write_bytes(pickle.dumps(isolated(places, scene, count)))
-            for peer in PEERS:
+            for peer in peers:
                 print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
                 yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
 
@@ -439,6 +439,7 @@ def options(parser: ArgumentParser) -> None:
     """Add how many places, and how long."""
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
+    parser.add_argument("--tracking", action="store_true", help="only those that start from a pose nearby")
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
 
 
@@ -448,8 +449,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
         signal.alarm(math.ceil(asked.limit))  # ends this process
         yield from _asked(*asked.trial)
         return
-    trials = list(contest(4 if asked.quick else asked.places, asked.limit))
-    for peer in PEERS:
+    peers = [peer for peer in PEERS if peer.tracking or not asked.tracking]
+    trials = list(contest(peers, 4 if asked.quick else asked.places, asked.limit))
+    for peer in peers:
         theirs = [trial for trial in trials if trial.peer == peer.name]
         reference = [trial for trial in trials if trial.peer == (OUR_TRACKING if peer.tracking else OURS)]
         details = {"trials": [asdict(trial) for trial in theirs]}
