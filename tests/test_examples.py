@@ -84,7 +84,7 @@ def test_example_agent(world, capsys):
 @pytest.mark.slow
 def test_example_custom_descriptor(world, capsys):
     shares = example("custom_descriptor.py")(world)
-    assert set(shares) == {"scan_context", "coview"}
+    assert set(shares) == {"scan_context", "coview", "paper"}
     assert max(shares["scan_context"], shares["coview"]) >= 0.5
     assert capsys.readouterr().out.count("keyframes") == len(shares)
 
