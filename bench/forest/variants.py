@@ -17,7 +17,7 @@ from coview_stream.config import KeyframeConfig, LocalizerConfig, RegistrationCo
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, inverse, orthonormal, pose_from, to_local
+from coview_stream.geometry.transforms import Pose, inverse, orthonormal, pose_from, rot_z, to_local, yaw_of
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking.pose_graph import PoseGraph
@@ -56,16 +56,20 @@ def by_gnss(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfi
 
 
 def by_map(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:
-    """Register each frame from where the last motion leads once more; from the true start, without odometry."""
+    """Register each frame from where the last shift and turn lead once more, as widely as a search does.
+
+    From the true start, without odometry.
+    """
     base_map, settings, keyframe = BaseMap.load(site), RegistrationConfig(), KeyframeConfig()
     maps, poses = LocalMaps(base_map, settings.source_range), [to_local(drive.truth[0], base_map.origin)]
     for frame in drive.frames:
-        step = inverse(poses[-2]) @ poses[-1] if len(poses) > 2 else np.eye(4)
-        guess = orthonormal(poses[-1] @ step)
+        before, last = poses[-2:] if len(poses) > 2 else [poses[-1]] * 2
+        turned = rot_z(yaw_of(last) - yaw_of(before)) @ last[:3, :3]  # its tilt sways, and leads nowhere
+        guess = pose_from(turned, 2.0 * last[:3, 3] - before[:3, 3])
         turn, place = pose_from(guess[:3, :3], np.zeros(3)), pose_from(np.eye(3), guess[:3, 3])
         scan = prepare_scan(voxelized(recorded.read(int(frame)), turn, keyframe), np.zeros(3), settings)
         target = maps.around(guess[:3, 3])
-        found = None if target is None else register(scan, place, target, settings, settings.track, centre=np.zeros(3))
+        found = None if target is None else register(scan, place, target, settings, settings.search, centre=np.zeros(3))
         poses.append(guess if found is None else orthonormal(found.T_map_source @ turn))
     out = np.array(poses[1:])
     out[:, :3, 3] += base_map.origin
