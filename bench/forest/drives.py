@@ -47,7 +47,7 @@ _QUICK = 60.0  # metres of the first
 _TIMES = "times"
 _TIMED_METRES, _AGAIN = 150.0, 15.0  # that are driven for the times, and after which the robot is searched anew
 
-_POINTS, _BESIDE = 12_000, 25.0  # of a map behind a track, and metres of it that are shown beside
+_POINTS, _BESIDE = 8_000, 25.0  # of a map behind a track, and metres of it that are shown beside
 _FARTHEST = 98  # percentile of the errors at which the colours end
 _LOWEST = 1e-3  # metres or degrees: the boxes' axis begins there
 
@@ -215,7 +215,10 @@ def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
                 for box in boxes["boxes"]:
                     box.set(facecolor=colour, alpha=0.5)
                 for median in boxes["medians"]:
-                    median.set(color="#000000")
+                    median.set(color=TRUTH)
+                for place, some in enumerate(values, start=1):
+                    if not len(some):
+                        axes.text(0.02, place, "no pose", transform=axes.get_yaxis_transform(), va="center")
                 axes.set_xscale("log")
                 axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
                 axes.set_xlabel(f"error [{unit}]")
@@ -223,21 +226,22 @@ def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
             line[0].set_title(drive)
 
 
-def draw_tracks(drives: Sequence[tuple[BaseMap, Floats, Errors]], path: Path) -> None:
+def draw_tracks(drives: Mapping[str, tuple[BaseMap, Floats, Errors]], path: Path) -> None:
     """Draw the true track (N, 4, 4) of each drive over its map, in the colour of the error in metres."""
-    options = {"figsize": (4.6 * len(drives), 4.0), "ncols": len(drives), "axes": {"squeeze": False}}
+    options = {"figsize": (4.4 * len(drives), 3.7), "ncols": len(drives), "axes": {"squeeze": False}}
     with figure(path, **options) as (drawing, panels):
-        for axes, (site, truth, error) in zip(panels[0], drives, strict=True):
+        for axes, (drive, (site, truth, error)) in zip(panels[0], drives.items(), strict=True):
             low, high = truth[:, :2, 3].min(axis=0) - _BESIDE, truth[:, :2, 3].max(axis=0) + _BESIDE
             points = site.sampled_points(10 * _POINTS) + site.origin
             points = points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)]
             shift = draw_base_map(axes, points[:: len(points) // _POINTS + 1])
             at, known = truth[:, :3, 3] - shift, np.isfinite(error.metres)
             axes.plot(at[:, 0], at[:, 1], color=TRUTH, linewidth=0.7)
-            most = float(np.percentile(error.metres[known], _FARTHEST)) if known.any() else 1.0
+            most = float(np.percentile(error.metres[known], _FARTHEST))
             dots = axes.scatter(at[known, 0], at[known, 1], s=5, c=error.metres[known], cmap="plasma", vmin=0.0,
                                 vmax=most, linewidths=0, zorder=3)  # fmt: skip
             drawing.colorbar(dots, ax=axes, shrink=0.8, label="error [m]", extend="max")
+            axes.set_title(drive)
 
 
 def options(parser: ArgumentParser) -> None:
@@ -275,10 +279,13 @@ def rows(asked: Namespace) -> Iterator[Row]:
         asked.plots.mkdir(parents=True, exist_ok=True)
         draw_errors({kind: {n: errors(r.track, r.truth) for n, r in some.items()} for kind, some in results.items()},
                     asked.plots / "forest_errors.png")  # fmt: skip
-        tracks = [(BaseMap.load(map_of(folder(), world)), results[world.kind]["ours"]) for world in worlds]
-        draw_tracks(
-            [(site, r.truth, errors(r.track, r.truth)) for site, r in tracks], asked.plots / "forest_tracks.png"
-        )
+        tracks = {
+            world.kind: (BaseMap.load(map_of(folder(), world)), found["ours"].truth, errors(*found["ours"][:2]))
+            for world in worlds
+            if "ours" in (found := results[world.kind]) and found["ours"].track.tracking.any()
+        }
+        if tracks:
+            draw_tracks(tracks, asked.plots / "forest_tracks.png")
     if _TIMES in chosen:
         for part, seconds in times(first).items():
             taken = statistics(1e3 * np.array(seconds))
