@@ -179,11 +179,11 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
 
 
 def _indoors(scene: Scene, hall: Footprint, rng: np.random.Generator) -> Floats:
-    """Scan a hall from stands on the route in it: (N, 3) float64 metres, scene frame."""
+    """Scan a hall from stands in it and before its gates, as walls have two sides: (N, 3) float64, scene frame."""
     scanner, caster = SENSORS["blk360"](), Caster(scene.mapped)
     ahead = np.array([np.cos(hall.yaw), np.sin(hall.yaw)])
     clouds = []
-    for along in np.arange(-0.4, 0.41, 0.2) * hall.w:
+    for along in [-0.5 * hall.w - 8.0, *(np.arange(-0.4, 0.41, 0.2) * hall.w), 0.5 * hall.w + 8.0]:
         x, y = (hall.x, hall.y) + along * ahead
         T = pose_from(np.eye(3), [x, y, scene.site.height(x, y) + 1.5])
         cloud = transform(T, scanner.scan(caster, T, 0, rng).astype(np.float64))
