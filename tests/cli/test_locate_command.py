@@ -41,6 +41,20 @@ def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_pat
     assert (out / "trajectory.png").exists()
 
 
+@pytest.mark.slow
+def test_smoothed_poses_are_written_beside_the_live_ones(world_file, world_run, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["locate", str(world_file), str(world_run), "-o", str(out), "--smooth", "--export", "csv"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^smoothed +\d+ frames with a live pose, ", printed, re.MULTILINE)
+    assert "trajectory.tum, filtered.tum, result.json, trajectory.csv, trajectory.png" in printed
+    live, smoothed = (read_tum(out / name)[0] for name in ("filtered.tum", "trajectory.tum"))
+    assert set(live) <= set(smoothed)
+    lines = (out / "trajectory.csv").read_text().splitlines()
+    kinds = [line.rsplit(",", 1)[1] for line in lines[1:]]
+    assert (lines[0].rsplit(",", 1)[1], kinds.count("smoothed"), len(kinds)) == ("kind", len(live), len(smoothed))
+
+
 def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["locate", str(world_file), str(elsewhere_run), "-o", str(out), "--no-pictures"]) == 1
