@@ -25,6 +25,11 @@ EYE = 1.7
 LOWEST_EYE = 0.3
 """Metres of a sensor above the ground at least: points less below it stand on walls, down the slope or behind it."""
 
+FLOOR_RADIUS = 15.0
+"""Metres around a body within which a lidar on it sees ground: a VLP-16 in 2 m of height from 7.5 m on."""
+
+_FREE = 1.3  # metres above a body's origin on the ground: free above ground, also below trees, and part of a wall
+
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
@@ -55,19 +60,39 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
 def ground_below(points: Points, position: Floats) -> float:
     """Estimate the height of the ground below ``position`` (3,) from the points around it, metres in their frame.
 
-    The median of the lowest points below the sensor in 1 m cells within 6 m: robust to clutter, and independent of the
-    sensor's mounting height. Without such points, as below a hemisphere that looks up, it is :data:`EYE` below the
-    sensor.
+    The median of the lowest points below the position in 1 m cells within 6 m: robust to clutter, and independent of
+    the sensor's mounting height. A body's origin may lie on the ground itself (:func:`lies_on_ground`); otherwise,
+    without such points, as below a hemisphere that looks up, the ground is :data:`EYE` below the position.
     """
     x, y = points[:, 0] - position[0], points[:, 1] - position[1]
-    near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2] - LOWEST_EYE))
+    inside = x * x + y * y < _GROUND_RADIUS**2
+    near = np.flatnonzero(inside & (points[:, 2] < position[2] - LOWEST_EYE))
     if not len(near):
-        return float(position[2] - EYE)
+        if not lies_on_ground(points, position):
+            return float(position[2] - EYE)
+        near = np.flatnonzero(inside & (points[:, 2] < position[2] + LOWEST_EYE))
+        if not len(near):
+            return float(position[2])
     reach = int(np.ceil(_GROUND_RADIUS))
     column, row = (np.floor(axis[near]).astype(np.int64) + reach for axis in (x, y))
     lowest = np.full((2 * reach) ** 2, np.inf, dtype=np.float32)
     np.minimum.at(lowest, column * 2 * reach + row, points[near, 2])
     return float(np.median(lowest[np.isfinite(lowest)]))
+
+
+def lies_on_ground(points: Points, position: Floats) -> bool:
+    """Whether ``position`` (3,), the origin of a body such as a ``base_footprint``, lies on the ground that is seen.
+
+    Of the 1 m cells within 15 m that have points at its height, most have free space just above: walls, of which a
+    lidar that looks up sees the feet at its own height, go on upwards.
+    """
+    offset = points - position.astype(np.float32)
+    offset = offset[(offset[:, 0] ** 2 + offset[:, 1] ** 2 < FLOOR_RADIUS**2) & (np.abs(offset[:, 2]) < _FREE)]
+    reach = int(np.ceil(FLOOR_RADIUS))
+    column, row = (np.floor(axis).astype(np.int64) + reach for axis in (offset[:, 0], offset[:, 1]))
+    cell, low = column * 2 * reach + row, np.abs(offset[:, 2]) < LOWEST_EYE
+    floor = np.unique(cell[low])
+    return bool(2 * np.isin(floor, cell[offset[:, 2] >= LOWEST_EYE]).sum() < len(floor))
 
 
 def on_ground(points: Points, position: Floats) -> Floats:

@@ -104,6 +104,20 @@ def test_ground_below_uses_points_near_the_robot_only():
     assert ground_below(np.concatenate([near, far]) + shift, np.array([300.0, -200.0, 52.0])) == pytest.approx(50.0)
 
 
+def test_origin_of_a_body_may_lie_on_the_ground():
+    """As a ``base_footprint`` does; a hemisphere that looks up sees only the feet of walls at its own height."""
+    rings = np.concatenate([polar(r, np.arange(0.0, 360, 3), 0.05) for r in (6.5, 7.5, 9.0, 11.0, 14.0)])
+    walls = np.concatenate([polar(12.5, np.arange(-40.0, 40, 2), z) for z in np.arange(0.1, 6.0, 0.4)])
+    crowns = np.concatenate([rings + np.float32([0, 0, 4]), rings, walls])
+    here = np.zeros(3)
+    assert ground_below(np.concatenate([rings, walls]), here) == 0.0
+    assert ground_below(crowns, here) == 0.0
+    assert ground_below(np.concatenate([crowns, polar(2.0, np.arange(0.0, 360, 20), -0.1)]), here) == pytest.approx(
+        -0.1
+    )
+    assert ground_below(walls, here) == -EYE
+
+
 def test_without_ground_points_the_sensor_stands_at_the_usual_height():
     sensor = np.array([0.0, 0.0, 2.0])
     assert ground_below(np.empty((0, 3), np.float32), sensor) == 2.0 - EYE

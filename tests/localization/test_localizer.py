@@ -261,6 +261,17 @@ def test_require_verification_withholds_pose_until_verified(world_map, world_dri
     assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
+@pytest.mark.slow
+def test_body_on_the_ground_is_localized_as_its_sensor_is(world_map, world_drive, world_fixes):
+    """The same clouds and drive, told of a body whose origin is the ground below the sensor."""
+    down = pose_from(np.eye(3), [0.0, 0.0, -1.7])
+    localizer, lifted = Localizer(world_map), np.float32([0.0, 0.0, 1.7])
+    for k in range(6):
+        fix = localizer.step(world_drive.clouds[k] + lifted, world_drive.T_odom_body[k] @ down, 0.5 * k)
+    assert fix.state is State.TRACKING
+    assert pose_error(fix.T_map_body, world_drive.T_map_body[5] @ down)[0] < 0.08
+
+
 def test_frame_is_copied_and_left_as_it_is(world_map, world_drive, results):
     """A driver may reuse its array for the next frame; a search result applied later still registers this one."""
     localizer = Localizer(world_map)

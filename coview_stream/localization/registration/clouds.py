@@ -14,7 +14,7 @@ from coview_kernels.cells import Cells
 from coview_stream.basemap.tiles import cut_points
 from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
-from coview_stream.descriptors.coview import EYE, LOWEST_EYE
+from coview_stream.descriptors.coview import EYE, FLOOR_RADIUS, LOWEST_EYE, lies_on_ground
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, Pose, norms
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
 _CLEAR = 0.5  # metres above the lowest point nearby, of points that are not ground
-_FLOOR_RADIUS = 15.0  # metres around the sensor, of its ground
 _FLOOR_PERCENTILE = 1.0  # of the heights: a few returns lie below the ground
 STRUCTURE_HEIGHT = 1.0  # metres above the lowest ground nearby
 _SEED = 20240  # of the choice among too many points
@@ -62,13 +61,14 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
 
     Args:
         points: (N, 3) float32 in a gravity-aligned frame, metres.
-        position: (3,) of the sensor, same frame.
+        position: (3,) of the body, same frame.
         config: range, voxel and number of points; the choice is random but seeded.
     """
     thin = thinned(points, position, config)
     height, cell = _heights(thin)
-    near = thin[((thin[:, :2] - position[:2]) ** 2).sum(axis=1) < _FLOOR_RADIUS**2, 2]
-    if len(near) and np.percentile(near, _FLOOR_PERCENTILE) > position[2] - LOWEST_EYE:
+    near = thin[((thin[:, :2] - position[:2]) ** 2).sum(axis=1) < FLOOR_RADIUS**2, 2]
+    high = len(near) > 0 and np.percentile(near, _FLOOR_PERCENTILE) > position[2] - LOWEST_EYE
+    if high and not lies_on_ground(thin, position):
         height = thin[:, 2] - np.float32(position[2] - EYE)  # no ground: the lowest points stand on walls
     chosen = np.arange(len(thin))
     if len(thin) > config.source_points:
