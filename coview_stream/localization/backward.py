@@ -106,10 +106,13 @@ class RecordingLocalizer(Localizer):
             )
         )  # fmt: skip
 
-    def fit(self, cloud: Points, T_map_body: Pose) -> float:
-        """Share of a frame's structure (N, 3), body frame, that is on the map at a pose (4, 4); 0 for too little."""
+    def fit(self, cloud: Points, T_map_body: Pose, calibration: Calibration) -> float:
+        """Share of a frame's structure that is on the map at a pose (4, 4) of its body; 0 for too little.
+
+        The cloud (N, 3) is in the sensor's axes, and ``calibration`` the one that the pose was made with.
+        """
         target = self._local_maps.around(T_map_body[:3, 3])
-        points = transform(pose_from(T_map_body[:3, :3], np.zeros(3)), self._frames.calibration.level(cloud))
+        points = transform(pose_from(T_map_body[:3, :3], np.zeros(3)), calibration.level(cloud))
         shift = pose_from(np.eye(3), T_map_body[:3, 3])
         return 0.0 if target is None else share_on_map(points, np.zeros(3), shift, target) or 0.0
 

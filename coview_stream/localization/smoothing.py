@@ -46,7 +46,7 @@ class PoseKind(StrEnum):
     """Kind of a smoothed pose; frames of the first kind alone had a pose live."""
 
     SMOOTHED = "smoothed"
-    """The frame had a live pose, and later registrations have corrected it."""
+    """The frame had a live pose; registrations around it have corrected it, or it is as it was where there is none."""
     BACKWARD = "backward"
     """Tracked backwards from a later fix: registered to the map and verified as live poses are."""
     BRIDGED = "bridged"
@@ -75,7 +75,7 @@ class SmoothedPose:
 
 
 def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[RecordedFrame]) -> list[SmoothedPose]:
-    """Return the smoothed poses of a recorded run, in order; none without a fix.
+    """Return the smoothed poses of a recorded run, in order; none without a live pose.
 
     Args:
         localizer: that has localized the run; it is used again to track backwards.
@@ -84,7 +84,7 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
     """
     live = [k for k, frame in enumerate(frames) if frame.registered is not None]
     if not live:
-        return []
+        return [_as_live(frame) for frame in frames if frame.fix.T_map_body is not None]
     calibration = frames[-1].fix.calibration or Calibration()
     for before, after in pairwise([-1, *live]):
         registered, between = frames[after].registered, frames[before + 1 : after]
@@ -95,7 +95,7 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
     chain = _Chain.of(frames, calibration, drift, localizer.config.acceptance.max_innovation)
 
     def fit(k: int, T_map_body: Pose) -> float:
-        return localizer.fit(run.read(frames[k].index, calibration.sweep).points, T_map_body)
+        return localizer.fit(run.read(frames[k].index, calibration.sweep).points, T_map_body, calibration)
 
     chain.settle_breaks(fit)
     return chain.solved(localizer.config.graph.huber, localizer.base_map.origin)
@@ -220,11 +220,15 @@ class _Chain:
         ]
         graph.add(registrations, ("Huber", huber))
         solved = zip(nodes, graph.solve(), graph.covariances(), strict=True)
-        found = [self._pose(k, T, along_map(covariance, T), origin) for k, T, covariance in solved]
-        return [pose for pose in found if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
+        found = {k: self._pose(k, T, along_map(covariance, T), origin) for k, T, covariance in solved}
+        for k, frame in enumerate(self.frames):
+            if k not in number and self._kind(k) is PoseKind.SMOOTHED:
+                found[k] = _as_live(frame)
+        poses = [found[k] for k in sorted(found)]
+        return [pose for pose in poses if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
 
     def _nodes(self) -> tuple[list[int], Poses]:
-        """Return the frames (M) that get a pose, and poses (M, 4, 4) by odometry from a registration near them."""
+        """Return the frames (M) that the graph poses, and poses (M, 4, 4) by odometry from a registration near them."""
         parts: list[list[int]] = []
         for k in range(len(self.frames)):
             if self._kind(k) is not None:
@@ -235,7 +239,7 @@ class _Chain:
         for part in parts:
             keys = [k for k in part if k in self.registered]
             # a single registration without a live pose that contradicts odometry on both sides is no evidence
-            if len(keys) > 1 or any(self._kind(k) is PoseKind.SMOOTHED for k in part):
+            if len(keys) > 1 or (keys and any(self._kind(k) is PoseKind.SMOOTHED for k in part)):
                 nodes += part
                 near = np.clip(np.searchsorted(keys, part, "right") - 1, 0, None)
                 poses += [self._predicted(keys[at], k) for at, k in zip(near.tolist(), part, strict=True)]
@@ -265,6 +269,16 @@ class _Chain:
         T_map_body = pose_from(T[:3, :3], T[:3, 3] + origin) @ pose_from(np.eye(3), -frame.origin)
         level = protection_level(reported, kept.doubt)
         return SmoothedPose(frame.fix.stamp, kind, T_map_body, reported, level, fix.confidence)
+
+
+def _as_live(frame: RecordedFrame) -> SmoothedPose:
+    """Return the live pose of a frame that no registration can correct."""
+    fix = frame.fix
+    assert fix.T_map_body is not None
+    assert fix.covariance is not None
+    assert fix.protection is not None
+    T_map_body = fix.T_map_body @ pose_from(np.eye(3), -frame.origin)
+    return SmoothedPose(fix.stamp, PoseKind.SMOOTHED, T_map_body, fix.covariance, fix.protection, fix.confidence)
 
 
 def _within_alert_limit(level: ProtectionLevel) -> bool:

@@ -18,8 +18,10 @@ from coview_stream.cli import build_parser
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.backward import RecordedFrame, RecordingLocalizer
+from coview_stream.localization.backward import BelievedRegistration, RecordedFrame, RecordingLocalizer
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.offline import RunResult, locate, summary, write
 from coview_stream.localization.result import Fix
 from coview_stream.localization.smoothing import PoseKind, smooth_run
@@ -160,6 +162,47 @@ def test_smoothed_poses_are_no_worse_with_odometry_that_drifts(world_map, way):
         for poses in (both, live)
     ]
     assert off[0] <= 1.02 * off[1]
+
+
+def recorded(registered, posed, count=12):
+    """Frames in a line, a metre apart, of which some were registered and some have a live pose; odometry is right."""
+    level, shared = ProtectionLevel(0.2, 0.5), 1e-6 * np.eye(6)
+    frames = []
+    for k in range(count):
+        T = pose_from(np.eye(3), [k, 0.0, 0.0])
+        fix = Fix(float(k), State.LOST)
+        if k in posed:
+            fix = Fix(float(k), State.TRACKING, T, np.eye(4), 1e-4 * np.eye(6), 0.9, protection=level)
+        kept = BelievedRegistration(T, 1e-4 * np.eye(6), shared, 1.0, False, False) if k in registered else None
+        frames.append(RecordedFrame(k, T, np.zeros(3), fix, kept))
+    return frames
+
+
+@pytest.mark.parametrize("registered", [range(5), range(0)])
+def test_live_poses_that_no_registration_is_near_stay_as_they_were(world_map, registered):
+    """Five frames, four lost, three posed again by odometry; or none of them registered."""
+    posed = [*range(5), 9, 10, 11]
+    frames = recorded(registered, posed)
+    poses = smooth_run(RecordingLocalizer(world_map), run_of([BLIND] * 12, [f.T_odom_body for f in frames]), frames)
+    assert [pose.stamp for pose in poses] == posed
+    for pose, k in zip(poses, posed, strict=True):
+        fix = frames[k].fix
+        assert (pose.kind, pose.confidence) == (PoseKind.SMOOTHED, 0.9)
+        np.testing.assert_allclose(pose.T_map_body, fix.T_map_body, atol=1e-9)
+        if k not in registered:
+            assert pose.protection == fix.protection
+            np.testing.assert_array_equal(pose.covariance, fix.covariance)
+
+
+def test_a_cloud_is_compared_at_the_level_of_its_pose(world_map, world_drive):
+    localizer, lean = RecordingLocalizer(world_map), Calibration(pitch=0.12)
+    localizer.prepare()
+    cloud, T = world_drive.clouds[3], world_drive.T_map_body[3]
+    leaning = cloud @ lean.R_body_cloud.astype(np.float32)
+    right = localizer.fit(cloud, T, Calibration())
+    assert right > 0.8
+    assert localizer.fit(leaning, T, lean) == pytest.approx(right, abs=0.01)
+    assert localizer.fit(leaning, T, Calibration()) < right - 0.1
 
 
 def test_a_run_without_a_fix_has_no_smoothed_poses_and_says_so(world_map):
