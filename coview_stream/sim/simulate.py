@@ -57,7 +57,7 @@ class SimulationConfig:
     changed: float = 0.0  # share of the trees, cars and poles that were replaced since the map was made
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to all map coordinates, metres (a UTM-like offset)
     speed: float = 1.5  # of the robot, metres per second
-    height: float = 1.5  # of the sensor above the ground, metres
+    height: float = 1.5  # of the body above the ground, metres; with a mount the sensor is off by its z
     odometry: OdometryConfig = field(default_factory=OdometryConfig)  # errors of the odometry
     dirt: Dirt = field(default_factory=Dirt)  # further imperfections; none by default
     drive_seed: int = 0  # of the drive, its scans and its odometry: another run through the same world

@@ -20,7 +20,8 @@ from coview_stream.sim.dirt.robot import Mounting
 from coview_stream.sim.dirt.scene import Grass
 from coview_stream.sim.sensors import SENSORS, Caster, Sensor
 
-_GROUP = {"vlp16": 16, "vlp16-inclined": 16, "os64": 64, "os64-2048": 64, "bpearl": 32}  # beams fired together
+# beams fired together
+_GROUP = {"vlp16": 16, "vlp16-inclined": 16, "os64": 64, "os64-2048": 64, "bpearl": 32, "blk360": 250}
 
 
 def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
@@ -36,7 +37,7 @@ def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sen
         # other columns in each frame: together they cover all
         return np.asarray(rays[(np.arange(len(rays)) // group + frame) % nth == 0])
 
-    return Sensor(name, thinned, sensor.min_range, sensor.max_range)
+    return replace(sensor, beams=thinned)
 
 
 TRAINED_DIRT = ("mounting", "beams", "grass")

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from coview_stream.descriptors.birds_eye_view import LAYERS
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.sim.sensors import INCLINATION
+from coview_stream.sim.sensors import INCLINATION, SENSORS
 from coview_stream.training.drives import CLEARANCE, between_trees
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import trained_sensor
@@ -147,6 +147,11 @@ def test_inclined_sensor_rotates() -> None:
     columns = [set(map(tuple, upright.beams(frame))) for frame in range(3)]
     assert not columns[0] & columns[1]
     assert set.union(*columns) == set(map(tuple, trained_sensor("vlp16").beams(0)))
+    scanner = trained_sensor("blk360", lambda beams: 50)  # whole columns, and it stands while it scans
+    assert len(np.unique(scanner.beams(0)[:, 2].round(6))) == len(
+        np.unique(SENSORS["blk360"]().beams(0)[:, 2].round(6))
+    )
+    assert (scanner.stop, scanner.stand) == (5.0, 40.0)
 
 
 @pytest.mark.slow
