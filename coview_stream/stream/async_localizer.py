@@ -115,7 +115,8 @@ class AsyncLocalizer:
         Raises:
             CloudError, RunError: as ``Localizer.step``, and nothing changes. CoViewError: a process has died or has
             failed at an earlier frame; it is started again, and the place is searched for. Raised once for each
-            failure, and the frame is taken: go on with the next.
+            failure (of several since the last call, only the first is told), and the frame is taken: go on with the
+            next.
         """
         self._check_usable()
         self._mailbox.add_frame(cloud, T_odom_body, stamp)
@@ -156,7 +157,7 @@ class AsyncLocalizer:
     @property
     def searching(self) -> bool:
         """Whether a search of the map waits or is under way."""
-        return self._mailbox.queue.searching
+        return self._mailbox.searching
 
     @property
     def calibration(self) -> Calibration:
@@ -245,6 +246,7 @@ class Mailbox:
         self.changed = threading.Condition()
         self._epoch = 0
         self._error: str | None = None  # not raised yet
+        self._search_told = False  # whether a restart of its engine has told the failure of the search under way
         self.begin(keep_calibration=False)
 
     # ---- the agent's side
@@ -285,7 +287,7 @@ class Mailbox:
             self.queue.put_frame(PairedFrame(message, now, T, None, driven, turned), now)
 
     def raise_error(self) -> None:
-        """Raise the newest failure of an engine, once."""
+        """Raise the first failure of an engine since the last call, once."""
         with self.changed:
             error, self._error = self._error, None
         if error is not None:
@@ -299,9 +301,17 @@ class Mailbox:
     @property
     def state(self) -> State:
         """The engine's state, unless it is out of date."""
-        if self._fix is None or (self._lost is not None and not self._fix.state.has_place):
-            return State.SEARCHING if self._lost is None else State.LOST
-        return State.DOUBTED if self._fix.state is State.TRACKING and self._unseen > _MAX_UNSEEN else self._fix.state
+        with self.changed:
+            if self._fix is None or (self._lost is not None and not self._fix.state.has_place):
+                return State.SEARCHING if self._lost is None else State.LOST
+            outdated = self._fix.state is State.TRACKING and self._unseen > _MAX_UNSEEN
+            return State.DOUBTED if outdated else self._fix.state
+
+    @property
+    def searching(self) -> bool:
+        """Whether a search waits or is under way."""
+        with self.changed:
+            return self.queue.searching
 
     @property
     def _unseen(self) -> float:
@@ -312,11 +322,12 @@ class Mailbox:
         """Return the fix of the newest frame."""
         with self.changed:
             newest, fix, at, state = self._newest, self._fix, self._fixed, self.state
-            evidence, unseen, calibration = self._lost, self._unseen, self.calibration
+            lost, unseen, calibration = self._lost, self._unseen, self.calibration
         if newest is None:
             raise RuntimeError("no frame yet; call step first")
-        if fix is None or at is None or (state is State.LOST and evidence is not None):
-            return Fix(newest.stamp, state, evidence=evidence, calibration=calibration)
+        if fix is None or at is None or (state is State.LOST and lost is not None):
+            evidence = None if fix is None else fix.evidence  # newer than the loss: why the place does not come back
+            return Fix(newest.stamp, state, evidence=evidence or lost, calibration=calibration)
         if state is State.TRACKING:
             if newest is at:
                 return replace(fix, stamp=newest.stamp)
@@ -339,6 +350,7 @@ class Mailbox:
         """Hand out the newest frame, or the result of a search if no frame waits, or the newest keyframe."""
         with self.changed:
             if engine == "search":
+                self._search_told = False
                 return self.queue.take_search_request()
             job = self.queue.take_frame(False, self.hints)
             if job is None:
@@ -374,18 +386,20 @@ class Mailbox:
                     self._fail(f"the tracking process failed at a frame: {last_line(reason)}", not rejected)
             elif isinstance(job, SearchJob):
                 self.queue.search_failed(job, reason)
-                self._fail(f"a search failed: {last_line(reason)}", searches=False)
+                if not self._search_told:
+                    self._fail(f"a search failed: {last_line(reason)}", searches=False)
             self.changed.notify_all()
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
         """Search again if the tracking engine was started again; tell the agent."""
         with self.changed:
             self._fail(f"{why}; it is started again", searches=engine == "track")
+            self._search_told = self._search_told or engine == "search"
             self.changed.notify_all()
 
     def _fail(self, error: str, searches: bool) -> None:
         """Note an error; if the place is forgotten, begin another epoch with the last place as a hint."""
-        self._error = self._error or error  # the first one of a chain
+        self._error = self._error or error  # the first since the last call
         if not searches:
             return
         had_place = self._lost is not None or self.state.has_place

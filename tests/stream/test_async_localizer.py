@@ -9,6 +9,8 @@ import re
 import signal
 import subprocess
 import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,10 @@ from small_world import pose_error
 from sockets import until
 
 from coview_stream import AsyncLocalizer, BaseMap, CloudError, CoViewError, InputError, PlaceGuess, RunError
+from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.state import State
 from coview_stream.stream.async_localizer import Mailbox
+from coview_stream.stream.node.engine_queue import FrameResult
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 
 WAIT = 120.0  # seconds, however slow the machine is
@@ -106,23 +110,42 @@ def test_failure_is_raised_once_and_the_last_place_is_a_hint(worked, world_fixes
     again = mailbox.take_job("track")
     np.testing.assert_array_equal(again.hint, world_fixes[2].T_map_body)
     assert again.epoch == job.epoch + 1
-    mailbox.handle_result(again, worked.engines["track"].run(again), 0.0)
-    assert mailbox.state is State.LOST
+    result = worked.engines["track"].run(again)
+    mailbox.handle_result(again, replace(result, fix=replace(result.fix, evidence=None)), 0.0)
+    assert mailbox.fix().evidence is lost.evidence  # there is nothing newer
+    mailbox.add_frame(worked.drive.clouds[4], worked.drive.T_odom_body[4], 2.25)
+    ambiguous = KeyframeEvidence(2.25, State.AMBIGUOUS, "one place leads")
+    mailbox.handle_result(mailbox.take_job("track"), replace(result, fix=replace(result.fix, evidence=ambiguous)), 0.0)
+    assert mailbox.fix().state is State.LOST
+    assert mailbox.fix().evidence is ambiguous
     assert worked.step(5).state is State.TRACKING
 
 
 def test_failed_search_leaves_the_frames_alone(worked):
     worked.step(0, work=False)
     worked.do("track")
-    assert worked.mailbox.queue.searching
+    assert worked.mailbox.searching
     job = worked.mailbox.take_job("search")
     worked.mailbox.engine_restarted("search", "the search engine died")
-    worked.mailbox.handle_failure(job, "the search engine died")
-    assert not worked.mailbox.queue.searching
     with pytest.raises(CoViewError, match="the search engine died; it is started again"):
         worked.mailbox.raise_error()
-    worked.mailbox.raise_error()
+    worked.mailbox.handle_failure(job, "the search engine died")
+    assert not worked.mailbox.searching
+    worked.mailbox.raise_error()  # not again
     assert [worked.step(k) for k in (1, 2)][-1].state is State.TRACKING
+
+
+def test_failures_of_later_searches_are_told(worked):
+    """A search engine that died without a job does not hide them."""
+    mailbox = worked.mailbox
+    mailbox.engine_restarted("search", "the search engine died")
+    with pytest.raises(CoViewError, match="died"):
+        mailbox.raise_error()
+    worked.step(0, work=False)
+    worked.do("track")
+    mailbox.handle_failure(mailbox.take_job("search"), "ZeroDivisionError: by nothing")
+    with pytest.raises(CoViewError, match="a search failed: ZeroDivisionError: by nothing"):
+        mailbox.raise_error()
 
 
 @pytest.mark.parametrize("keep_calibration", [True, False])
@@ -138,6 +161,50 @@ def test_results_from_before_a_new_beginning_are_ignored(worked, keep_calibratio
     with pytest.raises(RuntimeError, match="no frame yet"):
         worked.mailbox.fix()
     assert worked.step(0).state is State.TRACKING
+
+
+class Watched:
+    """Stands for a fix or a queue whose reader has to hold the mailbox's lock."""
+
+    T_map_body = calibration = None
+
+    def __init__(self, mailbox):
+        self.changed, self.free = mailbox.changed, []
+
+    def read(self):
+        """Note whether another thread, as the feed's, gets the lock now."""
+        other = threading.Thread(target=self.enter)
+        other.start()
+        other.join()
+
+    def enter(self):
+        self.free.append(self.changed.acquire(blocking=False))
+        if self.free[-1]:
+            self.changed.release()
+
+    @property
+    def state(self):
+        self.read()
+        return State.SEARCHING
+
+    @property
+    def searching(self):
+        self.read()
+        return True
+
+
+def test_feed_changes_nothing_while_the_state_is_read(worked):
+    """It would forget the fix between a look whether there is one and a look at its state."""
+    worked.step(0, work=False)
+    job, mailbox = worked.mailbox.take_job("track"), worked.mailbox
+    fix = Watched(mailbox)
+    mailbox.handle_result(job, FrameResult(fix, None, 0.0, ()), 0.0)
+    fix.free.clear()
+    assert mailbox.state is State.SEARCHING
+    mailbox.queue = queue = Watched(mailbox)
+    assert mailbox.searching
+    assert fix.free
+    assert not any(fix.free + queue.free)
 
 
 def test_a_map_in_memory_is_refused(world_map):
