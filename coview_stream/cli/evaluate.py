@@ -15,7 +15,12 @@ HELP = "compare a trajectory with the truth: errors, success, share localized, f
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("estimate", type=Path, metavar="EST.tum", help="trajectory of `locate`, map <- body")
+    parser.add_argument(
+        "estimate",
+        type=Path,
+        metavar="EST.tum",
+        help="trajectory of `locate`, map <- body; with its --smooth, filtered.tum is the live one",
+    )
     parser.add_argument("truth", type=Path, metavar="TRUTH.tum", help="true trajectory, map <- body")
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the errors over the distance driven")
     add_shared(parser, "--json")

@@ -15,10 +15,11 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, InputError, warn
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, pose_from, transform
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.frame import OdometryCorrection
+from coview_stream.localization.smoothing import PoseKind
 from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.run import Run
 
@@ -71,7 +72,7 @@ class PosedFrame:
 
 
 class LocalizedRun:
-    """Run with poses on the map; frames are read on demand.
+    """Run with poses on the map; frames are read on demand. A pose that was bridged by odometry alone counts as none.
 
     Attributes:
         pair: its paths.
@@ -93,6 +94,8 @@ class LocalizedRun:
         stamps, poses = read_tum(pair.trajectory)
         result = _read_result(pair.result)
         _check_map(pair, result, base_map)
+        measured = ~_bridged(stamps, result)
+        stamps, poses = stamps[measured], poses[measured]
         calibration = _part(result, "calibration")
         self._R_level = exp_so3(np.radians([_number(calibration, "roll_deg"), _number(calibration, "pitch_deg"), 0.0]))
         scale = _number(calibration, "odometry_scale", 1.0) - 1.0
@@ -158,6 +161,16 @@ def _matched(frames: Floats, stamps: Floats) -> tuple[Any, Any]:
     nearest = np.where(np.abs(stamps[before] - frames) <= np.abs(stamps[after] - frames), before, after)
     same = np.abs(stamps[nearest] - frames) <= _SAME_STAMP
     return np.flatnonzero(same), nearest[same]
+
+
+def _bridged(stamps: Floats, result: dict[str, Any]) -> Bools:
+    """Tell which poses (N,) lie in a stretch that ``locate --smooth`` bridged."""
+    stretches, bridged = result.get("smoothed"), np.zeros(len(stamps), dtype=bool)
+    for stretch in stretches if isinstance(stretches, list) else ():
+        if isinstance(stretch, dict) and stretch.get("kind") == PoseKind.BRIDGED:
+            first, last = (_number(stretch, name, math.nan) for name in ("first_stamp", "last_stamp"))
+            bridged |= (stamps > first - _SAME_STAMP) & (stamps < last + _SAME_STAMP)
+    return bridged
 
 
 def _read_result(path: Path) -> dict[str, Any]:

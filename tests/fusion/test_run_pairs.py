@@ -57,6 +57,22 @@ def test_frames_without_a_pose_are_counted(world_run, world_map, results):
     assert [frame is not None for frame in run.frames(lambda k: k == 1)] == [False, True, False, False, False]
 
 
+def test_bridged_poses_are_left_out(world_run, world_map, results):
+    """Of poses 2 to 6 the fourth and fifth are bridged; a stretch of another kind or without stamps changes nothing."""
+    stamps = [float(line.split()[0]) for line in (world_run / "odometry.tum").read_text().splitlines()]
+    stretches = [
+        {"kind": "backward", "first_stamp": stamps[2], "last_stamp": stamps[3]},
+        {"kind": "bridged", "first_stamp": stamps[4], "last_stamp": stamps[5]},
+        {"kind": "smoothed", "first_stamp": stamps[6], "last_stamp": stamps[6]},
+        {"kind": "bridged", "first_stamp": None},
+    ]
+    (results / "result.json").write_text(json.dumps({"map_sha256": "", "smoothed": stretches}))
+    with pytest.warns(UserWarning, match="which map"):
+        run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+    np.testing.assert_allclose(run.stamps, [stamps[k] for k in (2, 3, 6)])
+    assert run.without_pose == 4
+
+
 def test_a_trajectory_alone_will_do(world_run, world_map, results):
     with pytest.warns(UserWarning, match="which map"):
         run = LocalizedRun(parse_pair(f"{world_run}:{results / 'trajectory.tum'}"), world_map, opened)
