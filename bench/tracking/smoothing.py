@@ -74,23 +74,28 @@ def rows(asked: Namespace) -> Iterator[Row]:
             found.append({"name": name, **measure(folder(), name, asked.data)})
             rmse = found[-1]["smoothed_m"]
             yield informs(f"smooth/{name}", np.nan if rmse is None else rmse, "m", found[-1])
+    yield from verdicts(found)
+
+
+def verdicts(found: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
+    """Yield the targets of runs by their figures."""
     worse = [run["name"] for run in found if (run["smoothed_m"] or 0.0) > 1.02 * (run["live_m"] or 0.0)]
     yield judged("smooth/runs with a greater rmse than live", ", ".join(worse) or "none", "none", not worse)
-    false, beyond, live, poses = (
-        sum(run[key] for run in found) for key in ("only_false", "smoothed_beyond", "live_beyond", "live")
-    )
+    keys = ("only_false", "smoothed_beyond", "live_beyond", "live", "only_beyond", "only")
+    false, beyond, live, poses, others, only = (sum(run[key] for run in found) for key in keys)
     yield judged("smooth/false poses of frames without a live one", str(false), "0", not false, false)
     allowed = live + 1e-3 * poses
     text = f"{beyond}, live {live}, of {poses}"
     yield judged("smooth/poses beyond their level, same frames", text, f"<= {allowed:.0f}", beyond <= allowed, beyond)
+    name, allowed = "smooth/poses beyond their level, frames without a live one", 1e-3 * only
+    yield judged(name, f"{others} of {only}", f"<= {allowed:.0f}", others <= allowed, others)
 
 
 def measure(below: Path, name: str, data: Path) -> dict[str, Any]:
     """Return the figures of a run."""
-    bench = fingerprint("bench/tracking", "bench/accuracy")
     spec = {
         "code": fingerprint(),
-        "bench": bench,
+        "bench": fingerprint("bench/tracking", "bench/accuracy"),
         "run": name,
         "world": repr(DRIVES[name][0] if name in DRIVES else ""),
     }
@@ -164,8 +169,8 @@ def _statistics(name: str, values: Floats, levels: Floats, chosen: Bools) -> dic
 
 
 def _columns(title: str, name: str) -> tuple[tuple[str, str, int | None], ...]:
-    keys = (("rmse m", "m", 3), ("median", "median_m", 3), ("max", "max_m", 2), ("rmse deg", "deg", 2),
-            ("max", "max_deg", 2), ("beyond", "beyond", 0))  # fmt: skip
+    keys = (("rmse m", "m", 3), ("median m", "median_m", 3), ("max m", "max_m", 2), ("rmse deg", "deg", 2),
+            ("max deg", "max_deg", 2), ("beyond level", "beyond", 0))  # fmt: skip
     return tuple((f"{title}{text}", f"{name}_{key}", digits) for text, key, digits in keys)
 
 

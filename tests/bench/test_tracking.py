@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+
 import numpy as np
 import pytest
 from drives_with_truth import track, way
 
 from bench.accuracy.scores import errors, losses, recovery, score
-from bench.tracking import protection, tracking
+from bench.harness.rows import Row
+from bench.tracking import protection, smoothing, tracking
 from bench.tracking.protection import PRODUCT, Sample, beyond_alert_limit, misleading, tail
 from bench.tracking.tracking import AXES, NOMINAL, coverage, pooled, shares, since_fix, spread, squares
 from coview_stream.geometry.protection import protection_level
@@ -175,3 +178,25 @@ def test_families_share_no_kind_and_no_seed():
     fitted, reported = (protection.FAMILIES[name] for name in ("fitted", "reported"))
     assert not set(fitted.kinds) & set(reported.kinds)
     assert not {w.seed for w, _ in fitted.worlds(100)} & {w.seed for w, _ in reported.worlds(100)}
+
+
+def smoothed_run(**figures):
+    """Figures of a run, all zero but the given ones and the counts of frames."""
+    parts = ("m", "median_m", "max_m", "deg", "median_deg", "max_deg", "beyond", "false")
+    zero = {f"{group}_{part}": 0.0 for group in ("live", "smoothed", "only") for part in parts}
+    return {"name": "town", "frames": 500, "live": 400, "without": 100, "only": 22} | zero | figures
+
+
+@pytest.mark.parametrize("key", ["only_false", "smoothed_beyond", "only_beyond"])
+def test_smoothed_poses_of_every_kind_have_a_verdict(key):
+    assert all(row.holds for row in smoothing.verdicts([smoothed_run()]))
+    missed = [row for row in smoothing.verdicts([smoothed_run(), smoothed_run(**{key: 4})]) if not row.holds]
+    assert len(missed) == 1
+    assert ("without a live one" in missed[0].name) == key.startswith("only")
+
+
+def test_no_two_columns_about_smoothing_have_one_heading():
+    run = Row("smooth/town", details=smoothed_run())
+    for table in smoothing.tables([run], Namespace()).values():
+        headings = [cell.strip() for cell in table.splitlines()[0].strip("|").split("|")]
+        assert len(set(headings)) == len(headings)
