@@ -193,7 +193,7 @@ def describe_storeys(
         if np.isfinite(floor):
             above = points[:, 2] - floor * _STOREY
             part = points[(above > -_BELOW_FLOOR) & (above < _COVER)]
-        raster = rasterise(part, corner, RASTER_CELL, config.voxel, margin, points)
+        raster = rasterise(part, corner, RASTER_CELL, config.voxel, margin, points, "paper" in config.channels)
         before = done
 
         def step(count: int, _: int, before: int = before) -> None:
@@ -228,7 +228,7 @@ def describe_stations(
             rings=config.rings,
             sectors=config.sectors,
             r_max=config.radius,
-            raster_mean=raster.mean if "paper" in config.channels else None,
+            raster_mean=raster.mean,
         )
         for name in config.channels:
             described[name][part] = channel(name, grid)
@@ -239,7 +239,7 @@ def describe_stations(
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Raster of a cloud: greatest height, number of occupied voxels and their mean height, of square cells.
+    """Raster of a cloud: greatest height, number of occupied voxels and perhaps their mean height, of square cells.
 
     Arrays are (H, W): row along y, column along x; cell (r, c) has its centre at
     ``corner + cell * (c + 1/2, r + 1/2)``.
@@ -247,14 +247,14 @@ class HeightRaster:
     Attributes:
         top: greatest height, metres, map frame; 0 in empty cells.
         count: occupied voxels.
-        mean: mean height of one point of each voxel, metres, map frame; 0 in empty cells.
+        mean: mean height of one point of each voxel, metres, map frame; 0 in empty cells; None if not asked for.
         corner: (2,) lower left corner, metres, map frame.
         cell: edge, metres.
     """
 
     top: Floats32
     count: npt.NDArray[np.int32]
-    mean: Floats32
+    mean: Floats32 | None
     corner: Floats
     cell: float
 
@@ -274,8 +274,9 @@ def aligned_corner(points: Points, block: float, cell: float) -> Floats:
 
 
 def rasterise(
-    points: Points, corner: Floats, cell: float, voxel: float, margin: int = 0, extent: Points | None = None
-) -> HeightRaster:
+    points: Points, corner: Floats, cell: float, voxel: float, margin: int = 0, extent: Points | None = None,
+    means: bool = False,
+) -> HeightRaster:  # fmt: skip
     """Raster (N, 3) map-frame points, to the farthest of ``extent`` (default: the points) and ``margin`` cells beyond.
 
     The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of points depend on the scan pattern.
@@ -293,10 +294,11 @@ def rasterise(
     top = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0
-    mean = np.bincount(flat[first], weights=points[first, 2], minlength=size) / np.maximum(count, 1)
-    shape = (height, width)
-    whole, middle = count.astype(np.int32).reshape(shape), mean.astype(np.float32).reshape(shape)
-    return HeightRaster(top.reshape(shape), whole, middle, corner, cell)
+    shape, mean = (height, width), None
+    if means:
+        total = np.bincount(flat[first], weights=points[first, 2], minlength=size)
+        mean = (total / np.maximum(count, 1)).astype(np.float32).reshape(shape)
+    return HeightRaster(top.reshape(shape), count.astype(np.int32).reshape(shape), mean, corner, cell)
 
 
 class StationGrid:
