@@ -239,6 +239,7 @@ def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) 
         "ms": 1e3 * share("seconds", "keyframes", every),
         **{site: share("top1", "keyframes", [each]) for site, each in by_site.items()},
     }  # fmt: skip
+    details |= {"first": np.nan, "worst": np.nan, "false": "-"}
     if located := [each["located"] for each in every if "located" in each]:
         first = [np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in located]
         wrong = f"{sum(each['false_frames'] for each in located)} of {sum(each['posed'] for each in located)}"
