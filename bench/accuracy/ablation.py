@@ -23,7 +23,7 @@ from unittest.mock import patch
 import numpy as np
 
 from bench.accuracy import paper
-from bench.accuracy.choices import OFF, Choice, Localizing, Registering, Site, uncalibrated, unverified
+from bench.accuracy.choices import OFF, Choice, LocalizerChoice, RegistrationChoice, Site, uncalibrated, unverified
 from bench.harness.files import ROOT, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs, listed
 from bench.harness.worlds import prepare
@@ -110,27 +110,29 @@ SEARCH: dict[str, dict[str, Choice]] = {
 """Choices of the search."""
 
 REGISTRATION = {
-    "default: plane, 70 %": Registering(),
-    **{f"plane, {keep:.0%}": Registering(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
-    "plane, 15 iterations": Registering(RegistrationConfig(iterations=15)),
-    "plane, ground and structure trimmed together": Registering(apart=False),
-    "plane, facades removed": Registering(facades=False),
-    "point, same kernel": Registering(way="points"),
-    "point, facades removed": Registering(way="points", facades=False),
-    "the paper's: plain, point, 60 %": Registering(RegistrationConfig(keep=0.6), "paper"),
-    "the paper's, facades removed": Registering(RegistrationConfig(keep=0.6), "paper", facades=False),
+    "default: plane, 70 %": RegistrationChoice(),
+    **{f"plane, {keep:.0%}": RegistrationChoice(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
+    "plane, 15 iterations": RegistrationChoice(RegistrationConfig(iterations=15)),
+    "plane, ground and structure trimmed together": RegistrationChoice(apart=False),
+    "plane, facades removed": RegistrationChoice(facades=False),
+    "point, same kernel": RegistrationChoice(way="points"),
+    "point, facades removed": RegistrationChoice(way="points", facades=False),
+    "the paper's: plain, point, 60 %": RegistrationChoice(RegistrationConfig(keep=0.6), "paper"),
+    "the paper's, facades removed": RegistrationChoice(RegistrationConfig(keep=0.6), "paper", facades=False),
 }
 """Choices of the registration."""
 
 LOCALIZER = {
-    "default": Localizing(),
-    **{f"{n} keyframes vote": Localizing(LocalizerConfig(consensus=ConsensusConfig(window=n))) for n in (1, 5, 20)},
-    "verification off": Localizing(changed=unverified),
-    "risk 0.4": Localizing(LocalizerConfig(acceptance=AcceptanceConfig(risk=0.4))),
-    "calibration off": Localizing(changed=uncalibrated),
-    "outliers of scans removed": Localizing(filtered=True),
-    "60 % of the pairs": Localizing(LocalizerConfig(registration=RegistrationConfig(keep=0.6))),
-    "frames of two metres registered": Localizing(
+    "default": LocalizerChoice(),
+    **{
+        f"{n} keyframes vote": LocalizerChoice(LocalizerConfig(consensus=ConsensusConfig(window=n))) for n in (1, 5, 20)
+    },
+    "verification off": LocalizerChoice(changed=unverified),
+    "risk 0.4": LocalizerChoice(LocalizerConfig(acceptance=AcceptanceConfig(risk=0.4))),
+    "calibration off": LocalizerChoice(changed=uncalibrated),
+    "outliers of scans removed": LocalizerChoice(filtered=True),
+    "60 % of the pairs": LocalizerChoice(LocalizerConfig(registration=RegistrationConfig(keep=0.6))),
+    "frames of two metres registered": LocalizerChoice(
         LocalizerConfig(tracking=TrackingConfig(window=2.0, min_points=50_000))
     ),
 }
@@ -213,7 +215,7 @@ def measure(name: str, place: Path, groups: Sequence[str], code: Mapping[str, st
                 out[variant]["paper"] = paper.located(site().map, site().run, truth, choice.spacing, stations)
         if group == "channels":
             for channels in CHANNELS:
-                out[_channels(channels)]["located"] = site().located(Localizing(channels=channels))
+                out[_channels(channels)]["located"] = site().located(LocalizerChoice(channels=channels))
         return out | {"cpu": time.process_time() - begin}
 
     return {
@@ -320,7 +322,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
             yield row
 
 
-_SHARES = (("variant", "variant", None), ("top-1", "top1", 2), ("top-10", "top10", 2), ("five keyframes", "coarse", 2))
+_SHARES = (
+    ("variant", "variant", None),
+    ("top-1", "top1", 2),
+    ("top-10", "top10", 2),
+    ("keyframes together", "coarse", 2),
+)
 COLUMNS = {
     "channels": (
         *_SHARES, ("mean first fix m", "first", 1), ("latest", "worst", 1), ("false frames", "false", None),

@@ -105,7 +105,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Seen:
+class KeyframeView:
     """A keyframe as the search sees it."""
 
     scans: dict[int | None, Points]  # (N, 3) VLS by the number of keyframes gathered, odometry frame, metres
@@ -137,7 +137,7 @@ class Site:
         with _co_visibility(strict):
             return describe_storeys(self.points, self.stations(block), block, descriptor)[descriptor.channels[0]]
 
-    def _keyframes(self, distance: float) -> list[Seen]:
+    def _keyframes(self, distance: float) -> list[KeyframeView]:
         """Keyframes of the run in order, every ``distance`` metres."""
         settings, out = KeyframeConfig(distance=distance), []
         buffer, descriptor = KeyframeBuffer(settings), DescriptorConfig(radius=100.0)
@@ -154,7 +154,7 @@ class Site:
             parts = {n: buffer.recent(n) for n in _GATHERED if n is not None}
             thin = {n: paper.LocalScan.of(part, position, descriptor.voxel).points for n, part in parts.items()}
             submap = buffer.recent(4)  # as the search registers
-            out.append(Seen({**thin, None: whole}, position, T_map_body @ inverse(T_odom_body), submap))
+            out.append(KeyframeView({**thin, None: whole}, position, T_map_body @ inverse(T_odom_body), submap))
         return out
 
     def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32, float]]:
@@ -210,7 +210,7 @@ class Site:
         return counts | {"seconds": seconds, "stations": float(len(grid))}
 
     @cached_property
-    def starts(self) -> list[tuple[Seen, float, Pose]]:
+    def starts(self) -> list[tuple[KeyframeView, float, Pose]]:
         """Every second keyframe with metres, and a ``T_map_odom`` (4, 4) that puts the robot so far off."""
         out = []
         for k, seen in enumerate(self.keyframes(2.0)[1::2]):
@@ -222,7 +222,7 @@ class Site:
                 out.append((seen, off, T))
         return out
 
-    def registrations(self, choice: Registering) -> list[dict[str, float]]:
+    def registrations(self, choice: RegistrationChoice) -> list[dict[str, float]]:
         """Register all starts; metres ``off``, errors at the robot, and milliseconds of processor time."""
         maps, out = LocalMaps(self.map, choice.config.source_range), []
         for seen, off, start in self.starts:
@@ -256,9 +256,9 @@ class Site:
         config = self.map.parameters["config"] | {"descriptor": asdict(descriptor)}
         return BaseMap(arrays, self.map.parameters | {"config": config})
 
-    def located(self, choice: Localizing) -> dict[str, Any]:
+    def located(self, choice: LocalizerChoice) -> dict[str, Any]:
         """Localize the run; figures of ``evaluate``."""
-        run = Filtered(**vars(self.run)) if choice.filtered else self.run
+        run = FilteredRun(**vars(self.run)) if choice.filtered else self.run
         base_map = self._map(choice.channels or self.map.descriptor_config.channels)
         with choice.changed():
             found = locate(base_map, run, choice.config)
@@ -274,7 +274,7 @@ class Site:
 
 
 @dataclass(frozen=True)
-class Registering:
+class RegistrationChoice:
     """Registration with some of its choices made otherwise.
 
     Attributes:
@@ -312,7 +312,7 @@ class Registering:
 
 
 @dataclass(frozen=True)
-class Localizing:
+class LocalizerChoice:
     """The whole localizer with some of its choices made otherwise.
 
     Attributes:
@@ -328,7 +328,7 @@ class Localizing:
     channels: tuple[Channel, ...] = ()
 
 
-class Filtered(Run):
+class FilteredRun(Run):
     """A run whose frames have no statistical outliers, removed as from a map."""
 
     def read(self, index: int, *args: Any, **kwargs: Any) -> Frame:
@@ -426,7 +426,7 @@ def nearest_place(volume: Floats32, centre: Floats, stations: Floats32) -> Hypot
     return Hypothesis(T, station, shift, float(volume.min()))
 
 
-def right(T_map_odom: Pose, seen: Seen) -> bool:
+def right(T_map_odom: Pose, seen: KeyframeView) -> bool:
     """Whether a hypothesis puts the keyframe at its true place and heading; heights are not compared."""
     found, true = (transform(T, seen.position[None])[0] for T in (T_map_odom, seen.T_map_odom))
     turn = wrap_angle(yaw_of(T_map_odom) - yaw_of(seen.T_map_odom))

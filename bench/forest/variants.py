@@ -27,7 +27,7 @@ _WIDE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.
 """Covariance of a predicted pose without the graph: that of a place which the search has accepted."""
 
 
-class Unfused(PoseGraph):
+class ForgetfulGraph(PoseGraph):
     """A graph that forgets: odometry predicts where a registration begins, which alone makes the pose."""
 
     def move(self, T_between: Pose, covariance: Floats) -> None:
@@ -78,7 +78,7 @@ def by_map(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig
 
 def without_graph(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:
     """Run the product, but every registration is the pose, and odometry only leads from one to the next."""
-    with patch("coview_stream.localization.tracking.tracker.PoseGraph", Unfused):
+    with patch("coview_stream.localization.tracking.tracker.PoseGraph", ForgetfulGraph):
         return follow(site, recorded, drive, config)
 
 

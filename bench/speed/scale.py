@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from bench.accuracy.choices import Seen, Site, right
+from bench.accuracy.choices import KeyframeView, Site, right
 from bench.harness.files import folder, isolated, peak_megabytes
 from bench.harness.rows import Row, bounded, informs
 from bench.harness.worlds import WORLDS, opened, prepare, world_name
@@ -46,7 +46,7 @@ APART = 10  # factor by which stations are moved apart: every 20 m, as of 20 x 2
 _BLOCK = 8192
 _SEED = 1
 
-Keyframe = tuple[Seen, Floats, dict[Channel, Floats32]]
+Keyframe = tuple[KeyframeView, Floats, dict[Channel, Floats32]]
 """A keyframe, its centre (3,) in the odometry frame on the ground, and its descriptors by channel."""
 
 
@@ -140,7 +140,7 @@ def timed(consensus: StationConsensus, keyframes: Sequence[Keyframe], area: Circ
     return {"ms": times, "ranks": ranks}
 
 
-def place_of(seen: Seen) -> Floats:
+def place_of(seen: KeyframeView) -> Floats:
     """Place of a keyframe (3,) in the map."""
     return np.asarray((seen.T_map_odom @ np.append(seen.position, 1.0))[:3])
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import ablation, accuracy, conditions, odometry
-from bench.accuracy.choices import Seen, TableVote, nearest_place, over_common, right
+from bench.accuracy.choices import KeyframeView, TableVote, nearest_place, over_common, right
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
 from bench.results import COMMANDS
@@ -187,7 +187,7 @@ def test_distances_over_common_columns_let_nearly_empty_stations_win():
 def test_a_place_is_right_within_three_metres_and_nine_degrees(shift, degrees, verdict):
     position = np.array([12.0, -5.0, 1.5])
     empty = np.zeros((0, 3), np.float32)
-    seen = Seen({}, position, pose_from(rot_z(1.0), [100.0, 50.0, 3.0]), empty)
+    seen = KeyframeView({}, position, pose_from(rot_z(1.0), [100.0, 50.0, 3.0]), empty)
     about = pose_from(rot_z(np.radians(degrees)), position + np.array([0.0, shift, 7.0]))
     assert right(seen.T_map_odom @ about @ pose_from(np.eye(3), -position), seen) is verdict
 

@@ -11,7 +11,7 @@ from drives_with_truth import way
 from bench.accuracy.scores import errors
 from bench.forest.drives import statistics
 from bench.forest.gnss import Receiver, fused
-from bench.forest.variants import Unfused, of_poses
+from bench.forest.variants import ForgetfulGraph, of_poses
 from bench.tracking.drives import drifting
 from bench.tracking.worlds import World, winding_path
 from coview_stream.geometry.transforms import exp_so3, pose_from
@@ -63,7 +63,7 @@ def test_fusion_bounds_the_drift_of_odometry_and_is_bounded_by_the_receiver():
 
 
 def test_without_fusion_a_registration_is_the_pose():
-    graph, spread = Unfused(), 1e-6 * np.eye(6)
+    graph, spread = ForgetfulGraph(), 1e-6 * np.eye(6)
     graph.start(np.eye(4), spread)
     step = pose_from(exp_so3(np.array([0.0, 0.0, 0.1])), [1.0, 0.0, 0.0])
     graph.move(step, spread)
