@@ -26,7 +26,7 @@ from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
 
-ABLATION = ("channels", "bins", "scan", "vote", "registration", "localizer")
+ABLATION = ("channels", "bins", "scan", "vote", "registration", "localizer", "elsewhere")
 COMMANDS = {
     **{name: name for name in BENCHMARKS if name not in ("odometry", "ground", "ablation")},
     "throughput": "engine --throughput",

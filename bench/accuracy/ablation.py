@@ -1,11 +1,11 @@
 """What each choice of the method is worth, group by group, on sites that separate.
 
 Every variant changes one choice. Choices of the search are judged at single keyframes, those of registration from known
-starts, the others by the whole localizer. Sites: an airborne-like map of 6 pulses per square metre, streets of equal
-houses, a sparse sensor, a dirty world, forests, one changed since the survey, and real runs (``--data``). The first row
-of a group is the default. ``spacing`` is the first paper's Fig. 9, which ``--picture`` draws. Learned features,
-descriptors and both are rows of ``python -m bench forest``; odometry alone, map alone and no graph are rows of
-``python -m bench forest_drives``. Results stay in ``--work``.
+starts, the others by the whole localizer, also on maps of other sites (``elsewhere``). Sites: an airborne-like map of 6
+pulses per square metre, streets of equal houses, a sparse sensor, a dirty world, forests, one changed since the survey,
+and real runs (``--data``). The first row of a group is the default. ``spacing`` is the first paper's Fig. 9, which
+``--picture`` draws. Learned features, descriptors and both are rows of ``python -m bench forest``; odometry alone, map
+alone and no graph are rows of ``python -m bench forest_drives``. Results stay in ``--work``.
 """
 
 from __future__ import annotations
@@ -138,11 +138,15 @@ LOCALIZER = {
 }
 """Choices of the whole localizer."""
 
-GROUPS = (*SEARCH, "registration", "localizer")
+ELSEWHERE = {name: LOCALIZER[name] for name in ("default", "1 keyframes vote", "verification off", "risk 0.4")}
+"""Those that may let a wrong place through: runs on the map of the next site."""
+
+GROUPS = (*SEARCH, "registration", "localizer", "elsewhere")
 SITES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(GROUPS, ("airborne-like", "repetitive", "sparse", "dirty", "forest", "riverside_a", "kitti04")),
     **dict.fromkeys(SEARCH, ("airborne-like", "repetitive", "sparse", "forest", "riverside_a")),
     "channels": ("airborne-like", "repetitive", "sparse", "forest", "changed", "stand", *REAL),
+    "elsewhere": ("airborne-like", "repetitive", "sparse", "dirty"),
     "spacing": ("airborne-like", "sparse", "forest", "riverside_a", "kitti04"),
 }
 """Sites of each group, so that all groups together take less than 40 minutes of one core."""
@@ -197,8 +201,13 @@ def metres(name: str) -> float:
     return _REAL_METRES if name in REAL else _LENGTH
 
 
-def measure(name: str, place: Path, groups: Sequence[str], code: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Measure groups on one site unless they are there; by group and variant, with ``cpu`` seconds of each group."""
+def measure(
+    name: str, place: Path, groups: Sequence[str], code: Mapping[str, str], other: Path
+) -> dict[str, dict[str, Any]]:
+    """Measure groups on one site unless they are there; by group and variant, with ``cpu`` seconds of each group.
+
+    ``other`` is the folder of another site.
+    """
     site = cache(lambda: Site(place, metres(name)))
 
     def make(group: str) -> dict[str, Any]:
@@ -207,6 +216,8 @@ def measure(name: str, place: Path, groups: Sequence[str], code: Mapping[str, st
             out = {variant: {"errors": site().registrations(choice)} for variant, choice in REGISTRATION.items()}
         elif group == "localizer":
             out = {variant: site().located(choice) for variant, choice in LOCALIZER.items()}
+        elif group == "elsewhere":
+            out = {variant: site().elsewhere(choice, other) for variant, choice in ELSEWHERE.items()}
         else:
             out = {variant: site().search(choice) for variant, choice in SEARCH[group].items()}
         if group == "spacing":
@@ -285,6 +296,16 @@ def localizer_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
     return informs(f"ablation/localizer, {name}: runs localized", found, "", details)
 
 
+def elsewhere_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
+    """Row of a choice of the localizer on maps of other places."""
+    posed, frames = (sum(each[key] for each in by_site.values()) for key in ("posed", "frames"))
+    details = {
+        "group": "elsewhere", "variant": name, "false": f"{posed} of {frames}",
+        "runs": f"{sum(each['posed'] > 0 for each in by_site.values())} of {len(by_site)}",
+    }  # fmt: skip
+    return informs(f"ablation/elsewhere, {name}: false poses", posed, "", details)
+
+
 def options(parser: ArgumentParser) -> None:
     """Add the groups and the sites."""
     here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
@@ -305,7 +326,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
     by_site_and_group = {}
     for name, place in places.items():
         groups = [group for group in asked.only if name in chosen[group]]
-        by_site_and_group[name] = isolated(measure, name, place, groups, code)
+        of = list(chosen.get("elsewhere", (name,)))
+        other = places[of[(of.index(name) + 1) % len(of)]] if name in of else place
+        by_site_and_group[name] = isolated(measure, name, place, groups, code, other)
     for group in asked.only:
         measured = {name: by_site_and_group[name][group] for name in chosen[group]}
         cpu = sum(each.pop("cpu") for each in measured.values())
@@ -316,6 +339,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 row = registration_row(variant, by_site)
             elif group == "localizer":
                 row = localizer_row(variant, by_site)
+            elif group == "elsewhere":
+                row = elsewhere_row(variant, by_site)
             else:
                 row = search_row(group, variant, by_site)
             row.details.update(sites=list(measured), cpu=cpu)
@@ -342,6 +367,7 @@ COLUMNS = {
         ("median first fix m", "first", 1), ("latest", "worst", 1), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 2),
         ("step ms", "ms", 0),
     ),
+    "elsewhere": (("variant", "variant", None), ("false poses", "false", None), ("in runs", "runs", None)),
 }  # fmt: skip
 
 
@@ -350,7 +376,11 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     out = {}
     for group in dict.fromkeys(row.details["group"] for row in rows):
         found = [row.details for row in rows if row.details["group"] == group]
-        per_site = () if group in ("localizer", "spacing") else tuple((site, site, 2) for site in found[0]["sites"])
+        per_site = (
+            ()
+            if group in ("localizer", "elsewhere", "spacing")
+            else tuple((site, site, 2) for site in found[0]["sites"])
+        )
         columns = (*COLUMNS.get(group, (*_SHARES, ("ms", "ms", 0))), *per_site)
         about = f"Sites: {', '.join(found[0]['sites'])}; {found[0]['cpu'] / 60.0:.1f} minutes of one core."
         out[group] = f"{about}\n\n{listed(columns, found)}"

@@ -256,6 +256,12 @@ class Site:
         config = self.map.parameters["config"] | {"descriptor": asdict(descriptor)}
         return BaseMap(arrays, self.map.parameters | {"config": config})
 
+    def elsewhere(self, choice: LocalizerChoice, folder: Path) -> dict[str, Any]:
+        """Localize the run on the map of another site: count the poses, all of them false."""
+        with choice.changed():
+            found = locate(BaseMap.load(folder / "site.coview"), self.run, choice.config)
+        return {"posed": len(found.posed), "frames": found.frames}
+
     def located(self, choice: LocalizerChoice) -> dict[str, Any]:
         """Localize the run; figures of ``evaluate``."""
         run = FilteredRun(**vars(self.run)) if choice.filtered else self.run

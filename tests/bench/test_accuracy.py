@@ -146,6 +146,8 @@ def test_rows_of_the_ablation_add_sites_up():
     lost = known | {"success": False, "posed": 0, "first_fix_m": None, "e_t": None, "e_r": None}
     row = ablation.localizer_row("b", {"x": known, "y": lost, "z": lost})
     assert (row.details["right"], row.details["e_t"], row.details["first"]) == ("1 of 3", 0.02, np.inf)
+    row = ablation.elsewhere_row("d", {"x": {"posed": 3, "frames": 9}, "y": {"posed": 0, "frames": 4}})
+    assert (row.ours, row.details["false"], row.details["runs"]) == (3, "3 of 13", "1 of 2")
     tries = [
         {"off": 0.5, "metres": 0.1, "degrees": 0.2, "ms": 4.0},
         {"off": 1.0, "metres": 0.9, "degrees": 9.0, "ms": 6.0},
