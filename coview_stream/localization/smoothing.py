@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -222,10 +223,22 @@ class _Chain:
         solved = zip(nodes, graph.solve(), graph.covariances(), strict=True)
         found = {k: self._pose(k, T, along_map(covariance, T), origin) for k, T, covariance in solved}
         for k, frame in enumerate(self.frames):
-            if k not in number and self._kind(k) is PoseKind.SMOOTHED:
+            if self._kind(k) is PoseKind.SMOOTHED and (k not in number or k in self._beside_breaks):
                 found[k] = _as_live(frame)
         poses = [found[k] for k in sorted(found)]
         return [pose for pose in poses if pose.kind is PoseKind.SMOOTHED or _within_alert_limit(pose.protection)]
+
+    @cached_property
+    def _beside_breaks(self) -> set[int]:
+        """Frames between the live registrations on both sides of a break: what odometry did there is not known.
+
+        Their live poses stay as they are: a backward registration beside a break is not worth more.
+        """
+        live, out = [k for k in self.keys.tolist() if not self.registered[k].backward], set[int]()
+        for before, after in self.broken.values():
+            first = max((k for k in live if k <= before), default=-1)
+            out.update(range(first + 1, min((k for k in live if k >= after), default=len(self.frames))))
+        return out
 
     def _nodes(self) -> tuple[list[int], Poses]:
         """Return the frames (M) that the graph poses, and poses (M, 4, 4) by odometry from a registration near them."""
@@ -272,7 +285,7 @@ class _Chain:
 
 
 def _as_live(frame: RecordedFrame) -> SmoothedPose:
-    """Return the live pose of a frame that no registration can correct."""
+    """Return the live pose of a frame that no registration can correct with certainty."""
     fix = frame.fix
     assert fix.T_map_body is not None
     assert fix.covariance is not None

@@ -194,6 +194,21 @@ def test_live_poses_that_no_registration_is_near_stay_as_they_were(world_map, re
             np.testing.assert_array_equal(pose.covariance, fix.covariance)
 
 
+def test_live_poses_beside_a_break_are_not_handed_to_a_backward_registration(world_map, world_drive):
+    """One frame between registrations was registered backwards, a metre off, in fog: odometry is broken there."""
+    frames, small = [], 1e-4 * np.eye(6)
+    for k in range(len(world_drive.clouds)):
+        T, off = world_drive.T_map_body[k], pose_from(np.eye(3), [0.0, float(k == 4), 0.0])
+        fix = Fix(float(k), State.TRACKING, T, np.eye(4), small, 0.9, protection=ProtectionLevel(0.2, 0.5))
+        T_map_cloud = off @ pose_from(T[:3, :3], T[:3, 3] - world_map.origin)
+        kept = BelievedRegistration(T_map_cloud, small, 1e-6 * np.eye(6), 1.0, False, k == 4)
+        frames.append(RecordedFrame(k, world_drive.T_odom_body[k], np.zeros(3), fix, None if k in (3, 5, 6) else kept))
+    localizer, run = RecordingLocalizer(world_map), run_of(world_drive.clouds, world_drive.T_odom_body)
+    localizer.prepare()
+    for pose in smooth_run(localizer, run, frames):
+        assert pose_error(pose.T_map_body, world_drive.T_map_body[round(pose.stamp)])[0] < 0.1
+
+
 def test_a_cloud_is_compared_at_the_level_of_its_pose(world_map, world_drive):
     localizer, lean = RecordingLocalizer(world_map), Calibration(pitch=0.12)
     localizer.prepare()
