@@ -26,7 +26,7 @@ def act(fix: Fix) -> None:
 
 def main(world: Path, period: float = 0.1) -> tuple[Fix, float]:
     """Run the loop, a frame each ``period`` seconds; return the last fix and the longest call, seconds."""
-    site = world.parent / "site.coview"
+    site = world / "site.coview"
     if not site.exists():
         BaseMap.build(world / "base.laz").save(site)
     longest = 0.0

@@ -318,7 +318,8 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG, FILTERED):  # they would contradict the new trajectory
+        stale = (f"trajectory.{suffix}" for suffix in ("csv", "kitti", "geojson", "gpx"))  # of --export
+        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG, FILTERED, *stale):  # they would contradict the new trajectory
             (folder / name).unlink(missing_ok=True)
         write_tum(folder / TRAJECTORY, *located.trajectory)
         if located.smoothed is not None:
