@@ -114,9 +114,8 @@ class AsyncLocalizer:
 
         Raises:
             CloudError, RunError: as ``Localizer.step``, and nothing changes. CoViewError: a process has died or has
-            failed at an earlier frame; it is started again, and the place is searched for. Raised once for each
-            failure (of several since the last call, only the first is told), and the frame is taken: go on with the
-            next.
+                failed at an earlier frame; it is started again, and the place is searched for. Raised once for each
+                failure (of several since the last call, only the first is told); this frame is taken, go on.
         """
         self._check_usable()
         self._mailbox.add_frame(cloud, T_odom_body, stamp)
