@@ -36,6 +36,7 @@ COMMANDS = {
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
     "peers, tracking": "peers --tracking",
+    "conditions beside the paper": "conditions --conditions base --paper",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
     "overlap": "conditions --overlaps 5 20 35 50 65 85 "
     "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
