@@ -37,7 +37,7 @@ if GUIDED:
 with atheris.instrument_imports(include=["coview_stream", "rosbags", "laspy"]) if GUIDED else contextlib.nullcontext():
     import laspy  # noqa: F401 - here, so its coverage is seen
     import rosbags.rosbag1
-    import rosbags.rosbag2  # noqa: F401
+    import rosbags.rosbag2  # noqa: F401 - likewise
 
     from coview_stream import messages
     from coview_stream.basemap.basemap import BaseMap

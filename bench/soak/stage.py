@@ -180,7 +180,7 @@ def strike(stage: Stage, part: str, number: int, seconds: float = 0.0) -> float:
 
 def badly(stage: Stage, seconds: float, **changes: object) -> float:
     """Change how all robots send for some seconds."""
-    stage.order(replace(stage.manner, **changes))  # type: ignore[arg-type]
+    stage.order(replace(stage.manner, **changes))  # type: ignore[arg-type]  # its callers' names
     stage.wait(seconds)
     stage.order(stage.manner)
     return time.monotonic()

@@ -64,7 +64,7 @@ class FoxgloveSink(Sink):
         """
         sink = self
 
-        class Greeter(self._sdk.ServerListener):  # type: ignore[misc, name-defined]
+        class Greeter(self._sdk.ServerListener):  # type: ignore[misc, name-defined]  # the SDK is optional
             """Sends the map to a client that connects later: the server keeps no messages."""
 
             def on_subscribe(self, client: Any, channel: Any) -> None:

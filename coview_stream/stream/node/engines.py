@@ -50,10 +50,10 @@ class Engine(ABC):
     def forget(self, robot: str) -> None:
         """Forget a robot."""
 
-    def prepare(self) -> None:  # noqa: B027
+    def prepare(self) -> None:  # noqa: B027 - not every engine has work before its first job
         """Prepare for the first job."""
 
-    def prepare_later(self) -> None:  # noqa: B027
+    def prepare_later(self) -> None:  # noqa: B027 - likewise
         """Prepare for later jobs, in the first pause."""
 
 
