@@ -16,7 +16,7 @@ import numpy as np
 from coview_stream.geometry.arrays import Floats
 
 RISK = 1e-3
-"""Probability with which an error may exceed its level; metres and degrees each."""
+"""Probability with which an error may exceed its level; in space, in the plane, in height and in angle each."""
 
 ALERT_METRES, ALERT_DEGREES = 1.0, 3.0
 """Alert limit: a pose that is given may not be off by more; set by hand."""
@@ -30,6 +30,10 @@ kinds of sites than two to know how rare that is.
 """
 
 
+LEVELS = ("m", "deg", "horizontal_m", "vertical_m")
+"""Names of a level's numbers in messages and files."""
+
+
 @dataclass(frozen=True)
 class ProtectionLevel:
     """Error that a pose exceeds with a probability of at most 1e-3, relative to the map.
@@ -37,16 +41,21 @@ class ProtectionLevel:
     Attributes:
         metres: distance of the position, in space.
         degrees: angle of the rotation.
+        horizontal: metres in the map's x, y plane.
+        vertical: metres along its z.
         doubt: times as wide as the covariance alone has them.
     """
 
     metres: float
     degrees: float
+    horizontal: float
+    vertical: float
     doubt: float = 1.0
 
     def to_json(self) -> dict[str, float]:
         """Plain data for messages and ``result.json``."""
-        return {"m": round(self.metres, 4), "deg": round(self.degrees, 4)}
+        values = (self.metres, self.degrees, self.horizontal, self.vertical)
+        return {name: round(value, 4) for name, value in zip(LEVELS, values, strict=True)}
 
 
 def protection_level(covariance: Floats, doubt: float = 1.0, risk: float = RISK) -> ProtectionLevel:
@@ -57,19 +66,22 @@ def protection_level(covariance: Floats, doubt: float = 1.0, risk: float = RISK)
         doubt: 1 or more: times as large as usual the errors may be.
         risk: probability with which an error may exceed the level.
     """
-    metres = _quantile(covariance[:3, :3], *TAILS["metres"], risk)
-    radians = _quantile(covariance[3:, 3:], *TAILS["degrees"], risk)
-    return ProtectionLevel(doubt * metres, min(180.0, doubt * float(np.degrees(radians))), doubt)
+    metres, horizontal, vertical = (
+        doubt * _quantile(covariance[axes, axes], *TAILS["metres"], risk)
+        for axes in (slice(0, 3), slice(0, 2), slice(2, 3))
+    )
+    radians = doubt * _quantile(covariance[3:, 3:], *TAILS["degrees"], risk)
+    return ProtectionLevel(metres, min(180.0, float(np.degrees(radians))), horizontal, vertical, doubt)
 
 
 def axes_of(covariance: Floats) -> tuple[float, float]:
-    """Return the trace of a covariance (3, 3), and the number of axes, 1 to 3, that its errors come from."""
+    """Return the trace of a covariance (K, K), and the number of axes, 1 to K, that its errors come from."""
     trace, squares = float(np.trace(covariance)), float(np.sum(covariance * covariance))
-    return trace, trace**2 / squares if squares > 0 else 3.0
+    return trace, trace**2 / squares if squares > 0 else float(len(covariance))
 
 
 def _quantile(covariance: Floats, factor: float, freedom: float, risk: float) -> float:
-    """Norm that an error with a covariance (3, 3) exceeds with the probability ``risk``."""
+    """Norm that an error with a covariance (K, K) exceeds with the probability ``risk``."""
     from scipy.special import fdtri
 
     trace, axes = axes_of(covariance)

@@ -21,7 +21,7 @@ from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError, require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import ProtectionLevel, one_in
+from coview_stream.geometry.protection import LEVELS, ProtectionLevel, one_in
 from coview_stream.geometry.transforms import Poses, pose_from, pose_from_tum
 from coview_stream.localization.backward import RecordedFrame, RecordingLocalizer
 from coview_stream.localization.calibration.calibration import Calibration
@@ -296,7 +296,7 @@ def from_stream(
             T = pose_from_tum([*pose["position"], *pose["orientation"]])
             covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
             known_level = pose.get("protection_level")  # older nodes give none
-            level = None if known_level is None else ProtectionLevel(known_level["m"], known_level["deg"])
+            level = None if known_level is None else ProtectionLevel(*(known_level[name] for name in LEVELS))
             confidence = float(pose["confidence"])
             located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, confidence, protection=level))
     for status in statuses:

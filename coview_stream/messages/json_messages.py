@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from coview_stream.errors import MessageError
-from coview_stream.geometry.protection import ProtectionLevel
+from coview_stream.geometry.protection import LEVELS, ProtectionLevel
 from coview_stream.geometry.transforms import Pose, place_fields
 from coview_stream.messages.types import (
     Encoded,
@@ -210,10 +210,8 @@ def _protection(value: object) -> ProtectionLevel | None:
     if value is None:
         return None
     if not isinstance(value, dict):
-        raise MessageError("protection_level: write m and deg")
-    return ProtectionLevel(
-        number(value.get("m"), "protection_level.m"), number(value.get("deg"), "protection_level.deg")
-    )
+        raise MessageError(f"protection_level: write {', '.join(LEVELS)}")
+    return ProtectionLevel(*(number(value.get(name), f"protection_level.{name}") for name in LEVELS))
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -63,5 +63,16 @@ def test_no_covariance_is_no_error():
     assert protection_level(np.zeros((6, 6))).metres == 0.0
 
 
-def test_json_has_metres_and_degrees():
-    assert ProtectionLevel(0.12345, 1.5).to_json() == {"m": 0.1235, "deg": 1.5}
+def test_plane_and_height_have_levels_of_their_own_blocks():
+    C = pose_covariance(np.diag([0.04, 0.01, 4.0]), np.zeros((3, 3)))
+    level = protection_level(C)
+    flat = protection_level(pose_covariance(np.diag([0.04, 0.01, 0.0]), np.zeros((3, 3))))
+    upright = protection_level(pose_covariance(np.diag([0.0, 0.0, 4.0]), np.zeros((3, 3))))
+    assert level.horizontal == flat.horizontal == pytest.approx(flat.metres)
+    assert level.vertical == upright.vertical == pytest.approx(upright.metres)
+    assert level.horizontal < 2.0 < level.vertical < level.metres
+
+
+def test_json_has_all_levels():
+    level = ProtectionLevel(0.12345, 1.5, 0.1, 0.05)
+    assert level.to_json() == {"m": 0.1235, "deg": 1.5, "horizontal_m": 0.1, "vertical_m": 0.05}

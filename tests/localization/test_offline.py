@@ -65,7 +65,7 @@ def test_written_files_match_the_fixes(located, world_map, tmp_path):
     assert result["first_fix_stamp"] == located.first.stamp
     np.testing.assert_allclose(result["T_map_odom"], located.posed[-1].T_map_odom)
     level = located.posed[-1].protection
-    assert result["protection_level"] == {"m": round(level.metres, 4), "deg": round(level.degrees, 4)}
+    assert result["protection_level"] == level.to_json()
     assert (result["frames"], result["posed"]) == (7, len(located.posed))
     timings = result["timings_s"]
     assert 0 < timings["p50"] <= timings["p95"] <= timings["p99"]

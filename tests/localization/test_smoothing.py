@@ -166,7 +166,7 @@ def test_smoothed_poses_are_no_worse_with_odometry_that_drifts(world_map, way):
 
 def recorded(registered, posed, count=12):
     """Frames in a line, a metre apart, of which some were registered and some have a live pose; odometry is right."""
-    level, shared = ProtectionLevel(0.2, 0.5), 1e-6 * np.eye(6)
+    level, shared = ProtectionLevel(0.2, 0.5, 0.2, 0.1), 1e-6 * np.eye(6)
     frames = []
     for k in range(count):
         T = pose_from(np.eye(3), [k, 0.0, 0.0])
@@ -199,7 +199,7 @@ def test_live_poses_beside_a_break_are_not_handed_to_a_backward_registration(wor
     frames, small = [], 1e-4 * np.eye(6)
     for k in range(len(world_drive.clouds)):
         T, off = world_drive.T_map_body[k], pose_from(np.eye(3), [0.0, float(k == 4), 0.0])
-        fix = Fix(float(k), State.TRACKING, T, np.eye(4), small, 0.9, protection=ProtectionLevel(0.2, 0.5))
+        fix = Fix(float(k), State.TRACKING, T, np.eye(4), small, 0.9, protection=ProtectionLevel(0.2, 0.5, 0.2, 0.1))
         T_map_cloud = off @ pose_from(T[:3, :3], T[:3, 3] - world_map.origin)
         kept = BelievedRegistration(T_map_cloud, small, 1e-6 * np.eye(6), 1.0, False, k == 4)
         frames.append(RecordedFrame(k, world_drive.T_odom_body[k], np.zeros(3), fix, None if k in (3, 5, 6) else kept))

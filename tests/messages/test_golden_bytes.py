@@ -131,7 +131,7 @@ def test_pose_golden_bytes(name):
 
 
 def test_json_pose_has_the_documented_fields():
-    level = ProtectionLevel(0.25, 1.5)
+    level = ProtectionLevel(0.25, 1.5, 0.2, 0.15)
     message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, COVARIANCE, 0.75, "ab", 0.1, "utm", level)
     fields = json.loads(codecs.encode_pose(message, "json").payload)
     assert list(fields) == [
@@ -139,7 +139,7 @@ def test_json_pose_has_the_documented_fields():
         "age_s", "frame_id", "protection_level", "T_map_odom",
     ]  # fmt: skip
     assert fields["frame_id"] == "utm"
-    assert fields["protection_level"] == {"m": 0.25, "deg": 1.5}
+    assert fields["protection_level"] == {"m": 0.25, "deg": 1.5, "horizontal_m": 0.2, "vertical_m": 0.15}
     again = codecs.decode_pose(Sample("k", json.dumps(fields).encode()))
     assert (again.frame_id, again.protection) == ("utm", level)
 

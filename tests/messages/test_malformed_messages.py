@@ -215,7 +215,7 @@ def test_json_over_64_kib_is_oversized_and_extra_fields_are_ignored():
         {"protection_level": 0.1},
         {"T_map_odom": [1, 2, 3]},
         {"T_map_odom": {"position": [1, 2, 3]}},
-        {"protection_level": {"m": 0.1}},
+        {"protection_level": {"m": 0.1, "deg": 1.0}},
     ],
 )
 def test_malformed_json_poses_are_refused(changes):

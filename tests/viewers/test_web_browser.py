@@ -56,7 +56,16 @@ class Streaming:
             position = self.view.origin + np.array([-15.0 + 10.0 * np.cos(yaw), 10.0 * np.sin(yaw), 1.0])
             T = pose_from(rot_z(yaw), position)
             pose = PoseMessage(
-                ns(0.1 * k), "r1", "TRACKING", T, 0.01 * np.eye(6), 0.99999, SHA, 0.1, "map", ProtectionLevel(2.0, 1.0)
+                ns(0.1 * k),
+                "r1",
+                "TRACKING",
+                T,
+                0.01 * np.eye(6),
+                0.99999,
+                SHA,
+                0.1,
+                "map",
+                ProtectionLevel(2.5, 1.0, 2.0, 1.5),
             )
             if self.state == "TRACKING":
                 self._put(KEYS.pose, encode_pose(pose, "json"))

@@ -50,7 +50,7 @@ def pose(x, covariance=None, **fields):
 def test_a_pose_is_told_with_its_uncertainty(sink, page):
     covariance = np.diag([0.04, 0.01, 0.09, 1e-6, 1e-6, 1e-6])
     covariance[0, 1] = covariance[1, 0] = 0.01
-    sink.pose(pose(0.25, covariance, protection=ProtectionLevel(0.5, 1.0)))
+    sink.pose(pose(0.25, covariance, protection=ProtectionLevel(0.5, 1.0, 0.4, 0.3)))
     ((kind, told),) = events(page.take(0.0))
     assert (kind, told["robot"], told["x"], told["yaw"]) == ("pose", "r1", EAST + 0.25, 0.5)
     assert told["cov"] == [0.04, 0.01, 0.01]

@@ -235,7 +235,7 @@ export class View {
     const located = robot.located(now);
     const [px, py] = this.toScreen(pose.x, pose.y);
     const colour = located ? this.colours.TRACKING : this.colours[robot.state(now)] || this.colours.silent;
-    if (located && pose.protection) ring(context, px, py, pose.protection.m * this.camera.scale, colour);
+    if (located && pose.protection) ring(context, px, py, pose.protection.horizontal_m * this.camera.scale, colour);
     context.save();
     context.translate(px, py);
     context.rotate(-pose.yaw);

@@ -55,7 +55,7 @@ def test_pose_covariance_grows_with_distance_and_turn():
 def test_protection_level_grows_with_distance_and_keeps_its_doubt():
     known = np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
     robot = Robot()
-    robot.localized(0.0, covariance=known, protection=ProtectionLevel(9.0, 9.0, doubt=1.5))
+    robot.localized(0.0, covariance=known, protection=ProtectionLevel(9.0, 9.0, 9.0, 9.0, doubt=1.5))
     begin = robot.session.pose()
     assert begin.protection == protection_level(begin.covariance, 1.5)
     robot.drive(0.05, 2.0)
