@@ -61,6 +61,7 @@ BENCHMARKS = {
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "smooth": Benchmark("tracking.smoothing", "locate --smooth against live poses and the truth"),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
+    "faults": Benchmark("faults.run", "sensors that lie: false frames, the last pose, the cause being named"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors"),
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),

@@ -112,7 +112,7 @@ def built(source: Path, site: Path) -> Path:
         if done.returncode:
             raise InputError(f"building {site.name}: {done.stderr.strip().splitlines()[-1]}")
 
-    parts = (f"coview_stream/{part}" for part in ("basemap", "descriptors", "config"))
+    parts = (f"coview_stream/{part}" for part in ("basemap", "descriptors", "config/map.py"))
     remembered(site.with_suffix(".json"), {"bytes": source.stat().st_size, "code": fingerprint(*parts)}, build)
     return site
 
