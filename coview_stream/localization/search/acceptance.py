@@ -131,7 +131,7 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
         if undecided:
             return State.AMBIGUOUS, f"the place is found, but poses {undecided:.1f} m apart fit there equally"
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
-    if scored.moved.probability > rule.risk:
+    if scored.moved.probability > scored.error:  # it is the larger part of the error
         metres = f"{scored.moved.metres:.0f} m"
         wrong = f"wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
         return State.AMBIGUOUS, f"a part of what is seen may fit {metres} beside the rest: {wrong}"

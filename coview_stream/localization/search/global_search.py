@@ -122,6 +122,7 @@ class GlobalSearch:
             place = scored.places[0]
             modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
             leader, undecided = modes.best, modes.undecided
+        if leader is not None and scored.error < 0.5:  # a stated error that is not acted on has to be true as well
             scored = scored.doubted(find_moved_part(self.base_map.field, self._scorer.scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
         if result.accepted is not None:
