@@ -163,6 +163,12 @@ def _figure(value: float | None) -> str:
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
+def interval(events: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return Clopper-Pearson's two-sided interval of a share."""
+    one_sided = 0.5 * (1.0 + confidence)
+    return 1.0 - upper(runs - events, runs, one_sided), upper(events, runs, one_sided)
+
+
 def upper(events: int, runs: int, confidence: float = 0.95) -> float:
     """Return Clopper-Pearson's one-sided upper bound of a share; 1 without runs."""
     from scipy.stats import beta

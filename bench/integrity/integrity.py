@@ -3,8 +3,8 @@
 A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. The
 results of a site stay in ``--work``, so an interrupted benchmark resumes. Runs share sites, at most eight of them one
 map, but never map and drive; beside the share of false runs stands the share of sites with a false run. Bounds are
-Clopper-Pearson's, at 95 %, and hold for these families and this simulator. The first keyframe with a stated error below
-0.1, 0.01 and 0.001 is noted as well, and whether its most probable place was right (reliability).
+Clopper-Pearson's, at 95 %, and hold for these families and this simulator. Stated errors of all searched keyframes are
+noted, and whether the most probable place was right: how often they hold, by payment for looking again and again.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import os
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bench.harness.files import fingerprint, folder
-from bench.harness.rows import NOTHING, Row, informs, judged, number, table, upper
+from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan
 from bench.integrity.run import Result, everywhere
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
 
 OUTCOMES = ("right", "false", "none")  # of a run that counts; a failed run, or one without a street, does not
-FIX = 1e-4  # stated error below which a first fix counts in the table of reliability
 
 
 @dataclass(frozen=True)
@@ -115,20 +115,81 @@ def family_table(results: Sequence[Result]) -> str:
     return table(("family", "runs", "right", "false", "AMBIGUOUS", "SEARCHING", "false, below"), lines)
 
 
-def reliability_table(results: Sequence[Result]) -> str:
-    """Lay out how often a search is wrong: once a run, when it first states an error below each limit.
+def nothing(evidence: Floats) -> Floats:
+    """Pay nothing: Ville's inequality, which holds if the evidence is a martingale where every place is wrong."""
+    return evidence
 
-    Above :data:`FIX` it is the most probable place of the keyframe, accepted or not; below, the first fix.
+
+def looks(evidence: Floats) -> Floats:
+    """Divide by one more than the number of looks at eight keyframes."""
+    return np.asarray(evidence / looks_paid(len(evidence)))
+
+
+def each(evidence: Floats) -> Floats:
+    """Divide by j (j + 1): the shares 1 / (j (j + 1)) of the risk add up to one, whatever the keyframes share."""
+    j = np.arange(1, len(evidence) + 1)
+    return np.asarray(evidence / (j * (j + 1.0)))
+
+
+def adjusted(evidence: Floats) -> Floats:
+    """Adjust the largest evidence so far, which is kept: (e - 1 - log e) / log(e)^2 (Shafer and others, 2011)."""
+    most = np.maximum(np.maximum.accumulate(evidence), 1.0 + 1e-3)
+    return np.asarray((most - 1.0 - np.log(most)) / np.log(most) ** 2)
+
+
+def looks_paid(keyframes: int) -> Floats:
+    """Return the factors (J,) of :class:`~coview_stream.localization.search.scoring.PlaceScorer`."""
+    return np.asarray(1.0 + np.arange(1, keyframes + 1) // 8, dtype=np.float64)
+
+
+PAYMENTS = {"nothing (Ville)": nothing, "1 + j // 8": looks, "j (j + 1)": each, "largest, adjusted": adjusted}
+"""Payments for looking again and again: odds of all places together against none, by keyframe, to paid ones."""
+
+
+def stated_errors(run: Result, payment: Callable[[Floats], Floats]) -> Floats:
+    """Return the errors (J,) that a search would have stated at its keyframes with another payment."""
+    _, error, none, _ = np.array(run["searched"], dtype=np.float64).reshape(-1, 4).T
+    found = np.maximum(1.0 - none, 1e-12)
+    paid = payment(found / np.maximum(none, 1e-300) * looks_paid(len(none)))
+    none = 1.0 / (1.0 + paid)
+    return np.asarray(none + (1.0 - none) * np.maximum(found - (1.0 - error), 0.0) / found)
+
+
+def reliability_table(results: Sequence[Result]) -> str:
+    """Lay out stated against found errors by payment for looking again and again.
+
+    A search counts once for each limit, at its first keyframe with a stated error below it, accepted or not. Where no
+    place of the map is right, the share of searches that ever state an error below a limit should be below it. Metres
+    are to a stated error below the limit of the right place.
     """
-    counted = [run for run in results if run["outcome"] in OUTCOMES]
-    notes = {f"{limit:g}": [run["stated"].get(f"{limit:g}") for run in counted] for limit in STATED}
-    stated = {limit: [(note["error"], note["right"]) for note in found if note] for limit, found in notes.items()}
-    stated[f"{FIX:g}"] = [(run["risk"], run["outcome"] == "right") for run in counted if run.get("risk", 1.0) < FIX]
+    counted = [run for run in results if run["outcome"] in OUTCOMES and run["searched"]]
+    lost = [run["class"] == "outside" or run["family"] == "mirrored" for run in counted]
     lines = []
-    for limit, found in stated.items():
-        mean = f"{np.mean([error for error, _ in found]):.1e}" if found else NOTHING
-        lines.append([f"< {limit}", str(len(found)), mean, str(sum(not right for _, right in found))])
-    return table(("stated error", "first times", "mean stated", "wrong"), lines)
+    for name, payment in PAYMENTS.items():
+        stated = [stated_errors(run, payment) for run in counted]
+        for limit in STATED:
+            first = [(run, int((below < limit).argmax()), below) for run, below in zip(counted, stated, strict=True)]
+            found = [(run["searched"][k], below[k]) for run, k, below in first if below[k] < limit]
+            wrong = sum(not at[3] for at, _ in found)
+            metres = [at[0] for at, _ in found if at[3]]
+            ever = sum(bool(nowhere and (below < limit).any()) for nowhere, below in zip(lost, stated, strict=True))
+            mean = f"{np.mean([error for _, error in found]):.1e}" if found else NOTHING
+            lines.append([
+                name, f"< {limit:g}", str(len(found)), mean, str(wrong), between(wrong, len(found)),
+                f"{ever} of {sum(lost)}", between(ever, sum(lost)),
+                f"{np.median(metres):.1f}, {np.quantile(metres, 0.9):.1f}" if metres else NOTHING,
+            ])  # fmt: skip
+    head = (
+        "paid", "stated error", "first times", "mean stated", "wrong", "95 %", "no place is right", "95 %",
+        "right: median, 90 % m",
+    )  # fmt: skip
+    return table(head, lines)
+
+
+def between(events: int, runs: int) -> str:
+    """Write the interval of a share."""
+    low, high = interval(events, runs)
+    return f"{low:.1g} to {high:.1g}" if runs else NOTHING
 
 
 RUNS, QUICK = 1080, 60  # runs planned, and with ``--quick``

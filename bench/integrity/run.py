@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.harness.files import remembered, thread_settings
 from bench.integrity.kinds import built, draw, surveyed
-from bench.integrity.plan import FAMILIES, STATED, Run, Site
+from bench.integrity.plan import FAMILIES, Run, Site
 from bench.integrity.sites import beside_border, lane, rebuilt, shifted
 from coview_stream import BaseMap, Localizer
 from coview_stream.config import LocalizerConfig
@@ -123,6 +123,14 @@ def drive_of(run: Run) -> Drive | None:
     return Drive(poses, odometry, None if run.driven or run.family == "mirrored" else poses, frame)
 
 
+class Searched(NamedTuple):
+    """The most probable place of a searched keyframe."""
+
+    error: float  # stated
+    none: float  # probability of no place of the map
+    T_map_body: Pose
+
+
 class Robot:
     """A localizer on a map, and the search that answers its requests and shows the leader of a keyframe."""
 
@@ -133,38 +141,38 @@ class Robot:
         self.localizer.prepare()
         self.search = GlobalSearch(base, config, maps, index)
 
-    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Fix, tuple[float, Pose] | None]:
-        """Step as :meth:`Localizer.step`; also return stated error and pose of the most probable place of a search."""
-        request, leader = self.localizer.add_frame(cloud, T_odom_body, stamp), None
+    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Fix, Searched | None]:
+        """Step as :meth:`Localizer.step`; also return the most probable place where a keyframe was searched."""
+        request, searched = self.localizer.add_frame(cloud, T_odom_body, stamp), None
         if request is not None:
             result = self.search.update(request)
             self.localizer.apply_search_result(result)
-            if result.leader is not None and result.evidence.confidence is not None:
-                T = result.leader @ request.T_odom_body
-                leader = (1.0 - result.evidence.confidence, pose_from(T[:3, :3], T[:3, 3] + self.origin))
-        return self.localizer.fix(), leader
+            if result.leader is not None and result.considered is not None:
+                T, none = result.leader @ request.T_odom_body, result.considered.none
+                error = max(none, 1.0 - (result.evidence.confidence or 0.0))
+                searched = Searched(error, none, pose_from(T[:3, :3], T[:3, 3] + self.origin))
+        return self.localizer.fix(), searched
 
 
 def first_fix(robot: Robot, drive: Drive) -> Result:
-    """Follow a drive to its first fix; return outcome, last reason and stated errors.
+    """Follow a drive to its first fix; return outcome, last reason and searched keyframes.
 
-    ``stated`` has for each limit of :data:`STATED` the first keyframe below it: its error, and whether its most
-    probable place was right.
+    ``searched`` has for each the metres driven, the stated error, the probability of no place of the map, and whether
+    the most probable place was right.
     """
     robot.localizer.reset()
-    said, way, stated = "", drive.driven, dict[str, Result]()
-    out: Result = {"outcome": "none", "state": robot.localizer.state.value, "stated": stated}
+    said, way, searched = "", drive.driven, list[tuple[float, float, float, bool]]()
+    out: Result = {"outcome": "none", "state": robot.localizer.state.value, "searched": searched}
     for k, stamp in enumerate(drive.stamps):
         cloud = drive.frame(k)
         try:
-            fix, leader = robot.step(cloud, drive.odometry[k], float(stamp))
+            fix, place = robot.step(cloud, drive.odometry[k], float(stamp))
         except (CloudError, RunError):
             continue
         truth = None if drive.truth is None else drive.truth[k]
-        if leader is not None:
-            error, T = leader
-            new = {"error": error, "right": judged(T, truth)["outcome"] == "right"}
-            stated |= {f"{e:g}": new for e in STATED if error < e and f"{e:g}" not in stated}
+        if place is not None:
+            right = judged(place.T_map_body, truth)["outcome"] == "right"
+            searched.append((round(float(way[k]), 2), place.error, place.none, right))
         said = fix.evidence.reason if fix.evidence is not None else said
         out |= {"state": fix.state.value, "reason": said, "metres": round(float(way[k]), 2), "frames": k + 1}
         if fix.T_map_body is not None:
