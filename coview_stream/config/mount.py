@@ -52,7 +52,11 @@ class Mount:
 
     def turned(self, R: Floats) -> Mount:
         """Return the mount of this lidar if its clouds in the body frame have to be turned by ``R`` (3, 3) as well."""
-        T = pose_from(R, np.zeros(3)) @ self.T_body_sensor
+        return self.moved(pose_from(R, np.zeros(3)))
+
+    def moved(self, T_body_cloud: Pose) -> Mount:
+        """Return the mount of this lidar if its clouds in the body frame have to be moved by a pose (4, 4) as well."""
+        T = T_body_cloud @ self.T_body_sensor
         roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
         return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), *T[:3, 3].tolist())
 

@@ -213,7 +213,8 @@ class Localizer:
         calibration = self.calibration
         if self.state is not State.TRACKING or self._frames.anchor is None:
             return Fix(newest.stamp, self.state, evidence=evidence, calibration=calibration)
-        T_map_local = orthonormal(self._tracker.T_map_odom) @ newest.T_odom_body
+        T_odom_stamp = newest.T_odom_body @ self._frames.since_cloud(newest.stamp)
+        T_map_local = orthonormal(self._tracker.T_map_odom) @ T_odom_stamp
         T_map_body = pose_from(T_map_local[:3, :3], T_map_local[:3, 3] + self.base_map.origin)
         return Fix(
             newest.stamp,

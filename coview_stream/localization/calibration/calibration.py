@@ -11,13 +11,28 @@ import numpy as np
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rotation_angle
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
+    exp_so3,
+    inverse,
+    pose_from,
+    rot_z,
+    rotation_angle,
+    transform,
+)
 from coview_stream.odometry.deskew import SweepCorrection
 
 _LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
 """Least corrections that are reported: radians, factor, radians per metre, metres."""
-_MOVED_TILT, _MOVED_SCALE, _MOVED_TURN = math.radians(1.0), 0.02, math.radians(0.02)
+_TURNED, _SHIFTED, _LATE = math.radians(1.0), 0.1, 0.02
+"""Likewise: radians of heading, metres of lever arm, seconds."""
+_MOVED = {
+    "sigma_tilt": math.radians(1.0), "sigma_scale": 0.02, "sigma_turn": math.radians(0.02),
+    "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
+}  # fmt: skip
 """Least sigmas of a calibration from before the node started."""
+_ACCELERATION, _TURN_ACCELERATION = 1.0, 0.5  # m/s2 and rad/s2 of wheeled robots: late odometry does not show them
 
 
 @dataclass(frozen=True)
@@ -33,6 +48,13 @@ class Calibration:
         sigma_scale: one sigma of the scale.
         sigma_turn: one sigma of the turn, radians per metre.
         ground: height of the site's present ground above the survey's, metres.
+        heading: radians about the body's z that turn clouds into the body's axes, before roll and pitch.
+        lever_x: metres forward of the body's origin to the point that clouds take for it.
+        lever_y: metres to its left, likewise.
+        delay: seconds that clouds are stamped later than odometry; negative where odometry is late.
+        sigma_heading: one sigma of the heading, radians.
+        sigma_lever: one sigma of each of lever_x and lever_y, metres.
+        sigma_delay: one sigma of the delay, seconds.
     """
 
     roll: float = 0.0
@@ -43,16 +65,28 @@ class Calibration:
     sigma_scale: float = 0.03
     sigma_turn: float = math.radians(0.05)
     ground: float = 0.0
+    heading: float = 0.0
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    delay: float = 0.0
+    sigma_heading: float = math.radians(0.2)
+    sigma_lever: float = 0.01
+    sigma_delay: float = 0.002
+
+    @cached_property
+    def R_tilt(self) -> Floats:
+        """(3, 3) rotation that levels clouds in the body's heading."""
+        return exp_so3(np.array([self.roll, self.pitch, 0.0]))
 
     @cached_property
     def R_body_cloud(self) -> Floats:
-        """(3, 3) rotation that levels clouds."""
-        return exp_so3(np.array([self.roll, self.pitch, 0.0]))
+        """(3, 3) rotation that turns clouds into the body's axes."""
+        return self.R_tilt @ rot_z(self.heading) if self.heading else self.R_tilt
 
-    @property
+    @cached_property
     def T_body_cloud(self) -> Pose:
-        """(4, 4) the rotation as a transform."""
-        return pose_from(self.R_body_cloud, np.zeros(3))
+        """(4, 4) body <- cloud: rotation and lever arm."""
+        return pose_from(self.R_body_cloud, [self.lever_x, self.lever_y, 0.0])
 
     @property
     def sweep(self) -> SweepCorrection:
@@ -65,15 +99,46 @@ class Calibration:
 
     def level(self, cloud: Points) -> Points:
         """Return a cloud (N, 3) in the body's axes, from the sensor's."""
-        R = self.R_body_cloud
-        return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
+        T = self.T_body_cloud
+        return cloud if np.array_equal(T, np.eye(4)) else transform(T, cloud)
 
-    def motion_covariance(self, step: Floats) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the step's axes."""
+    def motion_covariance(self, step: Floats, turned: float = 0.0, change: Floats | None = None) -> Floats:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of odometry's motion between two clouds, in the step's axes.
+
+        Args:
+            step: (3,) metres.
+            turned: radians about z.
+            change: (3,) of the body's velocities (x, y, rotation about z) over the motion, the step's axes.
+        """
         along = np.concatenate([np.zeros(3), step])
-        spread = np.outer(along, along) * self.sigma_scale**2
+        across = np.concatenate([np.zeros(3), [-step[1], step[0], 0.0]])
+        spread = np.outer(along, along) * self.sigma_scale**2 + np.outer(across, across) * self.sigma_heading**2
         spread[2, 2] += (self.sigma_turn * float(np.linalg.norm(step))) ** 2
-        return np.asarray(spread)
+        spread[[3, 4], [3, 4]] += 2.0 * (1.0 - math.cos(turned)) * self.sigma_lever**2
+        if change is not None:
+            late = np.array([0.0, 0.0, change[2], change[0], change[1], 0.0])
+            spread += np.outer(late, late) * self.sigma_delay**2
+        return np.asarray(spread + 2.0 * self._extrapolated)
+
+    def pose_covariance(self, R_map_body: Floats, rates: Floats) -> Floats:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, that mount and clock add to a pose of the body.
+
+        ``R_map_body`` (3, 3); ``rates`` (3,) velocities x, y and rotation about z of the body, its axes. A cloud that
+        is late leaves the robot behind; odometry that is late is bridged to the stamp, and errs by accelerations.
+        """
+        spread = self._extrapolated.copy()
+        spread[2, 2] += self.sigma_heading**2
+        spread[[3, 4], [3, 4]] += self.sigma_lever**2
+        moving = np.concatenate([[0.0, 0.0, rates[2]], R_map_body @ [rates[0], rates[1], 0.0]])
+        late = 0.5 * (1.0 + math.erf(self.delay / max(self.sigma_delay, 1e-9) / math.sqrt(2.0)))  # probability
+        return np.asarray(spread + np.outer(moving, moving) * late * self.sigma_delay**2)
+
+    @property
+    def _extrapolated(self) -> Floats:
+        """(6, 6) covariance of odometry that is late, moved on to the stamp at constant velocities."""
+        grown = 0.5 * min(self.delay, 0.0) ** 2
+        moved = (grown * _ACCELERATION) ** 2
+        return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])
 
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Return one clause of text per noticeable correction.
@@ -81,16 +146,27 @@ class Calibration:
         Signs are as in ``--mount``; ``mount`` is already applied to the clouds.
         """
         clauses: list[str] = []
+        given = mount or Mount()
+        beyond = "" if given == Mount() else " beyond its mount"
+        remedy = f"set --mount={given.moved(self.T_body_cloud).option} to silence this"
         leans = [
             f"{math.degrees(angle):.1f} deg in {name}"
             for name, angle in (("roll", self.roll), ("pitch", self.pitch))
             if abs(angle) >= _LEAN
         ]
         if leans:
-            mount = mount or Mount()
-            beyond = "" if mount == Mount() else " beyond its mount"
-            remedy = f"set --mount={mount.turned(self.R_body_cloud).option} to silence this"
             clauses.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; {remedy}")
+        if abs(self.heading) >= _TURNED:
+            side = "left" if self.heading > 0 else "right"
+            angle = f"{abs(math.degrees(self.heading)):.1f} +- {math.degrees(self.sigma_heading):.1f} deg"
+            clauses.append(f"sensor is turned {angle} to the {side} on the body{beyond}: corrected; {remedy}")
+        if math.hypot(self.lever_x, self.lever_y) >= _SHIFTED:
+            place = f"{self.lever_x:.2f} m ahead and {self.lever_y:.2f} m left of the body's origin"
+            clauses.append(f"sensor sits {place}{beyond}, +- {self.sigma_lever:.2f} m: corrected; {remedy}")
+        if abs(self.delay) >= _LATE:
+            late, early = ("clouds", "odometry") if self.delay > 0 else ("odometry", "clouds")
+            size = f"{abs(self.delay):.3f} +- {self.sigma_delay:.3f} s"
+            clauses.append(f"{late} {'are' if late == 'clouds' else 'is'} {size} later than {early}: corrected")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"
             clauses.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")
@@ -106,12 +182,7 @@ class Calibration:
 
     def doubted(self) -> Calibration:
         """Return the calibration with wider sigmas: the sensor may have been moved since."""
-        return replace(
-            self,
-            sigma_tilt=max(self.sigma_tilt, _MOVED_TILT),
-            sigma_scale=max(self.sigma_scale, _MOVED_SCALE),
-            sigma_turn=max(self.sigma_turn, _MOVED_TURN),
-        )
+        return replace(self, **{name: max(getattr(self, name), least) for name, least in _MOVED.items()})
 
     def to_json(self, mount: Mount | None = None) -> dict[str, Any]:
         """Plain data: degrees, metres, factors, and the clauses of :meth:`describe`."""
@@ -124,6 +195,12 @@ class Calibration:
             "odometry_scale_sigma": round(self.sigma_scale, 4),
             "odometry_turn_deg_per_m": round(deg(self.turn), 3),
             "odometry_turn_sigma_deg_per_m": round(deg(self.sigma_turn), 3),
+            "heading_deg": round(deg(self.heading), 2),
+            "heading_sigma_deg": round(deg(self.sigma_heading), 2),
+            "lever_m": [round(self.lever_x, 3), round(self.lever_y, 3)],
+            "lever_sigma_m": round(self.sigma_lever, 3),
+            "clouds_late_s": round(self.delay, 4),
+            "clouds_late_sigma_s": round(self.sigma_delay, 4),
             "ground_offset_m": round(self.ground, 3),
             "says": self.describe(mount),
         }
@@ -137,13 +214,17 @@ class RawScan:
     Attributes:
         T_odom_body: (4, 4) odometry of the frame.
         calibration: the calibration of the frame's time.
+        rates: (3,) velocities x, y, metres per second, and rotation about z, radians per second, of the body, its axes.
     """
 
-    def __init__(self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None, rates: Floats | None = None
+    ) -> None:
         """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``calibration`` (default: none)."""
         self.T_odom_body = T_odom_body
         self.calibration = calibration or Calibration()
-        self._newest = self.calibration.R_body_cloud, points
+        self.rates = np.zeros(3) if rates is None else rates
+        self._newest = self.calibration.T_body_cloud, points
         self._raw: Points | None = None
 
     def __len__(self) -> int:
@@ -157,13 +238,11 @@ class RawScan:
 
     def levelled(self, calibration: Calibration) -> Points:
         """Return the points (N, 3) in the odometry frame, levelled by a calibration."""
-        R, points = self._newest
-        level = calibration.R_body_cloud
-        if np.array_equal(R, level):
+        T, points = self._newest
+        level = calibration.T_body_cloud
+        if np.array_equal(T, level):
             return points
-        position = self.position.astype(np.float32)
         if self._raw is None:
-            self._raw = (points - position) @ (self.T_odom_body[:3, :3] @ R).astype(np.float32)
-        turn = (self.T_odom_body[:3, :3] @ level).astype(np.float32)
-        self._newest = level, self._raw @ turn.T + position
+            self._raw = transform(inverse(self.T_odom_body @ T), points)
+        self._newest = level, transform(self.T_odom_body @ level, self._raw)
         return self._newest[1]

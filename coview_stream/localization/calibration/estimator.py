@@ -1,15 +1,16 @@
 """Kalman filter for the calibration of a robot's sensor and odometry.
 
-The state is x = (roll, pitch, s, w, g): tilt of the sensor against odometry's gravity, scale of odometry's distances
-less one, turn of its heading per metre, and lean of the odometry frame against the map (2 components). These are the
-systematic errors; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every believed
-registration to the map gives two measurements:
+The state is x = (roll, pitch, s, w, g, τ, ψ, l): tilt of the sensor against odometry's gravity, scale of odometry's
+distances less one, turn of its heading per metre, lean of the odometry frame against the map (2 components), seconds
+that clouds are stamped later than odometry, heading of the sensor on the body and its lever arm (2 components). These
+are the systematic errors; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every
+believed registration to the map gives two measurements:
 
 * Attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the residual
   tilt is u_map x u_odometry (eq. C1). The sensor's tilt turns with the body, the lean of the odometry frame does not;
   the pose graph follows the latter.
-* Motion since the previous registration against odometry's. They differ by s times the distance along the path and by
-  w times the distance in heading (eq. C2), apart from both registrations' errors and odometry's random walk.
+* Motion since the previous registration against odometry's (eq. C2, :func:`motion_jacobian`), apart from both
+  registrations' errors and odometry's random walk.
 
 A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk randomly
 with the metres driven. While a place only leads a search, the state is a mixture of two Gaussians: the place is right
@@ -18,8 +19,10 @@ and its attitude has been measured, or the place is wrong.
 
 from __future__ import annotations
 
+import itertools
 import math
 from copy import deepcopy
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,48 +40,111 @@ class _Prior(NamedTuple):
     wide: float  # sigma of a faulty one
     share: float  # probability of a fault
     walk: float  # sigma of the random walk, per square root of a metre
+    names: tuple[str, ...] = ()  # of the components in a Calibration
+    sigma: str = ""  # name of their sigma there
 
 
-_TILT = _Prior(slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03))
-_SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4)
-_TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4))
+_TILT = _Prior(
+    slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03), ("roll", "pitch"), "sigma_tilt"
+)
+_SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4, ("scale",), "sigma_scale")
+_TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4), ("turn",), "sigma_turn")
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
-_GROUPS = (_TILT, _SCALE, _TURN)  # corrected components
-_WIDE = np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide) for g in (*_GROUPS, GRAVITY)])
-SIZE = len(_WIDE)
+# Clocks and mounts are stated by who built the robot: a wrong one is a fault, rarer than the levels' risk or so.
+# Clocks that are set by PTP or by an edge agree within milliseconds, drawings within 0.2 degrees and a centimetre; a
+# queue is late by up to a second, a sensor sits within a metre or two
+_CLOCK = _Prior(slice(6, 7), 0.002, 0.5, 0.001, 3e-4, ("delay",), "sigma_delay")
+_HEADING = _Prior(
+    slice(7, 8), math.radians(0.2), math.radians(15.0), 0.002, math.radians(0.01), ("heading",), "sigma_heading"
+)
+_LEVER = _Prior(slice(8, 10), 0.01, 0.7, 0.0005, 5e-4, ("lever_x", "lever_y"), "sigma_lever")
+_GROUPS = (_TILT, _SCALE, _TURN, _CLOCK, _HEADING, _LEVER)  # corrected components
+_MOUNT = (_TILT, _HEADING, _LEVER)
+_RARE = (_CLOCK, _HEADING, _LEVER)
+_OF_SENSOR = (*_MOUNT, _CLOCK)  # none, where odometry is made of the sensor's own clouds
+SIZE = 10
 """Components of the state."""
+_WIDE = np.zeros(SIZE)
+for _group in (*_GROUPS, GRAVITY):
+    _WIDE[_group.axes] = _group.wide
+_MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that show in a motion
+_FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
+"""Choices (M, groups) of faulty groups."""
+_FREE = 1e6  # variance, in units of the wide prior's, that does not hold a component
+_STEPPED = 0.5  # probability of a fault where something speaks for a step
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
 
+def motion_jacobian(step: Pose, rates: Floats, scale: float = 0.0) -> Floats:
+    """Return the derivatives (3, 6) of a motion between clouds, (x, y, heading), by (s, w, τ, ψ, l) (eq. C2).
+
+    With t, R odometry's motion, v, Ω the body's velocity and rotation rate at its ends, z the vertical,
+
+        t' = t + s t + w |t| z x t / 2 - τ (R v2 - v1 - Ω1 x t) - ψ z x t + (R - I) l
+        heading' = heading + w |t| - τ (Ω2 - Ω1)
+
+    Args:
+        step: (4, 4) odometry's motion, in the body's axes at its start.
+        rates: (2, 3) velocities x, y and rotation about z at start and end, in the body's axes there.
+        scale: by which the step is corrected.
+    """
+    t, R = step[:2, 3], step[:2, :2]
+    across = np.array([-t[1], t[0]])
+    raw = float(np.linalg.norm(step[:3, 3])) / (1.0 + scale)
+    (*v1, w1), (*v2, w2) = rates.tolist()
+    J = np.zeros((3, 6))
+    J[:2, 0] = t / (1.0 + scale)
+    J[:, 1] = *(0.5 * raw * across), raw
+    J[:, 2] = *(np.array(v1) - R @ v2 + w1 * across), w1 - w2
+    J[:2, 3] = -across
+    J[:2, 4:] = R - np.eye(2)
+    return J
+
+
 class CalibrationBelief:
-    """Gaussian over the state x = (roll, pitch, s, w, g), with heavier tails where measurements contradict it.
+    """Gaussian over the state x = (roll, pitch, s, w, g, τ, ψ, l), with heavier tails where measurements contradict it.
 
     Most sensors stand straight and most odometry has the right scale. So a group is a mixture of a narrow prior about
-    zero and a wide one; the applied value is the mean of both by their probabilities (Savage-Dickey ratio, eq. C3).
+    zero, or an earlier value, and a wide one; the applied value is the mean of both by their probabilities
+    (Savage-Dickey ratio, eq. C3).
 
     Attributes:
-        x: (6,) mean.
-        P: (6, 6) covariance.
+        x: (10,) mean.
+        P: (10, 10) covariance.
     """
 
     def __init__(self, sensor_leans: bool) -> None:
         self.x = np.zeros(SIZE)
         self.P = np.diag(_WIDE**2)
+        self._centre = np.zeros(SIZE)  # of the narrow priors
+        self._exact = {group.sigma: group.exact for group in _GROUPS}
+        self._shares = {group.sigma: group.share for group in _GROUPS}
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
     def learn(self, earlier: Calibration) -> None:
         """See :meth:`CalibrationEstimator.learn`."""
         present = self.applied()
-        values = np.array([earlier.roll, earlier.pitch, earlier.scale, earlier.turn])
-        sigmas = (earlier.sigma_tilt, earlier.sigma_scale, earlier.sigma_turn)
-        limits = (present.sigma_tilt, present.sigma_scale, present.sigma_turn)
-        for group, sigma, limit in zip(_GROUPS, sigmas, limits, strict=True):
-            if sigma < limit:
-                self.x[group.axes] = values[group.axes]
+        for group in _GROUPS:
+            sigma, axes = getattr(earlier, group.sigma), np.arange(SIZE)[group.axes]
+            values = [getattr(earlier, name) for name in group.names]
+            if group in _RARE and sigma**2 < self.P[axes, axes].mean():  # as it was, rather than as it should be
+                self.x[group.axes] = self._centre[group.axes] = values
+                self._exact[group.sigma] = max(sigma, group.exact)
+            elif group not in _RARE and sigma < getattr(present, group.sigma):
+                self.x[group.axes] = values
                 self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
-                axes = np.arange(SIZE)[group.axes]
                 self.P[axes, axes] = sigma**2
+        self._stand_straight()
+
+    def widen(self, groups: tuple[_Prior, ...]) -> None:
+        """Suppose that components have taken a step from their present values, or not."""
+        present = self.applied()
+        for group in groups:
+            self._centre[group.axes] = [getattr(present, name) for name in group.names]
+            self._shares[group.sigma] = _STEPPED
+            axes = np.arange(SIZE)[group.axes]
+            self.P[axes, axes] += group.wide**2
         self._stand_straight()
 
     def begin_odometry(self) -> None:
@@ -116,25 +182,42 @@ class CalibrationBelief:
         return -0.5 * float(gap @ np.linalg.solve(spread, gap) + np.linalg.slogdet(spread)[1])
 
     def applied(self) -> Calibration:
-        """Return the mean of the narrow and the wide prior, group by group (eq. C3)."""
-        means, sigmas = np.zeros(4), []
-        for group in _GROUPS:
-            x, P = self.x[group.axes], self.P[group.axes, group.axes]
-            size = len(x)
-            spread = P + group.exact**2 * np.eye(size)
-            exact = -0.5 * (x @ np.linalg.solve(spread, x) + np.linalg.slogdet(spread)[1]) + size * math.log(group.wide)
-            weight = 1.0 / (1.0 + (1.0 - group.share) / group.share * math.exp(min(exact, 500.0)))
-            means[group.axes] = weight * x
-            variance = group.exact**2 * np.trace(P) / (np.trace(P) + size * group.exact**2)
-            within = weight * np.trace(P) + (1.0 - weight) * variance
-            sigmas.append(math.sqrt((within + weight * (1.0 - weight) * float(x @ x)) / size))
-        return Calibration(*means.tolist(), *sigmas)
+        """Return the mean and sigmas of the mixture over all choices of faulty groups (eq. C3)."""
+        values: dict[str, float] = {}
+        for groups, faulty in ((_GROUPS[:1], _FAULTY[1]), (_GROUPS[1:], _FAULTY[len(_GROUPS) - 1])):
+            axes = np.concatenate([np.arange(SIZE)[group.axes] for group in groups])
+            sizes = [group.axes.stop - group.axes.start for group in groups]
+            x, P = self.x[axes] - self._centre[axes], self.P[np.ix_(axes, axes)]
+            exact = np.repeat([self._exact[group.sigma] for group in groups], sizes)
+            wide = np.repeat([group.wide for group in groups], sizes)
+            shares = np.array([self._shares[group.sigma] for group in groups])
+            free = np.repeat(faulty, sizes, axis=1)  # (M, K): the component may be anything
+            # components that are as they should be are a measurement of zero, in units of their wide prior
+            noise = np.where(free, _FREE, (exact / wide) ** 2)
+            spread = P / np.outer(wide, wide) + noise[:, :, None] * np.eye(len(axes))
+            pull = np.linalg.solve(spread, np.column_stack([x / wide, P / np.outer(wide, wide)])[None])
+            fit = np.linalg.slogdet(spread)[1] - (free * math.log(_FREE)).sum(axis=1) + pull[:, :, 0] @ (x / wide)
+            prior = np.where(faulty, np.log(shares), np.log1p(-shares)).sum(axis=1)
+            weights = np.exp(prior - 0.5 * fit - (prior - 0.5 * fit).max())
+            weights /= weights.sum()
+            means = x - pull[:, :, 0] @ (P / wide).T  # (M, K)
+            variances = np.diag(P) - wide * np.einsum("ij,mji->mi", P / np.outer(wide, wide), pull[:, :, 1:]) * wide
+            mean = weights @ means
+            variance = weights @ (variances + means**2) - mean**2
+            at = 0
+            for group, size in zip(groups, sizes, strict=True):
+                own = slice(at, at + size)
+                at += size
+                values |= dict(zip(group.names, (self._centre[group.axes] + mean[own]).tolist(), strict=True))
+                values[group.sigma] = math.sqrt(max(float(variance[own].mean()), 0.0))
+        return Calibration(**values)
 
     def _stand_straight(self) -> None:
-        """Fix the tilt at zero for a sensor that cannot lean: then odometry's gravity leans."""
+        """Fix mount and clock at zero for odometry that is made of the clouds: then odometry's gravity leans."""
         if not self._sensor_leans:
-            self.x[:2] = 0.0
-            self.P[:2], self.P[:, :2] = 0.0, 0.0
+            for group in _OF_SENSOR:
+                self.x[group.axes] = self._centre[group.axes] = 0.0
+                self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
 
 
 def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
@@ -143,19 +226,14 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
     def mean(a: float, b: float) -> float:
         return (1.0 - share) * a + share * b
 
-    def sigma(a: float, b: float, apart: float) -> float:
-        return math.sqrt(mean(a**2, b**2) + share * (1.0 - share) * apart**2)
-
-    apart = math.hypot(one.roll - other.roll, one.pitch - other.pitch) / math.sqrt(2.0)  # per angle
-    return Calibration(
-        mean(one.roll, other.roll),
-        mean(one.pitch, other.pitch),
-        mean(one.scale, other.scale),
-        mean(one.turn, other.turn),
-        sigma(one.sigma_tilt, other.sigma_tilt, apart),
-        sigma(one.sigma_scale, other.sigma_scale, one.scale - other.scale),
-        sigma(one.sigma_turn, other.sigma_turn, one.turn - other.turn),
-    )
+    values: dict[str, float] = {}
+    for group in _GROUPS:
+        pairs = [(getattr(one, name), getattr(other, name)) for name in group.names]
+        apart = sum((a - b) ** 2 for a, b in pairs) / len(pairs)  # per component
+        within = mean(getattr(one, group.sigma) ** 2, getattr(other, group.sigma) ** 2)
+        values |= {name: mean(*pair) for name, pair in zip(group.names, pairs, strict=True)}
+        values[group.sigma] = math.sqrt(within + share * (1.0 - share) * apart)
+    return replace(one, **values)
 
 
 def heavier(distance: float, size: int) -> float:
@@ -166,6 +244,7 @@ def heavier(distance: float, size: int) -> float:
 _ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch, added to its covariance
 _LEAN = 3.0  # ratio of the roll and pitch errors of a frame-to-frame motion to its heading error
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the motion's errors
+_MIN_TURN = math.radians(5.0)  # likewise
 
 
 class CalibrationEstimator:
@@ -218,34 +297,54 @@ class CalibrationEstimator:
         _measure_attitude(self._supposed, T_map_cloud, T_odom_body, variance)
         self._apply()
 
-    def measure_motion(self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats) -> Pose:
+    def widen_mount(self) -> None:
+        """Suppose that the sensor may have been turned or shifted on the body."""
+        self._widen(_MOUNT)
+
+    def widen_clock(self) -> None:
+        """Suppose that the clock of clouds or odometry may have taken a step."""
+        self._widen((_CLOCK,))
+
+    def _widen(self, groups: tuple[_Prior, ...]) -> None:
+        self._supposed = None
+        self._known.widen(groups)
+        self._apply()
+
+    def measure_motion(
+        self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats, rates: Floats | None = None
+    ) -> Pose:
         """Add the motion between two registrations (eq. C2); return ``step`` corrected by the new calibration.
 
         Args:
             T_map_before: (4, 4) earlier pose, the prior removed.
             T_map_body: (4, 4) later pose, likewise.
             step: (4, 4) odometry between them, corrected by the calibration of its time.
-            noise: (2,) variances along the path and of the heading, without the calibration's.
+            noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at the start, without the
+                calibration's.
+            rates: (2, 3) as of :func:`motion_jacobian`; None without a delay. Where they are not known (NaN) the motion
+                is not used: a robot that begins to move looks as if its clouds were late.
         """
         driven = float(np.linalg.norm(step[:3, 3]))
-        if driven < _MIN_STEP:
+        turned = abs(float(log_so3(step[:3, :3])[2]))
+        if (driven < _MIN_STEP and turned < _MIN_TURN) or (rates is not None and not np.isfinite(rates).all()):
             return step
         for belief in filter(None, (self._known, self._supposed)):
             belief.walk(driven)
         motion = inverse(T_map_before) @ T_map_body
-        along = float((motion[:3, 3] - step[:3, 3]) @ step[:3, 3]) / driven
-        turned = float(log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
+        gap = np.append(motion[:2, 3] - step[:2, 3], log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
         before = self.calibration
-        raw = driven / (1.0 + before.scale)
-        for axis, gap, applied in ((2, along, before.scale), (3, turned, before.turn)):
-            H = np.zeros((1, SIZE))
-            H[0, axis] = raw
-            self._update(np.array([gap + applied * raw]), H, np.array([[noise[axis - 2]]]))
+        J = motion_jacobian(step, np.zeros((2, 3)) if rates is None else rates, before.scale)
+        H = np.zeros((3, SIZE))
+        H[:, _MOTION] = J
+        self._update(gap + J @ _motion_part(before), H, noise)
         now = self.calibration
-        turn = exp_so3(np.array([0.0, 0.0, (now.turn - before.turn) * raw]))
-        return pose_from(turn @ step[:3, :3], (1.0 + now.scale) / (1.0 + before.scale) * step[:3, 3])
+        moved = J @ (_motion_part(now) - _motion_part(before))
+        t = np.append(step[:2, 3] + moved[:2], (1.0 + now.scale) / (1.0 + before.scale) * step[2, 3])
+        return pose_from(exp_so3(np.array([0.0, 0.0, moved[2]])) @ step[:3, :3], t)
 
-    def measure_frames(self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float) -> Pose:
+    def measure_frames(
+        self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float, rates: Floats | None = None
+    ) -> Pose:
         """Add a motion between frames measured by the lidar alone (eq. C4); return ``step``, newly corrected.
 
         Args:
@@ -254,9 +353,10 @@ class CalibrationEstimator:
             variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
             position: sigma of ``motion``, metres.
             angle: sigma of ``motion``, radians.
+            rates: as of :meth:`measure_motion`.
         """
         t, before = step[:3, 3], self.calibration
-        applied = log_so3(before.R_body_cloud)[:2]
+        applied = np.array([before.roll, before.pitch])
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         # a tilted sensor sees a climb
         H = np.zeros((1, SIZE))
@@ -266,9 +366,9 @@ class CalibrationEstimator:
         H = np.zeros((2, SIZE))
         H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # the lidar's heading, which is better than odometry's
         self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
-        noise = np.array([variances[3] + position**2, variances[2] + angle**2])
-        level = pose_from(self.calibration.R_body_cloud @ before.R_body_cloud.T, np.zeros(3))
-        return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise)
+        noise = np.diag(variances[[3, 4, 2]] + np.array([position, position, angle]) ** 2)
+        level = self.calibration.T_body_cloud @ inverse(before.T_body_cloud)
+        return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, rates)
 
     def _update(self, measured: Floats, H: Floats, R: Floats) -> None:
         """Add a measurement ``measured`` = H x + noise of covariance R to both beliefs."""
@@ -285,11 +385,17 @@ class CalibrationEstimator:
             self.calibration = mixed(self.calibration, self._supposed.applied(), self._probability)
 
 
+def _motion_part(calibration: Calibration) -> Floats:
+    """Return the values (6,) of the components that show in a motion."""
+    c = calibration
+    return np.array([c.scale, c.turn, c.delay, c.heading, c.lever_x, c.lever_y])
+
+
 def _measure_attitude(belief: CalibrationBelief, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
-    R_body_cloud = belief.applied().R_body_cloud
-    residual = np.cross((T_map_cloud[:3, :3] @ R_body_cloud.T)[2], T_odom_body[2, :3])
+    applied = belief.applied()
+    residual = np.cross((T_map_cloud[:3, :3] @ applied.R_body_cloud.T)[2], T_odom_body[2, :3])
     residual[2] = 0.0
-    measured = log_so3(exp_so3(residual) @ R_body_cloud)[:2]
+    measured = log_so3(exp_so3(residual) @ applied.R_tilt)[:2]
     H = np.eye(2, SIZE)
     H[:, GRAVITY.axes] = T_odom_body[:2, :2].T  # the lean of odometry's frame turns with the body
     R = np.eye(2) * (variance + _ATTITUDE**2)

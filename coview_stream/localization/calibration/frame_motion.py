@@ -24,7 +24,7 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
@@ -37,7 +37,6 @@ _FREE_METRE = 0.1  # prior sigmas of the motion about odometry's: constant, and 
 _POSITION = 0.02  # sigma of a registered motion, metres
 _POSITION_METRE = 0.01  # and per metre driven: as in three real runs at two to eight metres a step
 _ANGLE = math.radians(0.2)  # sigma of a registered motion
-_HEADING = math.radians(1.0)  # sigma of the heading of the sensor on the body
 _POORER = 3.0  # times the configured drift that odometry may have
 _FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
 _FAILED_ANGLE = math.radians(3.0)
@@ -60,6 +59,7 @@ class _Reference(NamedTuple):
     points: Points  # (K, 3) on surfaces, sensor's axes
     normals: Floats32  # (K, 3) of the points
     T_odom_body: Pose  # (4, 4) corrected odometry
+    rates: Floats | None  # (3,) as of a RawScan
 
 
 class FrameMotion:
@@ -81,7 +81,10 @@ class FrameMotion:
             return True
         return float(np.linalg.norm(T_odom_body[:3, 3] - self._reference.T_odom_body[:3, 3])) >= self._distance
 
-    def refine(self, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator, drift: Variances) -> Pose:
+    def refine(
+        self, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator, drift: Variances,
+        rates: Floats | None = None,
+    ) -> Pose:  # fmt: skip
         """Register a frame to the previous keyframe; return its odometry (4, 4), corrected by the result.
 
         Args:
@@ -89,13 +92,15 @@ class FrameMotion:
             T_odom_body: (4, 4) odometry, corrected by the estimator's calibration.
             estimator: gets the motion as a measurement.
             drift: of odometry.
+            rates: (3,) as of a RawScan.
         """
         reference = self._reference
         if reference is not None:
             T_registered = self._registered(reference, points, T_odom_body, estimator)
             if T_registered is not None:
-                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift)
-        self._reference = _Reference(*surface_points(points), T_odom_body)
+                both = None if reference.rates is None or rates is None else np.array([reference.rates, rates])
+                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift, both)
+        self._reference = _Reference(*surface_points(points), T_odom_body, rates)
         return T_odom_body
 
     def _registered(
@@ -121,18 +126,19 @@ class FrameMotion:
 
 
 def _corrected(
-    before: Pose, T_odom_body: Pose, T_registered: Pose, estimator: CalibrationEstimator, drift: Variances
-) -> Pose:
+    before: Pose, T_odom_body: Pose, T_registered: Pose, estimator: CalibrationEstimator, drift: Variances,
+    rates: Floats | None,
+) -> Pose:  # fmt: skip
     """Give the estimator a registered motion from ``before`` (4, 4); return the newest odometry (4, 4), fused."""
-    level = estimator.calibration.R_body_cloud
+    level = estimator.calibration.T_body_cloud
     motion, step = inverse(before) @ T_registered, inverse(before) @ T_odom_body
     far = float(np.linalg.norm(step[:3, 3]))
     variances = drift(far, abs(yaw_of(step)))
     position = math.hypot(_POSITION, _POSITION_METRE * far)
     right = _probability_right(motion, step, variances, estimator.calibration, position)
     sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
-    step = estimator.measure_frames(motion, step, variances, *sigmas)
-    turn = pose_from(estimator.calibration.R_body_cloud @ level.T, np.zeros(3))
+    step = estimator.measure_frames(motion, step, variances, *sigmas, rates)
+    turn = estimator.calibration.T_body_cloud @ inverse(level)
     motion = turn @ motion @ inverse(turn)
     return _fused(before @ step, before @ motion, variances, *sigmas)
 
@@ -168,8 +174,8 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration:
     """
     far = float(np.linalg.norm(step[:3, 3]))
     gap = np.concatenate([log_so3(motion[:3, :3] @ step[:3, :3].T), motion[:3, 3] - step[:3, 3]])
-    tilt = calibration.sigma_tilt * far
-    constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, _HEADING * far, tilt])
+    tilt, sigma = calibration.sigma_tilt * far, calibration.sigma_heading
+    constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, sigma * far, tilt])
     noise = np.array([_ANGLE] * 3 + [position] * 3)
     right = _POORER**2 * variances + constant**2 + noise**2
     turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that shows in rotation

@@ -71,7 +71,7 @@ class Tracker:
 
     def add_scan(self, scan: RawScan) -> None:
         """Add a frame: its points, one per voxel, and its odometry."""
-        self.odometry.add_pose(scan.T_odom_body)
+        self.odometry.add_pose(scan.T_odom_body, scan.rates)
         self._scans.add(scan, self.odometry.travelled)
         self._unregistered += 1
 
@@ -201,8 +201,13 @@ class Tracker:
         return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
 
     def reported_covariance(self) -> Floats:
-        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), with the error that all registrations share, map axes."""
-        return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
+        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
+
+        Sum of the cloud's, the error that all registrations share, and errors of mount and clock.
+        """
+        R = self.T_map_odom[:3, :3] if self.odometry.pose is None else (self.T_map_odom @ self.odometry.pose)[:3, :3]
+        calibration = self._calibration.calibration.pose_covariance(R, np.nan_to_num(self.odometry.rates))
+        return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance + calibration)
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
@@ -223,7 +228,10 @@ class Tracker:
         spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self.odometry.motion(T_odom_body)
         calibration = self._calibration.calibration
-        spread += calibration.motion_covariance(self._belief().T_map_body[:3, :3] @ motion[:3, 3])
+        R = self._belief().T_map_body[:3, :3]
+        change = self.odometry.change()
+        change[:2] = R[:2, :2] @ change[:2]
+        spread += calibration.motion_covariance(R @ motion[:3, 3], yaw_of(motion), change)
         level = calibration.T_body_cloud
         self._graph.move(inverse(level) @ motion @ level, spread)
         self.odometry.set_keyframe(T_odom_body)

@@ -23,6 +23,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from coview_stream.config.mount import MAX_LEVER
 from coview_stream.errors import ConfigError, InputError, MessageError
 from coview_stream.geometry.transforms import Pose, is_pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
@@ -38,6 +39,7 @@ _FORMAT = "coview_stream last pose"
 _MAX_BYTES = 65_536  # of a file; ours have 500
 _MAX_NAME = 60  # characters of a robot's name in that of its file
 _MAX_LEAN = float(np.radians(45.0))  # of a sensor against its mount
+_MAX_DELAY = 60.0  # seconds of clouds after odometry
 _MAX_GUESS_BYTES = 4096
 _SIGMAS = 2.0  # of a covariance that are tried around its pose
 _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
@@ -205,12 +207,17 @@ def _read_calibration(plain: Any) -> Calibration | None:
         raise ValueError("its calibration is something else")
     names = {f.name for f in fields(Calibration)}
     calibration = Calibration(**{name: float(value) for name, value in plain.items() if name in names})
-    sigmas = all(0 <= s < 1 for s in (calibration.sigma_tilt, calibration.sigma_scale, calibration.sigma_turn))
+    c = calibration
+    sigmas = all(0 <= s < 1 for s in (c.sigma_tilt, c.sigma_scale, c.sigma_turn, c.sigma_heading, c.sigma_delay))
     if not (
         sigmas
         and math.hypot(calibration.roll, calibration.pitch) < _MAX_LEAN
         and abs(calibration.scale) + abs(calibration.turn) < 1
         and abs(calibration.ground) < 10
+        and abs(calibration.heading) <= math.pi
+        and math.hypot(calibration.lever_x, calibration.lever_y) < MAX_LEVER
+        and 0 <= calibration.sigma_lever < MAX_LEVER
+        and abs(calibration.delay) < _MAX_DELAY
     ):
         raise ValueError("its calibration is none of a robot")
     return calibration

@@ -135,7 +135,8 @@ def test_scale_is_restored_where_the_sensor_cannot_lean(world_map):
     """Lidar odometry levels itself: its tilt is known for sure, and says nothing of how well the scale is."""
     localizer = Localizer(world_map, LocalizerConfig(sensor_leans=False))
     localizer.hint_calibration(Calibration(pitch=0.05, scale=0.03, sigma_scale=0.001))
-    assert 0.008 < localizer.calibration.scale < 0.03  # doubted, for wheels may have been changed
+    assert 0.008 < localizer.calibration.scale < 0.03
+    assert localizer.calibration.sigma_scale > 0.01  # doubted, for wheels may have been changed
     assert localizer.calibration.pitch == 0.0
 
 

@@ -12,7 +12,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.frame import OdometryCorrection
 
-NOISE = np.array([0.02**2, np.radians(0.1) ** 2])  # along the way, of the heading
+NOISE = np.diag([0.02**2, 0.02**2, np.radians(0.1) ** 2])  # along the way, across, of the heading
 
 
 @pytest.mark.parametrize("scale", [0.9, 1.1])

@@ -40,6 +40,7 @@ def test_newest_pose_comes_back(tmp_path):
     "known",
     [
         Calibration(0.01, -0.05, 0.03, 1e-4, 0.002, 0.001, 1e-5),
+        Calibration(heading=-0.5, lever_x=0.6, delay=-0.3, sigma_heading=0.01, sigma_lever=0.1, sigma_delay=0.004),
         CalibrationEstimator(sensor_leans=False).calibration,  # lidar odometry knows the tilt: its sigma is zero
     ],
 )
@@ -52,7 +53,11 @@ def test_calibration_comes_back_with_the_pose(tmp_path, known):
 
 @pytest.mark.parametrize(
     "wrong",
-    [5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": -0.1}, {"scale": float("nan")}, {"ground": float("nan")}],
+    [
+        *(5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": -0.1}, {"scale": float("nan")}),
+        *({"ground": float("nan")}, {"heading": 4.0}, {"lever_x": 200.0}, {"delay": float("inf")}),
+        {"sigma_delay": -1.0},
+    ],
 )
 def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
     path = save(tmp_path, "r1", LAST)

@@ -1,0 +1,165 @@
+"""Mount and clock as states: heading and lever arm of the sensor, and the delay between clouds and odometry."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from se3 import exp_se3
+
+from coview_stream.config.mount import Mount
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.frame import OdometryCorrection, OdometryHistory
+
+POSITION, HEADING = 0.01, np.radians(0.1)  # sigmas of a registration
+RATE = 100  # poses of the way per second
+
+
+def way(speed, rate, seconds=60.0):
+    """Poses (N, 4, 4) of a robot, a hundred a second, of its speed and turning rate at each moment."""
+    T, poses = np.eye(4), []
+    for t in np.arange(int(seconds * RATE)) / RATE:
+        poses.append(T)
+        T = T @ exp_se3(np.array([0.0, 0.0, rate(t), speed(t), 0.0, 0.0]) / RATE)
+    return np.array(poses)
+
+
+WINDING = way(lambda t: 1.5 + 0.8 * np.sin(0.9 * t), lambda t: 0.5 * np.sin(0.4 * t))
+STRAIGHT = way(lambda t: 1.5, lambda t: 0.0)
+
+
+class Drive(NamedTuple):
+    """A drive along known poses, registered to the map once a second, with a delay and a mount."""
+
+    poses: np.ndarray
+    delay: float = 0.0
+    mount: np.ndarray = np.eye(4)
+
+    def learnt(self, earlier=None):
+        """Return the estimator after the drive."""
+        estimator, correction, history, rng = CalibrationEstimator(), OdometryCorrection(), OdometryHistory(), None
+        rng = np.random.default_rng(1)
+        if earlier is not None:
+            estimator.learn(earlier)
+        newest = marked = None
+        for stamp in np.arange(2.0, 58.0, 0.1):
+            late = estimator.calibration.delay
+            before = None if newest is None else history.at(newest - late)
+            history.add(stamp, self.at(stamp - max(-self.delay, 0.0)))
+            newest = stamp
+            T = correction.correct(history.at(stamp - late), estimator.calibration, before)
+            if round(10 * stamp) % 10:
+                continue
+            noise = exp_se3(rng.normal(0.0, [0, 0, HEADING, POSITION, POSITION, 0]))
+            T_cloud = self.at(stamp - max(self.delay, 0.0)) @ self.mount @ noise
+            mark = T, history.rates(stamp - late), T_cloud
+            if marked is not None:
+                level = inverse(estimator.calibration.T_body_cloud)
+                spread = 2.0 * np.diag([POSITION, POSITION + 1.5 * HEADING, HEADING]) ** 2
+                estimator.measure_motion(
+                    marked[2] @ level, T_cloud @ level, inverse(marked[0]) @ T, spread, np.array([marked[1], mark[1]])
+                )
+            marked = mark
+        return estimator
+
+    def at(self, stamp):
+        """Return the body's pose (4, 4) at a time."""
+        return self.poses[round(stamp * RATE)]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.12, -0.12, 0.4, -0.3])
+def test_delay_is_measured_where_the_robot_turns_and_accelerates(delay):
+    found = Drive(WINDING, delay).learnt().calibration
+    assert found.delay == pytest.approx(delay, abs=max(0.01, 4.0 * found.sigma_delay))
+    assert found.sigma_delay < 0.01
+    assert abs(np.degrees(found.heading)) < 0.1
+    assert np.hypot(found.lever_x, found.lever_y) < 0.02
+
+
+def test_heading_and_lever_arm_are_measured():
+    mount = pose_from(rot_z(np.radians(-20.0)), [0.6, -0.3, 0.0])
+    found = Drive(WINDING, mount=mount).learnt().calibration
+    np.testing.assert_allclose(found.T_body_cloud[:2, 3], mount[:2, 3], atol=0.04)
+    assert np.degrees(rotation_angle(found.R_body_cloud.T @ mount[:3, :3])) < 0.2
+    assert abs(found.delay) < 0.01
+    assert any("--mount=0,0,-20" in clause for clause in found.describe())
+
+
+def test_straight_ahead_at_constant_speed_tells_the_heading_alone():
+    prior = CalibrationEstimator().calibration
+    mount = pose_from(rot_z(np.radians(5.0)), [0.6, 0.0, 0.0])
+    found = Drive(STRAIGHT, 0.2, mount).learnt().calibration
+    assert np.degrees(found.heading) == pytest.approx(5.0, abs=0.2)
+    assert found.sigma_heading < 0.3 * prior.sigma_heading
+    assert found.sigma_lever > 0.7 * prior.sigma_lever
+    assert found.sigma_delay > 0.7 * prior.sigma_delay
+    assert abs(found.delay) < 0.02
+
+
+def test_step_is_followed_once_it_is_supposed():
+    """Ten metres after a sensor has turned by ten degrees; the state is sure of the earlier heading."""
+    estimator = Drive(WINDING).learnt()
+    sure = estimator.calibration.sigma_heading
+    estimator.widen_mount()
+    estimator.widen_clock()
+    wide = estimator.calibration
+    assert wide.sigma_heading > np.radians(5.0) > 20.0 * sure
+    assert wide.sigma_lever > 0.3
+    assert wide.sigma_delay > 0.2
+    assert wide.heading == pytest.approx(0.0, abs=np.radians(0.1))  # as likely as any other
+    turned = rot_z(np.radians(10.0))
+    for _ in range(10):
+        level = inverse(estimator.calibration.T_body_cloud)
+        T = pose_from(turned, np.zeros(3))
+        seen = inverse(T) @ pose_from(np.eye(3), [1.0, 0.0, 0.0]) @ T
+        spread = np.diag([POSITION, POSITION, HEADING]) ** 2
+        estimator.measure_motion(level, seen @ level, pose_from(np.eye(3), [1.0, 0.0, 0.0]), spread, np.zeros((2, 3)))
+    assert np.degrees(estimator.calibration.heading) == pytest.approx(10.0, abs=0.3)
+
+
+def test_earlier_mount_and_clock_are_kept_until_refuted():
+    earlier = Calibration(
+        delay=0.1, heading=np.radians(3.0), lever_x=0.5, sigma_delay=1e-3, sigma_heading=1e-3, sigma_lever=1e-2
+    )
+    estimator = CalibrationEstimator()
+    estimator.learn(earlier.doubted())
+    found = estimator.calibration
+    assert (found.delay, found.heading, found.lever_x) == pytest.approx((0.1, np.radians(3.0), 0.5), rel=0.01)
+    assert abs(Drive(WINDING).learnt(earlier.doubted()).calibration.delay) < 0.01
+
+
+def test_odometry_is_read_between_and_beyond_its_samples():
+    history, turn = OdometryHistory(), pose_from(rot_z(0.05), rot_z(0.025) @ [0.2, 0.0, 0.0])
+    poses = [np.eye(4), turn, turn @ turn]
+    for k, T in enumerate(poses):
+        history.add(0.1 * k, T)
+    np.testing.assert_allclose(history.at(0.1), poses[1])
+    np.testing.assert_allclose(history.at(0.15), turn @ pose_from(rot_z(0.025), rot_z(0.0125) @ [0.1, 0, 0]), atol=2e-3)
+    np.testing.assert_allclose(history.at(0.3), turn @ turn @ turn, atol=1e-3)
+    np.testing.assert_allclose(history.rates(0.1), [2.0, 0.0, 0.5], atol=1e-2)
+    assert np.isnan(OdometryHistory().rates(0.0)).all()
+
+
+def test_errors_of_mount_and_clock_are_in_the_poses_covariance():
+    sure = Calibration(sigma_heading=0.0, sigma_lever=0.0, sigma_delay=0.0)
+    ahead = np.array([2.0, 0.0, 0.1])
+    assert not sure.pose_covariance(np.eye(3), ahead).any()
+    north = rot_z(np.pi / 2)
+    late = Calibration(delay=0.5, sigma_delay=0.02, sigma_heading=0.0, sigma_lever=0.0)
+    np.testing.assert_allclose(np.diag(late.pose_covariance(north, ahead)), [0, 0, 0.002**2, 0, 0.04**2, 0], atol=1e-12)
+    standing = late.pose_covariance(north, np.zeros(3))
+    assert not standing.any()
+    turned = Calibration(sigma_heading=0.01, sigma_lever=0.1, sigma_delay=0.0).pose_covariance(north, ahead)
+    np.testing.assert_allclose(np.diag(turned), [0, 0, 1e-4, 0.01, 0.01, 0])
+
+
+def test_mount_is_said_beyond_the_one_given():
+    turned = Calibration(heading=np.radians(3.0), sigma_heading=np.radians(0.1), delay=0.12, sigma_delay=0.004)
+    text = turned.describe(Mount(roll=np.pi))
+    assert text[0].startswith("sensor is turned 3.0 +- 0.1 deg to the left on the body beyond its mount: corrected")
+    assert "--mount=180,0,3 " in text[0]
+    assert text[1] == "clouds are 0.120 +- 0.004 s later than odometry: corrected"
+    assert "odometry is 0.300" in Calibration(delay=-0.3).describe()[0]
