@@ -116,13 +116,13 @@ def family_table(results: Sequence[Result]) -> str:
 
 
 def nothing(evidence: Floats) -> Floats:
-    """Pay nothing: Ville's inequality, which holds if the evidence is a martingale where every place is wrong."""
+    """Pay nothing, as searches do: Ville's inequality holds if the evidence is a martingale where all is wrong."""
     return evidence
 
 
 def looks(evidence: Floats) -> Floats:
     """Divide by one more than the number of looks at eight keyframes."""
-    return np.asarray(evidence / looks_paid(len(evidence)))
+    return np.asarray(evidence / (1.0 + np.arange(1, len(evidence) + 1) // 8))
 
 
 def each(evidence: Floats) -> Floats:
@@ -137,11 +137,6 @@ def adjusted(evidence: Floats) -> Floats:
     return np.asarray((most - 1.0 - np.log(most)) / np.log(most) ** 2)
 
 
-def looks_paid(keyframes: int) -> Floats:
-    """Return the factors (J,) of :class:`~coview_stream.localization.search.scoring.PlaceScorer`."""
-    return np.asarray(1.0 + np.arange(1, keyframes + 1) // 8, dtype=np.float64)
-
-
 PAYMENTS = {"nothing (Ville)": nothing, "1 + j // 8": looks, "j (j + 1)": each, "largest, adjusted": adjusted}
 """Payments for looking again and again: odds of all places together against none, by keyframe, to paid ones."""
 
@@ -150,7 +145,7 @@ def stated_errors(run: Result, payment: Callable[[Floats], Floats]) -> Floats:
     """Return the errors (J,) that a search would have stated at its keyframes with another payment."""
     _, error, none, _ = np.array(run["searched"], dtype=np.float64).reshape(-1, 4).T
     found = np.maximum(1.0 - none, 1e-12)
-    paid = payment(found / np.maximum(none, 1e-300) * looks_paid(len(none)))
+    paid = payment(found / np.maximum(none, 1e-300))
     none = 1.0 / (1.0 + paid)
     return np.asarray(none + (1.0 - none) * np.maximum(found - (1.0 - error), 0.0) / found)
 

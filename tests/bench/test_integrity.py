@@ -109,10 +109,9 @@ def test_reliability_counts_each_run_once_where_it_first_states_an_error():
 def test_payments_for_looking_again_change_the_odds_of_no_place_alone():
     run = result("1", "none", searched=search(*[(0.11, 0.01, True)] * 16))
     stated = {name: stated_errors(run, payment) for name, payment in PAYMENTS.items()}
-    np.testing.assert_allclose(stated["1 + j // 8"], 0.11)  # as measured
-    odds = 0.99 / 0.01 * np.where(np.arange(16) < 7, 1.0, np.where(np.arange(16) < 15, 2.0, 3.0))
-    elsewhere = 0.1 / 0.99
-    np.testing.assert_allclose(stated["nothing (Ville)"], (1.0 + elsewhere * odds) / (1.0 + odds))
+    np.testing.assert_allclose(stated["nothing (Ville)"], 0.11)  # as measured
+    paid = 99.0 / np.where(np.arange(16) < 7, 1.0, np.where(np.arange(16) < 15, 2.0, 3.0))
+    np.testing.assert_allclose(stated["1 + j // 8"], 1.0 - 0.89 / 0.99 * paid / (1.0 + paid))
     assert stated["j (j + 1)"][[0, 1]] == pytest.approx([1.0 - 0.89 / 0.99 * o / (1.0 + o) for o in (49.5, 16.5)])
 
 

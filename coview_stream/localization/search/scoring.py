@@ -28,7 +28,7 @@ _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # places that stay by their evidence, whatever their rank at the newest keyframe
 _KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones farthest apart
-_LOOK = 8  # keyframes that count as one chance of an error, and are searched for a moved part
+_NEWEST = 8  # keyframes that are searched for a moved part
 _CHANCE = 128  # places that measure the correlation of chance over keyframes
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
@@ -148,12 +148,11 @@ class PlaceScorer:
     @property
     def scans(self) -> list[ObservedScan]:
         """Newest keyframes, eight at most, the newest last."""
-        return self._scans[-_LOOK:]
+        return self._scans[-_NEWEST:]
 
     def clear(self) -> None:
         """Forget all places and keyframes."""
         self._followed = _Followed.none()
-        self._keyframes = 0
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
 
@@ -181,11 +180,10 @@ class PlaceScorer:
         first = observed.first
         ratios = self._evidence(followed, observed, scan)
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
-        self._keyframes += 1
         self._scans.append(scan)
         self._followed = followed = followed[order]
         self._thin_out()
-        chances = posterior(ratios[order], followed.votes, len(first), 1 + self._keyframes // _LOOK)
+        chances = posterior(ratios[order], followed.votes, len(first))
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)

@@ -183,6 +183,28 @@ def test_stated_error_is_reached_by_chance_no_more_often_than_it_says(searches, 
     assert (errors < 1e-4).sum() <= most
 
 
+def largest_by_chance(places, keyframes, kept, seed=4):
+    """Largest likelihood ratios (P,) over a search's keyframes, of which each shows five more things, all by chance."""
+    rng = np.random.default_rng(seed)
+    things = rng.multinomial(5, CHANCE / CHANCE.sum(), (places, keyframes)).astype(float)
+    largest = np.zeros(places)
+    for k in range(1, keyframes + 1):
+        begin = max(0, k - kept)
+        seen = things[:, begin:k].sum(axis=1) / (5.0 * (k - begin))
+        known = Background(CHANCE / CHANCE.sum(), PASSED, (1.5, 1.5), (5.0 * (k - begin), 0.0))
+        ratios = log_likelihood_ratios(observation(seen, covered_ground=0.0), known)
+        largest = np.maximum(largest, np.exp(ratios))
+    return largest
+
+
+def test_chance_ever_reaches_a_ratio_no_more_often_than_its_inverse_however_often_one_looks():
+    """Ville's inequality, where keyframes reach back to the begin of the search; if most are dropped it fails."""
+    largest = largest_by_chance(2000, 24, kept=12)
+    for error in (0.3, 0.1, 0.03, 0.01):
+        assert (largest >= 1.0 / error).mean() <= error
+    assert (largest_by_chance(1000, 24, kept=1) >= 10.0).mean() > 0.1
+
+
 def test_right_place_is_told_from_chance():
     """The same searches with the right place among the others: calibration is not silence."""
     rng, result = np.random.default_rng(8), []
