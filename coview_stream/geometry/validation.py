@@ -75,7 +75,9 @@ def validate_cloud(cloud: npt.ArrayLike) -> Points:
     if len(finite) < _MIN_POINTS:
         raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_MIN_POINTS} or more")
     if np.median(np.abs(finite[:: 1 + len(finite) // _SAMPLED_POINTS])) > _MAX_DISTANCE:
-        raise CloudError("cloud lies kilometres from its origin; give it relative to the sensor")
+        raise CloudError(
+            "cloud lies kilometres from its origin; give it relative to the sensor, in metres (millimetres?)"
+        )
     return finite
 
 

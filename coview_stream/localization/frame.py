@@ -26,6 +26,7 @@ from coview_stream.geometry.validation import validate_cloud, validate_odometry
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.frame_motion import FrameMotion, Variances
+from coview_stream.localization.witness.first_motions import Conventions
 
 # sigmas of roll and pitch of a registered place
 _LEADER_TILT = math.radians(1.0)  # that leads the search, if it is the right one
@@ -58,11 +59,13 @@ class FramePreparation:
 
     Attributes:
         estimator: of the calibration; learns from registrations too.
+        conventions: judge of units and axes.
         anchor: (3,) origin of the odometry in use: near it float32 is exact; None before the first frame.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
         self.estimator = CalibrationEstimator(config.sensor_leans)
+        self.conventions = Conventions()
         self.anchor: Floats | None = None
         self._odometry = OdometryCorrection()
         self._history = OdometryHistory()
@@ -78,6 +81,7 @@ class FramePreparation:
     def restart(self) -> None:
         """Go on in another frame of odometry, with the same calibration."""
         self.estimator.begin_odometry()
+        self.conventions.clear()
         self._odometry, self._history = OdometryCorrection(), OdometryHistory()
         self._motion.clear()
         self.anchor = self._newest = None
@@ -111,6 +115,8 @@ class FramePreparation:
         T = self._odometry.correct(self._history.at(stamp - delay), self.calibration, before)
         rates = self._history.rates(stamp - delay)
         self._newest = stamp
+        if drift is not None or not self.conventions.plausible:
+            self.conventions.add(raw, T_raw)
         if self.anchor is None:
             self.anchor = T[:3, 3].copy()
         T = to_local(T, self.anchor)

@@ -296,6 +296,11 @@ class Localizer:
         drift = self._tracker.odometry.drift.variances if searching else None
         frame = self._newest = self._frames.prepare(cloud, T_odom_body, stamp, drift)
         self._tracker.add_scan(frame.scan)
+        if (finding := self._frames.conventions.finding) is not None:  # nothing of this sender can be believed
+            self._handle(Event.PLACE_GIVEN_UP)
+            self._requests.next_epoch()  # a search may be under way
+            self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
+            return frame, None
         if not searching:
             return frame, None
         request = self._requests.add(frame, self._tracker.odometry.travelled)

@@ -11,9 +11,10 @@ import small_world
 from nightly import nightly
 
 from coview_stream.config.mount import parse_mount
-from coview_stream.doctor.frame_checks import RIVALS, SeenFrame, frame_findings
+from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.map_checks import seen_frames
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
+from coview_stream.localization.witness.conventions import RIVALS
 from coview_stream.recordings.open_run import open_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,6 +57,7 @@ FAULTS = {
     "transposed": (odometry(RIVALS["transposed"]), "transposed"),
     "millimetres": (scaled(1000.0), "millimetres"),
     "feet": (scaled(3.2808), "feet"),
+    "left-handed": (lambda f: SeenFrame(f.stamp, f.points * np.float32([1, -1, 1]), f.T_odom_body), "left-handed"),
 }
 
 
@@ -87,7 +89,7 @@ def test_standing_robot_is_told_to_drive(frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "words"), [(4, "too few frames"), (7, "too few frames"), (10, "odometry follows")])
+@pytest.mark.parametrize(("count", "words"), [(3, "too few frames"), (5, "too few frames"), (7, "odometry follows")])
 def test_three_motions_that_agree_are_sure_and_two_are_not(frames, count, words):
     motion = next(f for f in frame_findings(frames[:count]) if f.what == "motion")
     assert motion.verdict == "ok"

@@ -50,6 +50,8 @@ class RejectionReason(StrEnum):
     """Rays passed through structure of the map."""
     ODOMETRY = "odometry"
     """The place fits, but not where odometry says that the robot has moved."""
+    CONVENTIONS = "conventions"
+    """Clouds or odometry come in other units or axes."""
 
 
 _AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT)

@@ -1,0 +1,246 @@
+"""Conventions: the units and axes in which clouds and odometry are sent, by the motions that both see.
+
+The ground tells which axis of the clouds points up. A *reading* says how clouds and odometry may have been sent; under
+each, odometry's motion is compared with that of pairs of clouds, which
+:mod:`coview_stream.localization.witness.first_motions` registers. The log odds of a reading are those of "odometry
+follows the clouds" against "the two have nothing to do with each other", added over the pairs; as a registration fails
+now and then, no single pair decides. The doctor and the localizer share all of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
+    inverse,
+    log_so3,
+    norms,
+    pose_from,
+    rot_z,
+    wrap_angle,
+    yaw_of,
+)
+from coview_stream.odometry.gravity import ground_plane
+
+HEADING, SCALE = math.radians(8.0), 0.12
+"""Heading of the lidar on the body, radians, and error of odometry's scale that are no other convention."""
+SURE = math.log(99.0)
+"""Log odds of a finding: two motions that agree may be chance (1 in 48), three are not (1 in 340)."""
+STILL = 0.5  # metres
+BASELINE = 1.5  # metres between two clouds that are compared
+
+_FAILS = 0.1  # probability that a registration fails, as in the calibration
+METRES_PER_RADIAN = 5.0
+_SWAY = math.radians(0.3)  # sigma of a turn about x or y: the registration's and that of odometry's level, 0.2 each
+_FARTHEST = 300.0  # metres; the median of a lidar's ranges is less, anywhere
+FOOT, MILLIMETRE = 0.3048, 0.001  # metres
+
+UP = np.array([0.0, 0.0, 1.0])
+AXES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], dtype=np.float64)
+AXIS_NAMES = ("+z", "-z", "+y", "-y", "+x", "-x")
+R_body_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+Change = Callable[[Pose], Pose]
+"""Odometry's poses -> poses as they should have been sent."""
+
+RIVALS: dict[str, Change] = {
+    "inverse": inverse,
+    "transposed": lambda T: pose_from(T[:3, :3].T, T[:3, 3]),
+    "z down": lambda T: np.diag([1.0, -1.0, -1.0, 1.0]) @ T @ np.diag([1.0, -1.0, -1.0, 1.0]),
+    "camera": lambda T: pose_from(R_body_camera, np.zeros(3)) @ T @ pose_from(R_body_camera.T, np.zeros(3)),
+    "millimetres": lambda T: pose_from(T[:3, :3], MILLIMETRE * T[:3, 3]),
+    "feet": lambda T: pose_from(T[:3, :3], FOOT * T[:3, 3]),
+}
+"""Usual mistakes in odometry, each by the change that mends it."""
+
+
+class Pair(NamedTuple):
+    """Motion between two clouds: the clouds' (4, 4) in level axes, its sigma in metres, and odometry (4, 4) at both."""
+
+    motion: Pose
+    sigma: float
+    before: Pose
+    after: Pose
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A way in which clouds and odometry may have been sent; ``found`` and ``remedy`` say it to people.
+
+    Attributes:
+        heading: of the body's x in the level axes of the clouds, radians.
+        mirrored: whether the clouds' y points right.
+        change: what mends odometry.
+    """
+
+    found: str
+    remedy: str
+    heading: float = 0.0
+    mirrored: bool = False
+    change: Change | None = None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Odometry against the clouds' motion, medians over pairs."""
+
+    odds: float  # log odds that odometry follows the clouds, over all pairs
+    misfit: float  # metres, a radian counting as five
+    yaw: float  # angle from odometry's motion to the clouds', radians: the heading of the lidar on the body
+    spread: float  # deviation from it
+    scale: float  # the clouds' distance over odometry's
+    pairs: int  # number of pairs that moved
+
+
+AS_SENT_WORDS = "x forward, y left, z up"
+AS_SENT = Reading("clouds and odometry are sent as they should", "")
+
+ODOMETRY = (
+    Reading("odometry is inverse: it is body <- odometry", "send T_odom_body, its inverse", change=RIVALS["inverse"]),
+    Reading("odometry's rotation is transposed", "send T_odom_body: rows for columns, or a conjugate",
+            change=RIVALS["transposed"]),
+    Reading("odometry's z points down (north-east-down)", f"send it with {AS_SENT_WORDS}", change=RIVALS["z down"]),
+    Reading("odometry has a camera's axes (z forward, y down)", f"send it with {AS_SENT_WORDS}",
+            change=RIVALS["camera"]),
+    Reading("odometry is in millimetres", "send metres", change=RIVALS["millimetres"]),
+    Reading("odometry is in feet", "send metres", change=RIVALS["feet"]),
+)  # fmt: skip
+"""Readings of odometry, with clouds as they should be."""
+
+FEET = Reading("clouds are in feet", "send metres")
+MILLIMETRES = Reading("clouds are in millimetres", "send metres")
+"""Readings of clouds that are multiplied before they are registered; millimetres are known by :func:`unit_of`."""
+MIRRORED = Reading(
+    "clouds and odometry mirror each other: the axes of one are left-handed (y points right)",
+    f"send both with {AS_SENT_WORDS}", mirrored=True,
+)  # fmt: skip
+BOTH_CAMERA = Reading(
+    "clouds and odometry have a camera's axes (z forward, y down)", f"send both with {AS_SENT_WORDS}",
+    heading=math.pi / 2.0, change=RIVALS["camera"],
+)  # fmt: skip
+
+
+def turning(start: Floats, end: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) that takes one unit vector (3,) to another."""
+    v, c = np.cross(start, end), float(start @ end)
+    if c < -0.9999:
+        return np.diag([1.0, -1.0, -1.0])
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + c))
+
+
+def unit_of(points: Points) -> float:
+    """Return the metres of a cloud's unit (N, 3): a thousandth where its points lie farther than any lidar sees."""
+    finite = norms(points[:: 1 + len(points) // 2000])
+    return MILLIMETRE if len(finite) and float(np.median(finite)) > _FARTHEST else 1.0
+
+
+def _log_odds(gap: float, far: float, farther: float, sigma: float) -> float:
+    """Return the log odds that odometry follows the clouds by one motion, ``gap`` metres from it.
+
+    If it follows, the gap stays within the heading and scale that are no finding, over ``far`` metres; if not, it is
+    an unrelated motion of up to ``farther`` metres. The clouds' motion has its ``sigma``, and fails now and then.
+    """
+    return _mixed(_gaussian(gap, math.hypot(math.hypot(HEADING, SCALE) * far, sigma), farther))
+
+
+def _gaussian(gap: float, sigma: float, farther: float) -> float:
+    """Return the ratio of two likelihoods of a gap in a plane: within ``sigma``, and within ``farther`` besides."""
+    follows, unrelated = sigma**2, sigma**2 + farther**2
+    return unrelated / follows * math.exp(0.5 * gap**2 * (1.0 / unrelated - 1.0 / follows))
+
+
+def _mixed(ratio: float) -> float:
+    """Return the log odds of a motion by its ratio of likelihoods, if a registration fails now and then."""
+    return math.log(((1.0 - _FAILS) * ratio + _FAILS) / (_FAILS * ratio + 1.0 - _FAILS))
+
+
+def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
+    """Compare the clouds' motions with odometry's, both as a reading has them."""
+    change = reading.change or (lambda T: T)
+    misfits, ratios, odds, sways = [], [], 0.0, np.zeros(2)
+    for pair in pairs:
+        before, after = change(pair.before), change(pair.after)
+        moved = rot_z(-yaw_of(before)) @ (after[:3, 3] - before[:3, 3])
+        step, turned = complex(moved[0], moved[1]), log_so3(before[:3, :3].T @ after[:3, :3])
+        driven, sway, turn = _as_read(pair.motion, reading)
+        misfits.append(abs(step - driven) + METRES_PER_RADIAN * abs(wrap_angle(yaw_of(after) - yaw_of(before) - turn)))
+        far = max(abs(driven), BASELINE)
+        odds += _log_odds(misfits[-1], far, max(far, abs(step)), pair.sigma)
+        swayed = complex(turned[0], turned[1])
+        sways += [_sways_odds(each, swayed) for each in (sway, _other_hand(sway))]
+        if min(abs(step), abs(driven)) > STILL:
+            ratios.append(driven / step)
+    # sways tell a mirror's sides apart, and nothing else; those of odometry in a plane do not
+    this, other = np.logaddexp(sways, 0.0)
+    odds += min(0.0, float(this - other))
+    misfit = float(np.median(misfits)) if misfits else math.inf
+    if not ratios:
+        return Fit(odds, misfit, 0.0, math.pi, 1.0, 0)
+    angles = np.angle(ratios)
+    yaw = float(np.angle(np.median(np.cos(angles)) + 1j * np.median(np.sin(angles))))
+    spread = float(np.median(np.abs(np.angle(np.exp(1j * (angles - yaw))))))
+    return Fit(odds, misfit, yaw, spread, float(np.median(np.abs(ratios))), len(ratios))
+
+
+def _sways_odds(sway: complex, swayed: complex) -> float:
+    """Return the log odds that odometry sways with the clouds, radians about x and y, against unrelated sways."""
+    return _mixed(_gaussian(abs(sway - swayed), _SWAY, math.hypot(abs(sway), abs(swayed))))
+
+
+def _other_hand(sway: complex) -> complex:
+    return complex(-sway.real, sway.imag)
+
+
+def _as_read(motion: Pose, reading: Reading) -> tuple[complex, complex, float]:
+    """Return the clouds' motion (4, 4) in the body's axes: x and y, the turn about x and about y, and about z."""
+    turned = np.exp(-1j * reading.heading)
+    rotation = log_so3(motion[:3, :3])
+    driven, sway = complex(motion[0, 3], motion[1, 3]) * turned, complex(rotation[0], rotation[1]) * turned
+    if reading.mirrored:
+        return driven.conjugate(), _other_hand(sway), -yaw_of(motion)
+    return driven, sway, yaw_of(motion)
+
+
+def turned_clouds(axis: int, heading: float) -> Reading:
+    """Return the reading of clouds whose axis number ``axis`` of :data:`AXES` points up, the body's x at ``heading``.
+
+    In quarter turns it names the axes, else the angle.
+    """
+    R_body_cloud = rot_z(-heading) @ turning(AXES[axis], UP)
+    forward = AXIS_NAMES[int(np.argmax(AXES @ R_body_cloud[0]))]
+    quarter = abs(wrap_angle(4.0 * heading)) < 4.0 * HEADING
+    parts = []
+    if axis:
+        parts.append("z points down" if axis == 1 else f"{AXIS_NAMES[axis]} points up")
+    if quarter and (forward != "+x" or not axis):
+        parts.append(f"{forward.removeprefix('+')} points forward")
+    if not quarter:
+        parts.append(f"x points {abs(math.degrees(heading)):.0f} degrees to the {'right' if heading > 0 else 'left'}")
+    found = f"clouds have other axes than the body: {', '.join(parts)}"
+    return Reading(found, f"send them with {AS_SENT_WORDS}, or set --mount (`doctor` prints it)", heading=heading)
+
+
+def axis_up(points: Points) -> int | None:
+    """Return the number of the axis of a cloud (N, 3) below whose negative end the ground lies; None without one.
+
+    A ceiling is a floor upside down, so z is asked first, also of a cloud in feet.
+    """
+    found = []
+    if not isinstance(ground_plane(points * np.float32(FOOT)), str):
+        return 0
+    for number, axis in enumerate(AXES):
+        plane = ground_plane(points @ turning(axis, UP).T.astype(np.float32))
+        if not isinstance(plane, str):
+            if number == 0:
+                return 0
+            found.append((plane.share, number))
+    return max(found)[1] if found else None

@@ -1,0 +1,72 @@
+"""Conventions by clouds of a small world: named within ten metres, and not where there is nothing to name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.witness.first_motions import Conventions
+
+SENT = {
+    "in feet": np.eye(3) / 0.3048,
+    "in millimetres": np.eye(3) * 1e3,
+    "z points down": np.diag([1.0, -1.0, -1.0]),
+    "y points forward": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "left-handed": np.diag([1.0, -1.0, 1.0]),
+}
+
+
+@pytest.fixture(scope="module")
+def drive(scene):
+    """Twelve metres straight on, then round a bend; a frame each metre and a half."""
+    return small_world.record_along(scene, small_world.drive(10), 1.6)
+
+
+def judged(drive, matrix=None, frames=99):
+    conventions = Conventions()
+    for cloud, T in list(zip(drive.clouds, drive.T_odom_body, strict=True))[:frames]:
+        conventions.add(cloud if matrix is None else (cloud @ matrix.T).astype(np.float32), T)
+    return conventions
+
+
+@pytest.mark.slow
+def test_right_clouds_are_plausible_and_then_settled(drive):
+    assert judged(drive, frames=5).plausible
+    whole = judged(drive)
+    assert (whole.finding, whole.settled) == (None, True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in SENT if name != "left-handed"])
+def test_wrong_clouds_are_named_within_ten_metres(drive, name):
+    found = judged(drive, SENT[name], frames=7)
+    assert name in found.finding
+    assert not found.settled
+
+
+@pytest.mark.slow
+def test_a_mirror_is_named_in_a_bend(drive):
+    assert "left-handed" in judged(drive, SENT["left-handed"]).finding
+
+
+@pytest.mark.slow
+def test_a_finding_goes_when_the_sender_is_mended(drive):
+    conventions = judged(drive, SENT["y points forward"], frames=6)
+    assert conventions.finding
+    for cloud, T in list(zip(drive.clouds, drive.T_odom_body, strict=True))[6:]:
+        conventions.add(cloud, T)
+    assert conventions.finding is None
+
+
+@pytest.mark.slow
+def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
+    localizer = Localizer(world_map)
+    for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):
+        fix = localizer.step((cloud @ SENT["y points forward"].T).astype(np.float32), T, float(k))
+        if k >= 6:
+            assert fix.T_map_body is None
+            assert fix.evidence.cause is RejectionReason.CONVENTIONS
+            assert "y points forward" in fix.evidence.reason
