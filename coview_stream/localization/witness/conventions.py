@@ -172,6 +172,8 @@ def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
         moved = rot_z(-yaw_of(before)) @ (after[:3, 3] - before[:3, 3])
         step, turned = complex(moved[0], moved[1]), log_so3(before[:3, :3].T @ after[:3, :3])
         driven, sway, turn = _as_read(pair.motion, reading)
+        if max(abs(step), abs(driven)) < STILL:  # read so, the robot stood
+            continue
         misfits.append(abs(step - driven) + METRES_PER_RADIAN * abs(wrap_angle(yaw_of(after) - yaw_of(before) - turn)))
         far = max(abs(driven), BASELINE)
         odds += _log_odds(misfits[-1], far, max(far, abs(step)), pair.sigma)

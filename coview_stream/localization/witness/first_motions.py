@@ -47,6 +47,8 @@ from coview_stream.localization.witness.conventions import (
 _LONGEST_CHAIN = 8  # clouds, where the robot hardly moves
 _SCALES = (3.0, 1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
 _NEW_START = 1.0  # metres from all other starts; the coarsest scale reaches three times as far
+_POINTS = 4000  # of a cloud, registered
+_ENOUGH, _SAME = 3, 0.2  # starts that reach the same motion, and metres between two that are the same
 _PAIRS = 6  # the newest, by which the localizer judges
 _ODD = math.log(1e-2)  # prior of a reading: of a hundred first set-ups one is wrong in one of these ways
 _ANY_HEADING = math.log(HEADING / math.pi)  # of one that is fitted: as one among all
@@ -93,16 +95,21 @@ class CloudPairs:
         return pair
 
     def _registered(self, cloud: Points, T_odom_body: Pose, anywhere: bool) -> list[tuple[float, Pose]]:
-        """Return the motions (4, 4) that are reached, each after its variance, m2."""
+        """Return the motions (4, 4) that are reached, each after its variance, m2; enough starts that agree suffice."""
         here, target = np.zeros(3), self._target
         assert target is not None
-        scan, motions = prepare_scan(cloud, here, self._config), list[tuple[float, Pose]]()
+        scan = prepare_scan(cloud[:: 1 + len(cloud) // _POINTS], here, self._config)
+        motions = list[tuple[float, Pose]]()
         guesses = starts(self._newest, T_odom_body, self._step)
         for start in guesses if anywhere else itertools.islice(guesses, 1):
             match = register(scan, start, target, self._config, _SCALES, centre=here)
-            if match is not None and match.converged:
-                covariance = self._config.inflation**2 * np.linalg.inv(match.information)
-                motions.append((float(np.diag(covariance)[3:5].max()), match.T_map_source))
+            if match is None or not match.converged:
+                continue
+            covariance = self._config.inflation**2 * np.linalg.inv(match.information)
+            motions.append((float(np.diag(covariance)[3:5].max()), match.T_map_source))
+            at = match.T_map_source[:3, 3]
+            if sum(float(np.linalg.norm(T[:3, 3] - at)) < _SAME for _, T in motions) == _ENOUGH:
+                break
         return motions
 
 
