@@ -26,6 +26,8 @@ from coview_stream.stream.transport.keys import RobotKeys
 
 _NS = 1_000_000_000
 _NEVER = float("-inf")
+_RESTARTED_NS = 5 * _NS  # a stamp that lies farther back than this is a restarted clock
+_COMES = {"clouds": "come", "odometry": "comes"}
 _MAX_WAITING = 8  # frames that wait for their odometry
 _MAX_LIDAR_WAITING = 2  # frames that wait for the odometry engine: it needs every frame, but no old one
 _END_WAIT = 0.15  # seconds that a frame waits for odometry up to its last point
@@ -154,6 +156,30 @@ class FrameSync:
         return message.stamp_ns + round(first * _NS), message.stamp_ns + round(last * _NS)
 
 
+class NewestStamp:
+    """The latest stamp of an input.
+
+    Attributes:
+        came_at: local time of the newest message, with any stamp.
+    """
+
+    def __init__(self) -> None:
+        self.came_at = self._later_at = _NEVER  # the second: of the newest message with a later stamp
+        self._stamp_ns: int | None = None
+
+    def add(self, stamp_ns: int, now: float) -> None:
+        """Note a message that came at local time ``now``."""
+        self.came_at = now
+        if self._stamp_ns is None or stamp_ns > self._stamp_ns or stamp_ns < self._stamp_ns - _RESTARTED_NS:
+            self._stamp_ns, self._later_at = stamp_ns, now
+
+    def stands(self, now: float, longest: float) -> str:
+        """Return that messages come but for ``longest`` seconds none with a later stamp; empty otherwise."""
+        if self._stamp_ns is None or now - self._later_at <= longest or now - self.came_at > longest:
+            return ""
+        return f"with no stamp after {self._stamp_ns * 1e-9:.3f} s for {now - self._later_at:.0f} s"
+
+
 class Inputs:
     """Clouds and odometry of a robot that sends both, from one reset of its session to the next.
 
@@ -180,7 +206,7 @@ class Inputs:
         self.disconnected_at = _NEVER
         self._frames = FrameSync(config, self.odometry, counters)
         self._missing = MissingFrames()
-        self._cloud_at = _NEVER  # local time of the newest readable cloud
+        self._newest = {"clouds": NewestStamp(), "odometry": NewestStamp()}
 
     def decode_cloud(self, sample: Sample) -> CloudMessage:
         """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
@@ -204,10 +230,15 @@ class Inputs:
 
     def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
         """Count a cloud and queue it; return the break if it does not continue those before it."""
-        self._cloud_at = now
+        self._newest["clouds"].add(message.stamp_ns, now)
         self.counters.received += 1
         self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
-        return self._queue(message, now)
+        duplicates = self.counters.duplicate
+        interruption = self._queue(message, now)
+        if self.counters.duplicate > duplicates:
+            text = f"{message.stamp_ns * 1e-9:.3f} s; give each its own, or is a second sender on the key?"
+            self.errors.add_first(f"{self.keys.robot}: clouds with the stamp of another cloud", text)
+        return interruption
 
     def _queue(self, message: CloudMessage, now: float) -> Break | None:
         self._frames.add(message, now)
@@ -215,6 +246,7 @@ class Inputs:
 
     def add_odometry(self, message: OdometryMessage, now: float) -> Break | None:
         """Add an odometry sample; return the break if it does not continue those before it."""
+        self._newest["odometry"].add(message.stamp_ns, now)
         self.counters.odometry_received += 1
         unreachable = self.odometry_source == "robot" and self.disconnected_at > self.odometry.arrived
         kind = self.odometry.add(message, now, unreachable)
@@ -236,7 +268,7 @@ class Inputs:
     def continue_from(self, other: Inputs) -> None:
         """Go on with the odometry of the robot's session on another map."""
         self.odometry.continue_from(other.odometry)
-        self._cloud_at = other._cloud_at
+        self._newest = other._newest
 
     # ---- lidar odometry: none here
 
@@ -283,15 +315,21 @@ class Inputs:
 
     def silent(self, now: float) -> str:
         """Return the inputs that have not come for ``max_outage``, and for how long; empty for none."""
-        arrived = {"clouds": self._cloud_at}
+        arrived = {"clouds": self._newest["clouds"].came_at}
         if self.odometry_source == "robot":
             arrived["odometry"] = self.odometry.arrived
-        silent = {name: now - at for name, at in arrived.items() if at > _NEVER and now - at > self.config.max_outage}
-        return " and ".join(f"no {name} for {seconds:.0f} s" for name, seconds in silent.items())
+        longest = self.config.max_outage
+        silent = {name: now - at for name, at in arrived.items() if at > _NEVER and now - at > longest}
+        return self.repeating(now) or " and ".join(f"no {name} for {seconds:.0f} s" for name, seconds in silent.items())
+
+    def repeating(self, now: float) -> str:
+        """Return the inputs whose stamps stand for ``max_outage`` though messages come; empty for none."""
+        stands = {name: newest.stands(now, self.config.max_outage) for name, newest in self._newest.items()}
+        return " and ".join(f"{name} {_COMES[name]} {text}" for name, text in stands.items() if text)
 
     def silence_reason(self, now: float) -> str:
         """Return why there is no odometry."""
-        return f"no odometry for {self.config.odometry_timeout:g} s"
+        return self.repeating(now) or f"no odometry for {self.config.odometry_timeout:g} s"
 
 
 class LidarInputs(Inputs):
@@ -387,6 +425,6 @@ class LidarInputs(Inputs):
     def silence_reason(self, now: float) -> str:
         """As of :class:`Inputs`."""
         timeout = self.config.odometry_timeout
-        if now - self._cloud_at > timeout:
+        if now - self._newest["clouds"].came_at > timeout:
             return f"no clouds for {timeout:g} s"
         return f"lidar odometry has placed no frame for {timeout:g} s; see errors and counters"

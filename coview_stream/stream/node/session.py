@@ -107,6 +107,8 @@ class Session:
             self._now = now
             self._proceed(None, now)
             if not self.robot_state.state.has_place:
+                if repeating := self.inputs.repeating(now):
+                    self.robot_state.explain_loss(repeating)
                 return
             odometry, processed_at = self.inputs.odometry, self.queue.processed_at
             newest_ns = odometry.newest.stamp_ns if odometry.newest else 0
@@ -114,7 +116,8 @@ class Session:
             if now - odometry.arrived > self.config.odometry_timeout:
                 self.robot_state.on_silence(self.inputs.silence_reason(now), newest_ns)
             elif processed_at is not None and now - processed_at > timeout:
-                self.robot_state.on_silence(f"no usable frame for {timeout:g} s", newest_ns)
+                reason = self.inputs.repeating(now) or f"no usable frame for {timeout:g} s"
+                self.robot_state.on_silence(reason, newest_ns)
             self._record_state()
 
     def restart_search(self, reason: str, forget: bool = False) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import random
+import re
 
 import pytest
 from fake_robot import (
     EVENTS,
     KEYS,
+    START_NS,
     Robot,
     counted,
     doubted,
@@ -354,3 +356,32 @@ def test_states_follow_the_table_of_transitions(seed):
             expected, engine, pending = NODE_TRANSITIONS.get((expected, RESTARTED), expected), None, False
         assert robot.session.state()[0] is expected, (action, pending)
         now += 0.1
+
+
+@pytest.mark.parametrize("stamp", [0.5, -START_NS * 1e-9], ids=["constant", "zero"])
+def test_clouds_whose_stamp_stands_are_named_within_five_seconds(robot, stamp):
+    for k in range(1, 50):
+        robot.moved(0.1 * k, now=1000.0 + 0.1 * k)
+        robot.saw(stamp, now=1000.0 + 0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+        if (job := robot.session.take_job("track")) is not None:
+            robot.session.handle_result(job, unknown(job, reason="too little has been seen"), 1000.0 + 0.1 * k)
+    assert state(robot) is State.SEARCHING
+    assert re.search(r"clouds come with no stamp after [\d.]+ s for [2-5] s|no common stamps", reason(robot))
+
+
+def test_odometry_whose_stamp_stands_is_named_where_a_place_was_lost_for_it(robot):
+    robot.frame(1.0)
+    assert state(robot) is State.TRACKING
+    for k in range(11, 40):
+        robot.moved(1.01, now=1000.0 + 0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+    assert (state(robot), reason(robot).split(" after ")[0]) == (State.LOST, "odometry comes with no stamp")
+
+
+def test_two_clouds_with_one_stamp_are_an_error_of_the_status(robot):
+    robot.drive(0.0, 1.0)
+    for _ in range(3):
+        robot.saw(0.5, now=1001.0)
+    (text,) = robot.session.errors.texts
+    assert "with the stamp of another cloud" in text
