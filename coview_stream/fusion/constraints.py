@@ -157,7 +157,7 @@ class Registrar:
         if match is None or match.pairs < (_ON_MAP if other < 0 else _ON_SUBMAP) * config.keep * len(scan.points):
             return None
         shared = SharedErrorModel(config)
-        shared.learn(scan, match.T_map_source, target, pivot)
+        shared.learn(scan, match.T_map_source, target, pivot, 0.0)
         try:
             of_body = match._replace(T_map_source=match.T_map_source @ turn)
             T, measured = remove_prior(of_body, kernels.Prior(T_start, information), config)

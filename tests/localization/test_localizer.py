@@ -23,7 +23,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import State
-from coview_stream.localization.tracking.shared_error import UNCLUSTERED
+from coview_stream.localization.tracking.shared_error import FLOOR
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
@@ -69,10 +69,10 @@ def test_covariance_is_symmetric_positive_and_translation_first(world_fixes):
     assert np.linalg.eigvalsh(covariance).min() > 0
     sigma = np.sqrt(np.diag(covariance))
     # metres come first: millimetres to decimetres; then radians: tenths of a degree; map points lie off their surfaces
-    assert (sigma[:3] > UNCLUSTERED[3:]).all()
+    assert (sigma[:3] > FLOOR[3:]).all()
     assert (sigma[:3] < 0.3).all()
     assert (sigma[3:] < np.radians(1.0)).all()
-    assert (sigma[3:] > UNCLUSTERED[2]).all()
+    assert (sigma[3:] > FLOOR[:3]).all()
 
 
 def test_confidence_is_the_probability_that_the_search_found(world_fixes):

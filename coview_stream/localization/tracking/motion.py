@@ -30,6 +30,11 @@ _MEMORY = 40.0  # metres over which measured drift is forgotten
 _OUTLIER = 16.0  # variances; a larger slip counts as this, as rates should grow step by step
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
+_TREMBLE, _TREMBLE_COUNT = (
+    float(np.radians(0.03)),
+    5.0,
+)  # of odometry's roll and pitch, before it is measured; it counts as
+_MAX_COUNT = 40.0  # registrations
 _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
 
 
@@ -71,6 +76,7 @@ class DriftEstimator:
         self._nominal = Drift.of(config)
         self._metres = np.full(len(_GROUPS), config.drift_prior)
         self._sums = self._metres.copy()
+        self._tilt, self._count = _TREMBLE**2, _TREMBLE_COUNT
 
     @property
     def drift(self) -> Drift:
@@ -82,6 +88,15 @@ class DriftEstimator:
             position * base.position, height * base.height, tilt * base.tilt, yaw * base.yaw, yaw * base.turn
         )  # fmt: skip
 
+    @property
+    def tremble(self) -> Floats:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of the tilt of a frame beside its neighbours, map axes.
+
+        Roll and pitch of odometry tremble from frame to frame, and so do those of registrations: each has half of the
+        mean square by which the two disagree from one registration to the next.
+        """
+        return np.diag([self._tilt, self._tilt, 0.0, 0.0, 0.0, 0.0])
+
     def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
         """Add the motion between two registrations, where it is :func:`worth_learning`.
 
@@ -91,7 +106,10 @@ class DriftEstimator:
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
         # negative ones stay, as their mean would be biased
-        squares = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
+        squares = np.minimum(gap**2, _OUTLIER * (now + noise))
+        self._count = min(self._count + 1.0, _MAX_COUNT)
+        self._tilt += (float(squares[:2].mean()) / 2.0 - self._tilt) / self._count
+        squares -= noise
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
             if driven < _MIN_STEP and rows != [2]:
@@ -185,6 +203,11 @@ class OdometryTracker:
     def drift(self) -> Drift:
         """Rates of odometry's drift, as measured so far."""
         return self._estimator.drift
+
+    @property
+    def tremble(self) -> Floats:
+        """Covariance (6, 6) of the tilt of one frame beside its neighbours; see :class:`DriftEstimator`."""
+        return self._estimator.tremble
 
     def learn(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.

@@ -1,9 +1,14 @@
-"""Cluster-robust (sandwich) covariance of a registration: the error that neighbouring registrations share.
+"""The error of registrations that the next ones repeat: map and scan disagree, and a fit is their compromise.
 
-The inverse Hessian presumes independent residuals. But a wall that lies 3 cm off in the map pulls with all of its
-points, and a tree's whole crown looks different from above. So pairs are gathered into clusters by place, and the
-covariance is A^-1 B A^-1, with A the sum of J^T J over the pairs and B the sum over clusters of the outer products of
-their gradients.
+The inverse Hessian is the covariance for independent residuals of one size, with each point's partner held. But a part
+of the map lies some centimetres off the others, a tree's crown looks different from above, a lidar's far rings lie too
+high: all points of a sector pull together. And a point that is off finds another partner nearby, so a fit that is off
+looks hardly worse: in a map of several passes the gradient grows by a third of what held partners make of it.
+
+So a clustered sandwich estimator: C = c H^-1 B H^-1. B is the sum, over the quadrants around the body, ground and
+structure apart, of the outer products of their gradients, each a mean over the last metres, in which scanner noise
+averages out and map error does not. H is the derivative of the whole gradient by the pose with all partners sought
+anew. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
 """
 
 from __future__ import annotations
@@ -17,20 +22,22 @@ from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import RESIDUAL_SCALE
 
-UNCLUSTERED = np.array([*np.radians([0.03, 0.03, 0.001]), 0.001, 0.001, 0.001])
-"""Sigmas (6,) over (rx, ry, rz, x, y, z) of the shared error that the pairs do not show: radians, metres.
+FLOOR = np.array([*np.radians([0.001, 0.001, 0.001]), 0.001, 0.001, 0.001])
+"""Sigmas (6,) over (rx, ry, rz, x, y, z), radians and metres, that no agreement of the pairs takes away."""
 
-Calibrated on the simulated drives of ``python -m bench tracking --seeds 5100``.
-"""
-
-_CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 give similar results
+_VIEW = 5.0  # metres of driving over which the view is about the same, and gradients are averaged
+_STEP = 2.0  # metres of driving between two lessons
 _EVERY = 2  # of the points: more change nothing
-_NEWEST_SHARE = 0.3  # of a new covariance in the running average
-_MIN_CLUSTERS = 8  # more than the six unknowns
+_MIN_PAIRS = 50
+_SHIFT = 0.03  # metres by which the pose is moved to seek partners anew: above a scanner's noise, below a wall's width
+_LEVER = 17.0  # metres: a turn moves points by as much there
+_TURNS = (0.0, 0.25 * np.pi)  # radians: two ways to cut the quadrants, as a wall may lie along a cut
+_SECTORS = 8  # four quadrants, ground and structure apart
+_LEAST = 0.03  # of a direction's curvature relative to the others': below it the derivative is noise
 
 
 class SharedErrorModel:
-    """Running average of the error that neighbouring registrations share: it does not average out over them."""
+    """Running average of the pairs' disagreement, sector by sector, and the covariance that comes of it."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
@@ -38,59 +45,92 @@ class SharedErrorModel:
 
     def clear(self) -> None:
         """Forget all registrations: the place is another."""
-        self._clustered: Floats | None = None
+        self._gradients = np.zeros((len(_TURNS), _SECTORS, 6))
+        self._curvature = np.zeros((6, 6))
+        self._learned_at: float | None = None  # metres driven
+        self._side = -1  # to which the pose is moved for the curvature, in turn
 
-    def learn(self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats) -> None:
-        """Add a verified registration; arguments are those of :func:`clustered_covariance`."""
-        now = clustered_covariance(source, T_map_source, target, pivot, self._config)
-        if now is not None:
-            before = self._clustered
-            self._clustered = now if before is None else before + _NEWEST_SHARE * (now - before)
+    def learn(
+        self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, travelled: float
+    ) -> None:
+        """Add a verified registration, ``travelled`` metres into the drive; other arguments: :func:`disagreement`.
+
+        One per two metres counts: those between see the same.
+        """
+        before = self._learned_at
+        if before is not None and travelled - before < _STEP:
+            return
+        self._side = -self._side
+        now = disagreement(source, T_map_source, target, pivot, self._config, self._side)
+        if now is None:
+            return
+        share = 1.0 if before is None else 1.0 - np.exp((before - travelled) / _VIEW)
+        self._gradients += share * (now[0] - self._gradients)
+        self._curvature += share * (now[1] - self._curvature)
+        self._learned_at = travelled
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the clustered sigma, and other errors.
+        """(6, 6) over (rx, ry, rz, x, y, z), map axes: ``shared`` times the sandwich's sigma, and the floor."""
+        sandwich = np.zeros((6, 6))
+        if self._learned_at is not None:
+            sandwich = clustered_covariance(self._gradients, self._curvature)
+        return np.asarray(self._config.shared**2 * sandwich + np.diag(FLOOR**2))
 
-        The main one of these: odometry's roll and pitch tremble from frame to frame.
-        """
-        clustered = np.zeros((6, 6)) if self._clustered is None else self._clustered
-        return np.asarray(self._config.shared**2 * clustered + np.diag(UNCLUSTERED**2))
+
+def clustered_covariance(gradients: Floats, curvature: Floats) -> Floats:
+    """Return the sandwich (6, 6) of (K, 8, 6) gradients, cut in K ways, and the curvature (6, 6)."""
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-12))
+    strength, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
+    inverse = unit[:, None] * (directions / np.maximum(strength, _LEAST)) @ directions.T * unit
+    middle = np.einsum("ksi,ksj->ij", gradients, gradients) / len(gradients)
+    return np.asarray(_SECTORS / (_SECTORS - 6) * inverse @ middle @ inverse)
 
 
-def clustered_covariance(
-    source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, config: RegistrationConfig
-) -> Floats | None:
-    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) of a registration; None for too few clusters.
+def disagreement(
+    source: RegistrationCloud,
+    T_map_source: Pose,
+    target: LocalMap,
+    pivot: Floats,
+    config: RegistrationConfig,
+    side: int = 1,
+) -> tuple[Floats, Floats] | None:
+    """Return the gradients (2, 8, 6) of a registration by sector, and its curvature (6, 6); None for too few pairs.
 
-    Rotations are about ``pivot`` (3,) in the source's frame, along the map's axes.
+    Both over (rx, ry, rz, x, y, z); rotations are about ``pivot`` (3,) in the source's frame, along the map's axes.
     """
     source = source.every(_EVERY)
-    reach = config.track[-1]
+    reach, body = config.track[-1], transform(T_map_source, pivot[None])[0]
     moved = transform(T_map_source, source.points)
-    distance, partner = kernels.nearest(target.grid, moved, reach)
-    weights, paired = np.zeros(len(distance)), distance < reach  # not trimmed: the best pairs disagree least
-    for kind in (source.above, ~source.above):  # both kinds weigh the same
-        weights[kind & paired] = 1.0 / max(1, int((kind & paired).sum()))
-    chosen = np.flatnonzero(weights)
-    gap, (n, planarity) = moved[chosen] - target.points[partner[chosen]], target.planes(partner[chosen])
-    residual = np.einsum("ij,ij->i", gap, n).astype(np.float64)
-    weight = weights[chosen] * planarity / (1.0 + (residual / RESIDUAL_SCALE) ** 2)
-    arm = moved[chosen] - transform(T_map_source, pivot[None])[0].astype(np.float32)
-    J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
-    cell = np.floor(moved[chosen, :2] / _CELL).astype(np.int64)  # structure apart from ground
-    cluster = np.unique((cell[:, 0] * 100_003 + cell[:, 1]) * 2 + source.above[chosen], return_inverse=True)[1]
-    count = int(cluster.max()) + 1 if len(cluster) else 0
-    if count < _MIN_CLUSTERS:
+    paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed: the best pairs disagree least
+    if paired.sum() < _MIN_PAIRS:
         return None
-    gradient = J * (weight * residual)[:, None]
-    A = (J * weight[:, None]).T @ J + 1e-6 * np.eye(6)
-    loose = weights[chosen] * (1.0 - planarity)
-    loose /= kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / RESIDUAL_SCALE**2
-    for axis in np.eye(3, dtype=np.float32):  # points without a surface constrain all three directions
-        J = np.concatenate([np.cross(arm, axis), np.broadcast_to(axis, arm.shape)], axis=1).astype(np.float64)
-        gradient += J * (loose * (gap @ axis))[:, None]
-        A += (J * loose[:, None]).T @ J
-    gradients = np.stack([np.bincount(cluster, column, count) for column in gradient.T], axis=1)
-    inverse_A = np.linalg.inv(A)
-    # the fit uses up six clusters
-    return np.asarray(inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 6))
+    kinds = [source.above, ~source.above]  # both kinds weigh the same
+    weight = sum(kind / max(1, int((kind & paired).sum())) for kind in kinds)
+    arm = (moved - body).astype(np.float32)
+    gradient = _gradient(moved, arm, weight, target, reach)
+    total, curvature = gradient.sum(axis=0), np.empty((6, 6))
+    for axis, size in enumerate([side * _SHIFT / _LEVER] * 3 + [side * _SHIFT] * 3):
+        unit = np.eye(3, dtype=np.float32)[axis % 3]
+        step = np.float32(size) * (np.cross(unit, arm) if axis < 3 else unit)
+        curvature[:, axis] = (_gradient(moved + step, arm, weight, target, reach).sum(axis=0) - total) / size
+    angle = np.arctan2(arm[:, 1], arm[:, 0])
+    sectors = [2 * (np.floor((angle - turn) / (0.5 * np.pi)).astype(np.int64) % 4) + source.above for turn in _TURNS]
+    gradients = [[np.bincount(sector, column, _SECTORS) for column in gradient.T] for sector in sectors]
+    return np.array(gradients).transpose(0, 2, 1), 0.5 * (curvature + curvature.T)
+
+
+def _gradient(moved: Floats, arm: Floats, weight: Floats, target: LocalMap, reach: float) -> Floats:
+    """Return each point's part (N, 6) of the gradient, with its partner sought among the map's points.
+
+    A point on a surface pulls along its normal, with Cauchy's weight; one without a surface in all directions.
+    """
+    distance, partner = kernels.nearest(target.grid, moved, reach)
+    partner = np.where(distance < reach, partner, 0)
+    gap, (normal, planarity) = moved - target.points[partner], target.planes(partner)
+    residual = np.einsum("ij,ij->i", gap, normal)
+    weight = np.where(distance < reach, weight, 0.0)
+    flat = weight * planarity / (1.0 + (residual / RESIDUAL_SCALE) ** 2)
+    loose = weight * (1.0 - planarity) / (kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / RESIDUAL_SCALE**2)
+    pull = (flat * residual)[:, None] * normal + loose[:, None] * gap
+    return np.concatenate([np.cross(arm, pull), pull], axis=1).astype(np.float64)

@@ -203,11 +203,13 @@ class Tracker:
     def reported_covariance(self) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
-        Sum of the cloud's, the error that all registrations share, and errors of mount and clock.
+        Sum of the cloud's by the graph and by odometry since, the error that all registrations share, the tilt that
+        trembles, and errors of mount and clock.
         """
         R = self.T_map_odom[:3, :3] if self.odometry.pose is None else (self.T_map_odom @ self.odometry.pose)[:3, :3]
         calibration = self._calibration.calibration.pose_covariance(R, np.nan_to_num(self.odometry.rates))
-        return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance + calibration)
+        repeated = self._shared_error.covariance + self.odometry.tremble
+        return swap_rotation_translation(self.predicted_covariance() + repeated + calibration)
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
@@ -262,6 +264,6 @@ class Tracker:
             self._learned_at = self.odometry.travelled
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
-        self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
+            self._shared_error.learn(scan.cloud, self.T_map_odom, target, position, self.odometry.travelled)
         self._displacement.learn(newest, position, self.T_map_odom, target)
         self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)

@@ -1,16 +1,16 @@
-"""What pairs say of a registration's error by disagreeing place by place."""
+"""What pairs say of a registration's error by disagreeing sector by sector."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from courtyard import courtyard, local_map, source_of
+from courtyard import courtyard, source_of
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import boxminus, pose_from
 from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.registration.register import register
-from coview_stream.localization.tracking.shared_error import UNCLUSTERED, SharedErrorModel, clustered_covariance
+from coview_stream.localization.tracking.shared_error import FLOOR, SharedErrorModel, clustered_covariance, disagreement
 
 CONFIG = RegistrationConfig()
 PIVOT = np.array([0.0, 0.0, 1.5])
@@ -41,7 +41,7 @@ def registered(seed, off):
     source, target = street(np.random.default_rng(seed), off)
     fit = register(source, np.eye(4), target, CONFIG, CONFIG.track, centre=PIVOT)
     T_body = fit.T_map_source @ pose_from(np.eye(3), PIVOT)
-    spread = clustered_covariance(source, fit.T_map_source, target, PIVOT, CONFIG)
+    spread = clustered_covariance(*disagreement(source, fit.T_map_source, target, PIVOT, CONFIG))
     return boxminus(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(fit.information)
 
 
@@ -63,29 +63,41 @@ def test_clustered_covariance_grows_with_map_error():
     assert (sigma[2] > 1.3 * sigma[1]).all()
 
 
-def test_too_few_clusters_give_no_covariance():
+def layers(apart):
+    """A courtyard, each surface mapped twice: by two passes ``apart`` metres to either side of where it is."""
     points, normals = courtyard()
-    target = local_map(points, normals)
-    few = np.abs(points[:, 0] - 3) + np.abs(points[:, 1] - 3) < 2
-    source = source_of(points[few], np.eye(4))
-    assert clustered_covariance(source, np.eye(4), target, PIVOT, CONFIG) is None
+    shift = np.where(np.arange(len(points)) % 2, apart, -apart)[:, None] * normals
+    return source_of(points, np.eye(4)), LocalMap((points + shift).astype(np.float32), normals.astype(np.float32))
 
 
-def test_shared_error_is_scaled_recent_covariance_plus_floor():
-    config = RegistrationConfig(shared=2.0)
-    rest = UNCLUSTERED**2
-    shared = SharedErrorModel(config)
-    np.testing.assert_allclose(shared.covariance, np.diag(rest))
+def test_curvature_is_less_where_surfaces_are_mapped_twice():
+    """A wall between two layers pulls to neither: partners held, both maps would look equally certain."""
+    thin, thick = (disagreement(*pair[:1], np.eye(4), pair[1], PIVOT, CONFIG)[1] for pair in map(layers, (0.0, 0.04)))
+    assert (np.diag(thick) < 0.9 * np.diag(thin)).all()
+    assert np.mean(np.diag(thick) / np.diag(thin)) < 0.75
+
+
+def test_too_few_pairs_teach_nothing():
     source, target = street(np.random.default_rng(0), 0.03)
-    now = clustered_covariance(source, np.eye(4), target, PIVOT, config)
-    shared.learn(source, np.eye(4), target, PIVOT)
-    np.testing.assert_allclose(shared.covariance, 4 * now + np.diag(rest))
+    assert disagreement(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT, CONFIG) is None
+
+
+def test_shared_error_is_scaled_covariance_of_the_last_metres_plus_floor():
+    config = RegistrationConfig(shared=2.0)
+    shared, floor = SharedErrorModel(config), np.diag(FLOOR**2)
+    np.testing.assert_allclose(shared.covariance, floor)
+    source, target = street(np.random.default_rng(0), 0.03)
+    shared.learn(source, np.eye(4), target, PIVOT, 0.0)
+    first = 4 * clustered_covariance(*disagreement(source, np.eye(4), target, PIVOT, config))
+    np.testing.assert_allclose(shared.covariance, first + floor)
     better, same = street(np.random.default_rng(0), 0.0)
-    for _ in range(20):
-        shared.learn(better, np.eye(4), same, PIVOT)
-    assert (np.diag(shared.covariance) - rest < 0.2 * 4 * np.diag(now)).all()
-    before = shared.covariance
-    shared.learn(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT)  # nothing has a pair there
-    np.testing.assert_array_equal(shared.covariance, before)
+    shared.learn(better, np.eye(4), same, PIVOT, 1.9)  # too near to see anything new
+    np.testing.assert_allclose(shared.covariance, first + floor)
+    for metres in range(2, 42, 2):
+        shared.learn(better, np.eye(4), same, PIVOT, metres)
+    later = shared.covariance
+    assert (np.diag(later) - FLOOR**2 < 0.2 * np.diag(first)).all()
+    shared.learn(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT, 50.0)  # nothing has a pair there
+    np.testing.assert_array_equal(shared.covariance, later)
     shared.clear()
-    np.testing.assert_allclose(shared.covariance, np.diag(rest))
+    np.testing.assert_allclose(shared.covariance, floor)
