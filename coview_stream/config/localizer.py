@@ -50,8 +50,8 @@ class RegistrationConfig:
     Points above the ground and points on it are trimmed apart, for the ground fits anywhere; ``python -m bench ablation
     --only registration`` has them together, too, and other values of ``keep`` and ``iterations``.
 
-    ``inflation`` is calibrated by ``python -m bench tracking --seeds 5100``, ``shared`` by ``python -m bench covariance``
-    on kitti04 and simulated towns, and tested on other real runs and kinds of sites. The rest is set by hand.
+    ``inflation`` is calibrated by ``python -m bench tracking --seeds 5100``, ``shared`` by ``python -m bench
+    covariance`` on kitti04 and simulated towns, and tested on others. The rest is set by hand.
 
     Attributes:
         keep: overlap, the share of the pairs that the last scale keeps, the nearest; the paper keeps 0.6. The scales
@@ -76,7 +76,7 @@ class RegistrationConfig:
     source_points: int = 5000
     source_range: float = 50.0
     inflation: float = 3.0
-    shared: float = 1.2
+    shared: float = 1.0
     gravity_sigma: float = math.radians(1.0)
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import RESIDUAL_SCALE
 
@@ -105,8 +105,8 @@ def disagreement(
     paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed: the best pairs disagree least
     if paired.sum() < _MIN_PAIRS:
         return None
-    kinds = [source.above, ~source.above]  # both kinds weigh the same
-    weight = sum(kind / max(1, int((kind & paired).sum())) for kind in kinds)
+    counts = [max(1, int((kind & paired).sum())) for kind in (source.above, ~source.above)]
+    weight = np.where(source.above, 1.0 / counts[0], 1.0 / counts[1])  # both kinds weigh the same
     arm = (moved - body).astype(np.float32)
     gradient = _gradient(moved, arm, weight, target, reach)
     total, curvature = gradient.sum(axis=0), np.empty((6, 6))
@@ -120,7 +120,7 @@ def disagreement(
     return np.array(gradients).transpose(0, 2, 1), 0.5 * (curvature + curvature.T)
 
 
-def _gradient(moved: Floats, arm: Floats, weight: Floats, target: LocalMap, reach: float) -> Floats:
+def _gradient(moved: Points, arm: Points, weight: Floats, target: LocalMap, reach: float) -> Floats:
     """Return each point's part (N, 6) of the gradient, with its partner sought among the map's points.
 
     A point on a surface pulls along its normal, with Cauchy's weight; one without a surface in all directions.
