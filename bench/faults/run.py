@@ -39,9 +39,9 @@ NAMED_S = 5.0  # seconds of driving within which bad input is named
 _SIMULATED = {
     world_name(config): config
     for config in (
-        SimulationConfig("town", "vlp16", seed=6101, length=72.0, speed=2.0),
-        SimulationConfig("campus", "mid360", seed=6102, length=72.0, speed=2.0),
-        SimulationConfig("forest", "os64", seed=6103, length=72.0, speed=2.0),
+        SimulationConfig("town", "vlp16", seed=6111, length=50.0, speed=2.0),
+        SimulationConfig("campus", "mid360", seed=6112, length=50.0, speed=2.0),
+        SimulationConfig("forest", "os64", seed=6113, length=50.0, speed=2.0),
     )
 }
 WORLDS = (*_SIMULATED, *SETS)
