@@ -27,6 +27,7 @@ from coview_stream.localization.state import Event, State, next_state
 from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
+from coview_stream.localization.witness.first_motions import DOUBT
 
 _DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
 
@@ -181,6 +182,10 @@ class Localizer:
         if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
             return
         self._evidence = result.evidence
+        if result.accepted is not None and self._frames.conventions.doubtful:
+            self._handle(Event.PLACE_PROPOSED)
+            self._evidence = replace(self._evidence, state=self.state, reason=DOUBT, cause=RejectionReason.CONVENTIONS)
+            return
         registration = None if result.accepted is None else result.accepted.registration
         if registration is None:
             if result.T_map_cloud is not None and result.evidence.evidence is not None:  # a registered place leads
@@ -302,6 +307,9 @@ class Localizer:
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
         if not searching:
+            if self._frames.conventions.doubtful:
+                self.require_verification()
+                self._evidence = KeyframeEvidence(stamp, self.state, DOUBT, cause=RejectionReason.CONVENTIONS)
             return frame, None
         request = self._requests.add(frame, self._tracker.odometry.travelled)
         if not isinstance(request, NoSearch):
@@ -316,6 +324,8 @@ class Localizer:
 
     def _match_to_map(self, frame: PreparedFrame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans after a metre, a second, or when something looks wrong."""
+        if self._frames.conventions.doubtful:
+            return None
         patience = _DEFERRED if defer else 1.0
         due = self._tracker.needs_registration(patience)
         waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds

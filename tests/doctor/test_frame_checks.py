@@ -89,7 +89,7 @@ def test_standing_robot_is_told_to_drive(frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "words"), [(3, "too few frames"), (5, "too few frames"), (7, "odometry follows")])
+@pytest.mark.parametrize(("count", "words"), [(2, "too few frames"), (3, "too few frames"), (5, "odometry follows")])
 def test_three_motions_that_agree_are_sure_and_two_are_not(frames, count, words):
     motion = next(f for f in frame_findings(frames[:count]) if f.what == "motion")
     assert motion.verdict == "ok"

@@ -35,7 +35,7 @@ HEADING, SCALE = math.radians(8.0), 0.12
 SURE = math.log(99.0)
 """Log odds of a finding: two motions that agree may be chance (1 in 48), three are not (1 in 340)."""
 STILL = 0.5  # metres
-BASELINE = 1.5  # metres between two clouds that are compared
+BASELINE = 1.0  # metre between two clouds that are compared
 
 _FAILS = 0.1  # probability that a registration fails, as in the calibration
 METRES_PER_RADIAN = 5.0

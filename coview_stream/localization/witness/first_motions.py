@@ -44,7 +44,11 @@ from coview_stream.localization.witness.conventions import (
     unit_of,
 )  # fmt: skip
 
+DOUBT = "odometry does not follow the first clouds: do both come in metres, x forward, y left, z up?"
+"""Reason while :attr:`Conventions.doubtful`."""
+
 _LONGEST_CHAIN = 8  # clouds, where the robot hardly moves
+_STUCK = 0.05  # metres, that clouds of one place seem to have moved at most
 _SCALES = (3.0, 1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
 _NEW_START = 1.0  # metres from all other starts; the coarsest scale reaches three times as far
 _POINTS = 4000  # of a cloud, registered
@@ -88,7 +92,9 @@ class CloudPairs:
         best, self._step = min(found, key=lambda each: each[0])
         self._motion, self._variance = self._motion @ self._step, self._variance + best
         self._clouds += 1
-        if np.linalg.norm(self._motion[:3, 3]) <= BASELINE and self._clouds < _LONGEST_CHAIN:
+        moved, odometry = (float(np.linalg.norm(T[:3, 3])) for T in (self._motion, inverse(self._first) @ T_odom_body))
+        stuck = moved < _STUCK and odometry > BASELINE
+        if moved <= BASELINE and self._clouds < _LONGEST_CHAIN and not stuck:
             return None
         pair = Pair(self._motion, math.sqrt(self._variance), self._first, T_odom_body)
         self._begin(T_odom_body)
@@ -143,6 +149,7 @@ class Conventions:
         plausible: they surely fit as they are sent; only what a straight drive hides may be wrong: a mirrored axis, or
             odometry's turns.
         settled: they surely are as they should be.
+        doubtful: not plausible yet, and odometry more probably does not follow the clouds.
     """
 
     def __init__(self) -> None:
@@ -151,7 +158,7 @@ class Conventions:
     def clear(self) -> None:
         """Begin anew: another sender may speak."""
         self.finding: str | None = None
-        self.plausible = self.settled = False
+        self.plausible = self.settled = self.doubtful = False
         self._at: Floats | None = None  # odometry's position at the newest cloud
         self._ups = Counter[int]()  # axes of the clouds below which ground was seen
         self._axis, self._unit = 0, 1.0
@@ -174,6 +181,7 @@ class Conventions:
             self._unit, self._axis, self._motions = unit, axis, CloudPairs(AXES[axis])
             self._pairs.clear()
             self._pairs_in_feet.clear()
+            self.doubtful = False
             self._motions_in_feet = CloudPairs(AXES[axis])
         anywhere = not self.plausible or (len(self._pairs) > 0 and fit([self._pairs[-1]]).odds < 0.0)
         found = [(self._pairs, self._motions.add(points, T_odom_body, anywhere))]
@@ -201,6 +209,7 @@ class Conventions:
         right = next((odds for odds, reading in weighed if reading is AS_SENT), -math.inf)
         self.plausible = self.plausible or right - odds(AS_SENT, MIRRORED, *ODOMETRY) > 2.0 * SURE
         self.settled = right - odds(AS_SENT) > 2.0 * SURE
+        self.doubtful = not self.plausible and right < 0.0
         (best, reading), (second, other) = weighed[:2]
         wrong = float(np.logaddexp.reduce([odds for odds, reading in weighed if reading is not AS_SENT]))
         self.finding = None
