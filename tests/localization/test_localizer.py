@@ -231,7 +231,7 @@ def test_late_search_result_gives_the_current_pose(world_map, world_drive, resul
 def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, world_drive, results):
     localizer, result, k = searched(world_map, world_drive, results)
     T_odom_body = world_drive.T_odom_body[k].copy()
-    T_odom_body[:2, 3] += 1.2  # too little for a keyframe, whose motion would be measured
+    T_odom_body[:2, 3] += 0.65  # too little for a keyframe, whose motion would be measured
     for n in (k + 1, k + 2):
         localizer.add_frame(garbage(n), T_odom_body, 0.5 * n)
     localizer.apply_search_result(result)

@@ -78,7 +78,7 @@ class Reading:
     Attributes:
         heading: of the body's x in the level axes of the clouds, radians.
         mirrored: whether the clouds' y points right.
-        change: what mends odometry.
+        change: mends odometry.
     """
 
     found: str

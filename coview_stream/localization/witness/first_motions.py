@@ -146,8 +146,7 @@ class Conventions:
 
     Attributes:
         finding: why clouds and odometry are no use as they are sent, and the remedy; None while nothing is found.
-        plausible: they surely fit as they are sent; only what a straight drive hides may be wrong: a mirrored axis, or
-            odometry's turns.
+        plausible: they surely fit as they are sent; a straight drive may hide a mirror or odometry's wrong turns.
         settled: they surely are as they should be.
         doubtful: not plausible yet, and odometry more probably does not follow the clouds.
     """
