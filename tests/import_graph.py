@@ -58,7 +58,7 @@ INNER = {
         "basemap",
         "joined",
     ),
-    "localization": ("state", "registration", "evidence", "calibration", "witness", "tracking", "result", "search"),
+    "localization": ("state", "registration", "evidence", "calibration", "tracking", "witness", "result", "search"),
     "stream": ("transport", "maps", "node", "client"),
 }
 """Parts of a folder that has folders of its own, likewise; what is not named here may import all of them."""

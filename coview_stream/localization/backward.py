@@ -116,9 +116,9 @@ class RecordingLocalizer(Localizer):
         shift = pose_from(np.eye(3), T_map_body[:3, 3])
         return 0.0 if target is None else share_on_map(points, np.zeros(3), shift, target) or 0.0
 
-    def _update(self, match: MapMatch, ruling: Ruling) -> None:
+    def _update(self, match: MapMatch) -> Ruling:
         T_map_cloud = match.T_map_body @ self._frames.calibration.T_body_cloud  # before the calibration learns
-        super()._update(match, ruling)
+        ruling = super()._update(match)
         self._slipped |= match.moves_place
         if ruling.believed and not match.moves_place:
             level = self._tracker.protection_level()
@@ -128,6 +128,7 @@ class RecordingLocalizer(Localizer):
                 T_map_cloud, match.covariance, shared, level.doubt, self._slipped, self._backward
             )
             self._slipped = False
+        return ruling
 
 
 def track_backward(

@@ -28,6 +28,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 from coview_stream.localization.witness.first_motions import DOUBT
+from coview_stream.localization.witness.witness import Witness
 
 _DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
 
@@ -95,6 +96,7 @@ class Localizer:
         self.state = State.SEARCHING
         self._events: list[Event] = []  # since take_events
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
+        self._witness = Witness(self.config.registration, self._frames.estimator)
         self._newest: PreparedFrame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search's acceptance
@@ -148,8 +150,7 @@ class Localizer:
         if self.state.has_place:
             match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
             if match is not None:
-                ruling = self._monitor.verify(match.verdict, stamp, self._tracker.odometry.travelled)
-                self._update(match, ruling)  # the graph of poses and the state
+                self._update(match)  # verify, correct the graph of poses, change the state
         elif request is not None:
             self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
         return self.fix()
@@ -170,7 +171,7 @@ class Localizer:
         frame, request = self._predict(cloud, T_odom_body, stamp)
         match = self._match_to_map(frame, defer) if self.state.has_place else None
         if match is not None:
-            self._update(match, self._monitor.verify(match.verdict, stamp, self._tracker.odometry.travelled))
+            self._update(match)
         return request
 
     def apply_search_result(self, result: SearchResult) -> None:
@@ -207,8 +208,7 @@ class Localizer:
         self._frames.forget_keyframe()
         # the robot may have driven on or been carried since the keyframe
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
-        ruling = self._monitor.verify(match.verdict, newest.stamp, self._tracker.odometry.travelled)
-        self._update(replace(match, confirms_search=True), ruling)
+        self._update(replace(match, confirms_search=True))
 
     def fix(self) -> Fix:
         """Return the fix of the newest frame, as :meth:`step` does; RuntimeError before the first."""
@@ -306,10 +306,16 @@ class Localizer:
             self._requests.next_epoch()  # a search may be under way
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
+        self._witness.add(stamp, cloud, frame.scan, T_odom_body)
         if not searching:
             if self._frames.conventions.doubtful:
                 self.require_verification()
                 self._evidence = KeyframeEvidence(stamp, self.state, DOUBT, cause=RejectionReason.CONVENTIONS)
+            return frame, None
+        accused = self._witness.while_searching(self._tracker.odometry.drift)
+        if accused is not None:  # no place is found by clouds that may lie
+            self._requests.begin_anew()
+            self._evidence = KeyframeEvidence(stamp, self.state, accused.sentence, cause=accused.cause)
             return frame, None
         request = self._requests.add(frame, self._tracker.odometry.travelled)
         if not isinstance(request, NoSearch):
@@ -335,13 +341,16 @@ class Localizer:
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
-    def _update(self, match: MapMatch, ruling: Ruling) -> None:
-        """Correct the pose by a registration that is believed, and change the state.
+    def _update(self, match: MapMatch) -> Ruling:
+        """Judge a registration, correct the pose by one that is believed, and change the state; return the ruling.
 
         The next fix has its evidence, unless it only confirms the search's.
         """
         assert self._newest is not None  # the match is of the newest frame
+        belief = self._tracker.belief if self.state is State.TRACKING else None
+        match = self._witness.while_tracking(match, belief, self._tracker)
         verdict, stamp = match.verdict, self._newest.stamp
+        ruling = self._monitor.verify(verdict, stamp, self._tracker.odometry.travelled)
         self._wrong = ruling.wrong
         self._registered_at = stamp
         after = self.state if ruling.event is None else next_state(self.state, ruling.event)
@@ -353,6 +362,7 @@ class Localizer:
         self._tracker.update(match, self._newest.T_odom_body, ruling.believed)
         if ruling.event is not None:
             self._handle(ruling.event)
+        return ruling
 
     # ---- states
 
@@ -368,6 +378,7 @@ class Localizer:
             self._frames.forget_odometry()
             self._tracker.ground.restore(self._tracker.ground.metres)
             self._tracker.forget_odometry()
+            self._witness.forget_scan()
 
 
 def checked_arguments(

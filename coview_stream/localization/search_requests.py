@@ -92,6 +92,10 @@ class SearchRequests:
         """Start again, as odometry may have jumped; it may also go on from ``T_map_odom`` (4, 4): that is a hint."""
         if self._frames.anchor is not None:
             self.hints.odometry_continues(T_map_odom, self._frames.anchor)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget the keyframes so far; the hints stay."""
         self._odometry_check.clear()
         self._restart()
 

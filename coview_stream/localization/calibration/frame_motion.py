@@ -20,20 +20,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
-from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
-from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.surfaces import motion_prior, register_to_cloud, surface_points
 
 # set by hand
-_SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
-_FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
-_FREE_METRE = 0.1  # prior sigmas of the motion about odometry's: constant, and metres per metre driven
 _POSITION = 0.02  # sigma of a registered motion, metres
 _POSITION_METRE = 0.01  # and per metre driven: as in three real runs at two to eight metres a step
 _ANGLE = math.radians(0.2)  # sigma of a registered motion
@@ -42,12 +38,6 @@ _FAILS = 0.1  # probability that a registration fails; its sigmas then, radians 
 _FAILED_ANGLE = math.radians(3.0)
 _FAILED = 0.15
 _LONGEST = 12.0  # metres between two keyframes
-
-# surface patches
-_CELL = 1.0  # metres
-_CELL_POINTS = 5
-_THICKNESS = 0.15  # metres, one sigma across
-_FLATTER = 2.0  # times as wide as thick
 
 Variances = Callable[[float, float], Floats]
 """Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, of metres driven and radians turned."""
@@ -119,9 +109,8 @@ class FrameMotion:
         scan = prepare_scan(transform(T_odom_body @ level, points), T_odom_body[:3, 3], self._config)
         if len(scan.points) < MIN_PAIRS:
             return None
-        free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
-        prior = kernels.Prior(np.eye(4), np.diag(free**-2.0))
-        registration = register(scan, np.eye(4), target, self._config, _SCALES, prior, T_odom_body[:3, 3])
+        prior = motion_prior(np.eye(4), far)
+        registration = register_to_cloud(scan, target, prior, self._config, T_odom_body[:3, 3])
         return None if registration is None else registration.T_map_source @ T_odom_body
 
 
@@ -141,30 +130,6 @@ def _corrected(
     turn = estimator.calibration.T_body_cloud @ inverse(level)
     motion = turn @ motion @ inverse(turn)
     return _fused(before @ step, before @ motion, variances, *sigmas)
-
-
-def surface_points(points: Points) -> tuple[Points, Floats32]:
-    """Return the points (K, 3) of a cloud (N, 3) in cubic metres with a flat surface, and their normals (K, 3)."""
-    cell = np.floor(points / np.float32(_CELL)).astype(np.int64)
-    cell -= cell.min(axis=0) if len(cell) else 0
-    size = cell.max(axis=0) + 1 if len(cell) else np.ones(3, dtype=np.int64)
-    _, cell_of, count = np.unique(
-        (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True, return_counts=True
-    )
-    exact = points.astype(np.float64)
-    off = exact - (_sums(exact, cell_of, len(count)) / count[:, None])[cell_of]
-    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), cell_of, len(count)) / count[:, None]
-    variances, axes = np.linalg.eigh(moments.reshape(-1, 3, 3))
-    thin = np.maximum(variances[:, 0], 0.0)
-    flat = (count >= _CELL_POINTS) & (thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin)
-    chosen = flat[cell_of]
-    return points[chosen], axes[:, :, 0][cell_of[chosen]].astype(np.float32)
-
-
-def _sums(values: Floats, cell_of: Ints, count: int) -> Floats:
-    """Return the sums (count, K) of values (N, K) by cell number (N,)."""
-    columns = [np.bincount(cell_of, column, minlength=count) for column in values.T]
-    return np.stack(columns, axis=1) if columns else np.empty((count, 0))
 
 
 def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration, position: float) -> float:

@@ -52,9 +52,20 @@ class RejectionReason(StrEnum):
     """The place fits, but not where odometry says that the robot has moved."""
     CONVENTIONS = "conventions"
     """Clouds or odometry come in other units or axes."""
+    REPEATED = "repeated"
+    """The lidar repeats itself: its clouds show no motion while odometry moves."""
+    CLOCK = "clock"
+    """Clouds are older than their stamps."""
+    MOUNT = "mount"
+    """The sensor was turned or shifted on its mount, or clouds come in another frame."""
+    MIXED = "mixed"
+    """Clouds of more than one place come in turns, or in one."""
 
 
-_AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT)
+_AT_ONCE = (
+    RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT, RejectionReason.REPEATED,
+    RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED,
+)  # fmt: skip
 """Causes that stop the poses at once, though they are no evidence of a wrong place."""
 
 

@@ -195,7 +195,7 @@ class Tracker:
         last = self.odometry.pose
         if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
-        belief = self._belief()
+        belief = self.belief
         here = self.T_map_odom @ last
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
         return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
@@ -230,16 +230,17 @@ class Tracker:
         spread = self.odometry.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
         motion = self.odometry.motion(T_odom_body)
         calibration = self._calibration.calibration
-        R = self._belief().T_map_body[:3, :3]
+        R = self.belief.T_map_body[:3, :3]
         change = self.odometry.change()
         change[:2] = R[:2, :2] @ change[:2]
         spread += calibration.motion_covariance(R @ motion[:3, 3], yaw_of(motion), change)
         level = calibration.T_body_cloud
         self._graph.move(inverse(level) @ motion @ level, spread)
         self.odometry.set_keyframe(T_odom_body)
-        return self._belief()
+        return self.belief
 
-    def _belief(self) -> Estimate:
+    @property
+    def belief(self) -> Estimate:
         """Return the newest keyframe's body pose by the present calibration."""
         of_cloud = self._graph.estimate
         level = inverse(self._calibration.calibration.T_body_cloud)
@@ -250,7 +251,7 @@ class Tracker:
         return T_map_body @ self._calibration.calibration.T_body_cloud
 
     def _set_belief(self, T_odom_body: Pose) -> None:
-        self.T_map_odom = self._belief().T_map_body @ inverse(T_odom_body)
+        self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
     def _learn(self, match: MapMatch, position: Floats) -> None:
         """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat."""

@@ -16,9 +16,9 @@ import numpy as np
 from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, wrap_angle, yaw_of
-from coview_stream.localization.calibration.frame_motion import surface_points
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.surfaces import surface_points
 from coview_stream.localization.witness.conventions import (
     AS_SENT,
     AXES,

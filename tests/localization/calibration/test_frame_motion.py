@@ -9,7 +9,7 @@ from small_world import boxes, scan
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.localization.calibration.frame_motion import FrameMotion, surface_points
+from coview_stream.localization.calibration.frame_motion import FrameMotion
 from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.tracking.motion import Drift
 
@@ -84,14 +84,3 @@ def test_empty_frames_do_no_harm():
     nothing = np.empty((0, 3), dtype=np.float32)
     for T in STEPS:
         np.testing.assert_array_equal(motion.refine(nothing, T, estimator, DRIFT), T)
-
-
-def test_surface_points_have_the_normals_of_their_surfaces():
-    rng = np.random.default_rng(2)
-    wall = np.column_stack([np.full(4000, 3.02), rng.uniform(-5, 5, 4000), rng.uniform(0, 5, 4000)])
-    bush = rng.uniform(-4.0, -1.0, (2000, 3))
-    points, normals = surface_points(np.concatenate([wall, bush]).astype(np.float32))
-    on_wall = points[:, 0] > 0
-    assert on_wall.sum() > 3500
-    assert (~on_wall).sum() < 200
-    np.testing.assert_allclose(np.abs(normals[on_wall, 0]), 1.0, atol=1e-4)

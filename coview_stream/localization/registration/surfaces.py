@@ -1,0 +1,62 @@
+"""Surfaces of single clouds, and the registration of one cloud to another's surfaces: a motion without the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+import coview_kernels as kernels
+from coview_kernels import Registration
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.register import register
+
+_SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
+_FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
+_FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of it
+
+# surface patches
+_CELL = 1.0  # metres
+_CELL_POINTS = 5
+_THICKNESS = 0.15  # metres, one sigma across
+_FLATTER = 2.0  # times as wide as thick
+
+
+def motion_prior(T_start: Pose, far: float) -> kernels.Prior:
+    """Return the prior of a motion by ``far`` metres about its start (4, 4)."""
+    free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
+    return kernels.Prior(T_start, np.diag(free**-2.0))
+
+
+def register_to_cloud(
+    scan: RegistrationCloud, target: LocalMap, prior: kernels.Prior, config: RegistrationConfig, centre: Floats
+) -> Registration | None:
+    """Register a scan to the surfaces of an earlier one from a prior's mean, which turns about ``centre`` (3,)."""
+    return register(scan, prior.T_map_source, target, config, _SCALES, prior, centre)
+
+
+def surface_points(points: Points) -> tuple[Points, Floats32]:
+    """Return the points (K, 3) of a cloud (N, 3) in cubic metres with a flat surface, and their normals (K, 3)."""
+    cell = np.floor(points / np.float32(_CELL)).astype(np.int64)
+    cell -= cell.min(axis=0) if len(cell) else 0
+    size = cell.max(axis=0) + 1 if len(cell) else np.ones(3, dtype=np.int64)
+    _, cell_of, count = np.unique(
+        (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True, return_counts=True
+    )
+    exact = points.astype(np.float64)
+    off = exact - (_sums(exact, cell_of, len(count)) / count[:, None])[cell_of]
+    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), cell_of, len(count)) / count[:, None]
+    variances, axes = np.linalg.eigh(moments.reshape(-1, 3, 3))
+    thin = np.maximum(variances[:, 0], 0.0)
+    flat = (count >= _CELL_POINTS) & (thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin)
+    chosen = flat[cell_of]
+    return points[chosen], axes[:, :, 0][cell_of[chosen]].astype(np.float32)
+
+
+def _sums(values: Floats, cell_of: Ints, count: int) -> Floats:
+    """Return the sums (count, K) of values (N, K) by cell number (N,)."""
+    columns = [np.bincount(cell_of, column, minlength=count) for column in values.T]
+    return np.stack(columns, axis=1) if columns else np.empty((count, 0))

@@ -1,0 +1,141 @@
+"""Motion between two clouds, registered to each other without the map and without belief in odometry.
+
+The registration starts at odometry's motion. Where another start could explain the clouds as well (no motion at all, as
+of a scan that is repeated) or the clouds fit less than usual (a sensor that was turned, a cloud of another time), the
+clouds' own fit chooses: the share of the structure that lies on the earlier cloud's surfaces. So odometry cannot hide
+a motion that it does not have. Motions are planar: (x, y, heading) in the level axes of the earlier body.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+import coview_kernels as kernels
+from coview_stream.config import RegistrationConfig
+from coview_stream.config.localizer import MIN_PAIRS
+from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose, Poses, pose_from, rot_z, transform, wrap_angle, yaw_of
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
+from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud, prepare_scan
+from coview_stream.localization.registration.register import registration_covariance, remove_prior
+from coview_stream.localization.registration.surfaces import motion_prior, register_to_cloud, surface_points
+
+_ON_SURFACE = 0.1  # metres from an earlier surface, across it: its thickness, one sigma, is no more than 0.15
+_REACH = 1.0  # metres to the nearest point of the surface, along it: sparse lidars have rings so far apart
+_SAMPLE = 300  # points of which the fit is counted
+_FEWEST = 40  # points of structure; with fewer, the clouds do not show which motion fits
+_COARSE = 0.4  # metres, of the fit of starts that are not registered yet
+_USUAL = 0.7  # times the usual fit, below which other starts are tried
+_LEARNS = 0.1  # weight of a new fit in the usual one
+_STARTS = 2  # registered of those, the best
+_ALIKE = 0.03  # difference of fits that counting so many points does not resolve (one sigma)
+_UNKNOWN = 1e4  # variance of a motion that cannot be registered
+_NOISE = np.array([0.02, 0.02, np.radians(0.2)])  # sigma of a motion, as of `frame_motion`
+_NOISE_METRE = np.array([0.01, 0.01, 0.0])  # and per metre of it
+
+
+class CloudMotion(NamedTuple):
+    """Planar motion of the body between two clouds."""
+
+    motion: Floats  # (3,) x, y, heading
+    covariance: Floats  # (3, 3), wide along a tunnel
+    fit: float  # share of the structure that lies on the earlier surfaces
+    usual: float  # the same, of the motions before
+
+
+def planar(T_before: Pose, T_now: Pose) -> Floats:
+    """Return the motion (3,) between two poses (4, 4) in the level axes of the first one."""
+    turn = yaw_of(T_before)
+    x, y, _ = rot_z(-turn) @ (T_now[:3, 3] - T_before[:3, 3])
+    return np.array([x, y, wrap_angle(yaw_of(T_now) - turn)])
+
+
+class CloudMotionMeter:
+    """Meter of the motion between clouds, which remembers how well they fit usually."""
+
+    def __init__(self, config: RegistrationConfig) -> None:
+        self._config = config
+        self._usual = 0.0
+
+    def measure(self, before: RawScan, now: RawScan, calibration: Calibration) -> CloudMotion | None:
+        """Return the motion between two scans; None where there is too little to register."""
+        here = np.zeros(3)
+        target = LocalMap(*surface_points(before.levelled(calibration) - before.position.astype(np.float32)))
+        scan = prepare_scan(now.levelled(calibration) - now.position.astype(np.float32), here, self._config)
+        if len(target.points) < MIN_PAIRS or len(scan.points) < MIN_PAIRS:
+            return None
+        target.prepare()
+        # in odometry's axes, about the body: a motion that is odometry's turns nothing
+        odometry = pose_from(np.eye(3), now.position - before.position)
+        turned = before.T_odom_body[:3, :3] @ now.T_odom_body[:3, :3].T
+        none = pose_from(turned, here)
+        found = [self._registered(scan, target, odometry)]
+        structured = int(scan.above.sum()) >= _FEWEST
+        if _fit(scan, target, none, _ON_SURFACE) > found[0][2] - _ALIKE:
+            found.append(self._registered(scan, target, none))
+        if structured and max(fit for *_, fit in found) < _USUAL * self._usual:
+            starts = _starts(odometry, turned)
+            fits = np.array([_fit(scan, target, T, _COARSE) for T in starts])
+            found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
+        best = max(found, key=lambda each: each[2])
+        usual = self._usual or best[2]
+        if not structured:
+            usual = best[2]
+        if best[0] is None:
+            return CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), 0.0, usual)
+        if structured:
+            self._usual = usual + _LEARNS * (best[2] - usual)
+        return CloudMotion(*_in_plane(best[0], best[1], before.T_odom_body, now.T_odom_body), best[2], usual)
+
+    def _registered(
+        self, scan: RegistrationCloud, target: LocalMap, T_start: Pose
+    ) -> tuple[Pose | None, Floats, float]:
+        """Return pose (4, 4), covariance (6, 6) and fit of a registration; no pose if it fails."""
+        prior = motion_prior(T_start, float(np.linalg.norm(T_start[:3, 3])))
+        registration = register_to_cloud(scan, target, prior, self._config, np.zeros(3))
+        if registration is None:
+            return None, np.eye(6), 0.0
+        try:
+            T, information = remove_prior(registration, prior, self._config)
+            covariance = registration_covariance(information, self._config)
+        except InputError:
+            return None, np.eye(6), 0.0
+        # along a tunnel the clouds know nothing, and stay where they began
+        return T, covariance, _fit(scan, target, T, _ON_SURFACE)
+
+
+def _fit(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float) -> float:
+    """Return the share of the scan's structure that lies on the target's surfaces at a pose; 0 of too little."""
+    rows = np.flatnonzero(scan.above)
+    if len(rows) < _FEWEST:
+        return 0.0
+    points = transform(T, scan.points[rows[:: max(1, len(rows) // _SAMPLE)]])
+    distance, nearest = kernels.nearest(target.grid, points, _REACH)
+    seen = distance < _REACH
+    gaps = points[seen] - target.points[nearest[seen]]
+    return float((np.abs((gaps * target.normals[nearest[seen]]).sum(axis=1)) < across).sum() / len(points))
+
+
+def _starts(odometry: Pose, turned: Pose) -> Poses:
+    """Return motions (K, 4, 4) to try: parts of odometry's, backwards too, turned by all angles, and to all sides."""
+    poses = [pose_from(np.eye(3), share * odometry[:3, 3]) for share in (-2.0, -1.0, -0.5, 0.5, 1.5, 2.0)]
+    poses += [pose_from(rot_z(np.radians(angle)), odometry[:3, 3]) for angle in range(-175, 181, 5) if angle]
+    for radius in (0.75, 1.5, 2.25, 3.0, 4.0, 5.0):
+        for angle in np.arange(0.0, 2.0 * np.pi, 0.75 / radius):
+            side = radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+            poses.append(pose_from(np.eye(3), odometry[:3, 3] + side))
+    return np.stack(poses)
+
+
+def _in_plane(T: Pose, covariance: Floats, T_before: Pose, T_now: Pose) -> tuple[Floats, Floats]:
+    """Return a registered pose (4, 4) in odometry's axes and its covariance as a planar motion and its (3, 3)."""
+    turn = yaw_of(T_before)
+    seen = pose_from(T[:3, :3] @ T_now[:3, :3], T_before[:3, 3] + T[:3, 3])
+    motion = planar(T_before, seen)
+    axes = [3, 4, 2]
+    R = rot_z(-turn)
+    noise = _NOISE + _NOISE_METRE * float(np.linalg.norm(motion[:2]))
+    return motion, R @ covariance[np.ix_(axes, axes)] @ R.T + np.diag(noise**2)

@@ -1,0 +1,329 @@
+"""Faults of clouds and odometry, and their probabilities, from the motions that odometry, clouds and map show.
+
+Over a step the odometry moves by o, the clouds, registered to each other, by l, and the registrations to the map by m.
+All three agree where nothing is wrong. A fault makes them disagree in a way of its own:
+
+* good: l = o; m = l in all cases, as the map sees the same clouds.
+* slip: o is wrong (wheels slip, odometry stands still or jumps), l is right, and smooth, as bodies have inertia.
+* repeated: l = 0, whatever o is.
+* late: l = o at an earlier time. The lag is constant, or grows.
+* moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
+  body does, and from then on l = C^-1 o C.
+* mixed: clouds of several places; l is anything, and most clouds do not fit each other.
+
+Each registration fails with a small probability and then says anything. The probabilities are those of a hidden Markov
+model: those before the step, moved by the rates at which faults come and go, times the likelihood of l and m (forward
+algorithm). A lag is a state of its own on a grid; each step begins a hypothesis about C, and the best are kept.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import wrap_angle
+from coview_stream.localization.tracking.monitor import RejectionReason
+
+# how often faults come
+_PER_SECOND = 1e-6  # a driver hangs, a clock parts, a second driver starts: once in twelve days of driving
+_PER_METRE = 1e-6  # a bolt gives way: once in 1000 km
+_FAST = 40.0  # metres per second: no robot is faster, clouds that cannot be registered may be
+_SLIPS = 0.01  # per metre: wheels slip once in 100 m
+_SLIPS_ON = 0.5  # probability that a slip lasts to the next step
+_ENDS = 0.01  # per second, that a fault of a driver or a clock ends
+_GROWS_ON = 0.95  # probability that a lag that grows does so in the next step
+
+LAGS = np.arange(0.0, 3.01, 0.05)
+"""Lags of clouds, seconds; the first is none, the last is "as long or longer"."""
+_FASTEST = 0.5  # seconds per second by which a lag grows
+FAILS = 0.05
+"""Probability that clouds are registered wrongly, where they fit each other as usual."""
+_MAP_FAILS = 0.02  # likewise a verified registration to the map
+_ALONE = 0.05  # probability that clouds of one place do not fit each other, and those of several
+_APART = 0.7
+_ANYWHERE = np.array([2.0, 2.0, math.radians(20.0)])  # sigmas of a wrong registration about odometry's motion
+_SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
+    (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([0.3, 0.0, 0.0])),  # all wheels, along the way
+    (0.4, np.array([0.1, 0.1, math.radians(3.0)]), np.array([0.2, 0.1, 0.0])),  # some of the wheels, to a side
+    (0.1, _ANYWHERE, np.zeros(3)),  # odometry jumps
+)
+_INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleration of a body, metres and radians per s^2
+_COPY = 1e-6  # probability that another cloud has the same bytes
+_BOLT = np.array([0.1, 0.1, math.radians(10.0)])  # sigmas of C where a mount gives way, and of another frame
+_FRAME = np.array([3.0, 3.0, math.radians(3.0)])
+_KEPT = 5  # hypotheses about C
+_TURNED = math.radians(2.0)  # of C, from which it is said to be a turn
+_NEGLIGIBLE = 1e-6  # probability below which a fault has not begun
+
+
+class Seen(NamedTuple):
+    """Motion (3,) as seen by one witness, with its covariance (3, 3)."""
+
+    motion: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a robot by its witnesses; motions are planar: (x, y, heading) in the earlier body's axes."""
+
+    seconds: float
+    odometry: Seen
+    clouds: Seen | None  # None where there is too little to see
+    on_map: Seen | None  # None without a verified registration at both ends
+    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the begin of the step
+    path_now: Floats  # and before its end
+    fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
+    apart: bool = False  # the clouds fit each other much less than usual
+    copied: bool = False  # the clouds are the same bytes
+    parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
+
+
+@dataclass
+class _Moved:
+    """Hypothesis that clouds are moved by C (3,) since a step."""
+
+    weight: float
+    C: Floats
+    sigmas: Floats
+
+    def expected(self, o: Floats, noise: Floats) -> tuple[Floats, Floats]:
+        """Return the clouds' motion (3,) by odometry's, and its covariance (3, 3)."""
+        lateral = self.sigmas[2] * float(np.linalg.norm(o[:2])) + self.sigmas[:2] * abs(o[2])
+        return compose(compose(inverted(self.C), o), self.C), noise + np.diag([*lateral, 0.0]) ** 2
+
+
+class Accusation(NamedTuple):
+    """A fault that may make poses wrong."""
+
+    cause: RejectionReason
+    probability: float  # of all such faults
+    sentence: str
+
+
+@dataclass
+class FaultPosterior:
+    """Probabilities of the faults."""
+
+    slip: float = 0.0
+    repeated: float = 0.0
+    mixed: float = 0.0
+    steady: Floats = field(default_factory=lambda: np.eye(1, len(LAGS))[0])  # of each constant lag; the first: good
+    growing: Floats = field(default_factory=lambda: np.zeros(len(LAGS)))  # of each lag that grows
+    moved: list[_Moved] = field(default_factory=list)
+    _driven: float = 0.0  # metres by odometry since the scan began to be repeated
+    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step
+    _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
+
+    @property
+    def good(self) -> float:
+        """Probability that nothing is wrong."""
+        return float(self.steady[0])
+
+    def add(self, step: Step) -> None:
+        """Move the probabilities over a step (see the module)."""
+        o, dt = step.odometry.motion, step.seconds
+        driven = float(np.linalg.norm(o[:2]))
+        noise = step.odometry.covariance
+        come, ends = _PER_SECOND * dt, 1.0 - math.exp(-_ENDS * dt)
+        good, slip = self.good, self.slip
+
+        def like(motion: Floats, spread: Floats = noise) -> Floats:
+            """Return the likelihood of the clouds' and the map's motion where this one is expected."""
+            return _likelihood(step, motion, spread, _ALONE)
+
+        anything = float(_likelihood(step, o, np.diag(_ANYWHERE**2), _APART))
+        kinds = [(share, np.diag((sigmas + metre * driven) ** 2)) for share, sigmas, metre in _SLIP_KINDS]
+        slips = self._smoother(step) * sum(share * _slipped(step, noise + spread) for share, spread in kinds)
+        stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
+        copy = like(o) if stands else like(np.zeros(3)) / (_COPY if step.copied else 1.0)
+
+        # faults that come from a good state or a slip, stay and go
+        farther = (
+            driven if step.clouds is None else max(driven, min(dt * _FAST, float(np.hypot(*step.clouds.motion[:2]))))
+        )
+        begins = 1.0 - math.exp(-_SLIPS * farther)
+        new_slip = (begins * good + _SLIPS_ON * slip) * slips
+        new_repeated = (come * (good + slip) + (1.0 - ends) * self.repeated) * float(copy)
+        new_mixed = (come * (good + slip) + (1.0 - ends) * self.mixed) * anything
+        back = (1.0 - _SLIPS_ON) * slip * float(like(o)) + ends * (self.repeated + self.mixed) * anything
+
+        # lags: every pair of a lag before and one now
+        between = _between(step.path_before, step.path_now)
+        pairs = like(between, noise + _grid_spread(o, dt))
+        np.fill_diagonal(pairs, like(between.diagonal().T))  # a lag that stays is off by as much at both ends
+        pairs[0, 0], pairs[-1, -1] = like(o), max(pairs[-1, -1], like(o, np.diag(_ANYWHERE**2)))
+        on, to_steady, to_growing = _lag_rates(dt, come)
+        grown = self.growing + np.eye(1, len(LAGS))[0] * good * come
+        steady: Floats = self.steady @ (on * pairs) + self.growing @ (to_steady * pairs)
+        growing: Floats = grown @ (to_growing * pairs)
+        steady[0] += back - begins * good * float(like(o))
+
+        # a sensor that has been moved stays so
+        moved = [_Moved(h.weight * float(like(*h.expected(o, noise))), h.C, h.sigmas) for h in self.moved]
+        if step.clouds is not None:
+            C = compose(inverted(o), step.clouds.motion)
+            weight = (come + _PER_METRE * driven) * (good + slip) * 0.5 * (_density(C, _BOLT) + _density(C, _FRAME))
+            weight *= _fits(step, _ALONE) * (1.0 - step.fails)
+            weight *= float(_of_map(step, step.clouds.motion, step.clouds.covariance))
+            moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
+        moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
+
+        total = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum() + sum(h.weight for h in moved)
+        if not (math.isfinite(total) and total > 0.0):
+            return
+        self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
+        self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
+        self.moved = [_Moved(h.weight / total, h.C, h.sigmas) for h in moved]
+        if not stands:
+            self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
+        self._speed = np.abs(o) / dt
+        self._before = None
+        if step.clouds is not None:
+            self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
+
+    def corrected(self, D: Floats, delay: float) -> None:
+        """Follow a calibration that has turned and shifted clouds by ``D`` (3,) and now takes them for later.
+
+        ``D`` is body <- the body's axes by the earlier calibration, ``delay`` the change of its delay, seconds.
+        """
+        for h in self.moved:
+            h.C = compose(h.C, inverted(D))
+        if delay:
+            for lags in (self.steady, self.growing):
+                shares, place = lags.copy(), (LAGS - delay) / float(LAGS[1])
+                if lags is self.steady:
+                    place[0] = 0.0  # the good state stays good by the new calibration
+                lags[:] = 0.0
+                np.add.at(lags, np.clip(np.round(place), 0, len(LAGS) - 1).astype(np.int64), shares)
+
+    def accusation(self, metres: float, radians: float, risk: float) -> Accusation | None:
+        """Return the most probable fault by which poses are off by more than a level, if all together reach a risk."""
+        wrong: list[tuple[float, RejectionReason, str]] = []
+        if self._driven > metres:
+            words = f"the lidar repeats itself: no motion between clouds while odometry drives {self._driven:.1f} m"
+            wrong.append((self.repeated, RejectionReason.REPEATED, words))
+        wrong.append(
+            (self.mixed, RejectionReason.MIXED, "clouds do not fit each other: they are of more than one place")
+        )
+        late = self.steady + self.growing
+        off = LAGS * float(np.linalg.norm(self._speed[:2])) > metres
+        off |= LAGS * self._speed[2] > radians
+        if off.any():
+            lag, share = float(LAGS[off][late[off].argmax()]), float(late[off].sum())
+            grows = " and more and more" if self.growing[off].sum() > 0.5 * share else ""
+            wrong.append((share, RejectionReason.CLOCK, f"clouds are {lag:.1f} s older than their stamps{grows}"))
+        for h in self.moved:
+            shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))
+            if shift > metres or turn > radians:
+                words = f"clouds jumped by {shift:.1f} m as no body moves"
+                if turn > _TURNED:
+                    words = f"the sensor was turned by {math.degrees(turn):.0f} degrees on its mount"
+                wrong.append((h.weight, RejectionReason.MOUNT, words))
+        total = sum(probability for probability, *_ in wrong)
+        if total < risk:
+            return None
+        _, cause, sentence = max(wrong, key=lambda each: each[0])
+        return Accusation(cause, total, sentence)
+
+    def _smoother(self, step: Step) -> float:
+        """Return how much better the clouds' motion goes on from the step before than odometry's, as a ratio."""
+        if self._before is None or step.clouds is None:
+            return 1.0
+        exponent, (seconds, driven, seen) = 0.0, self._before
+        for part in step.parts or ((step.seconds, step.odometry.motion, step.clouds.motion),):
+            inertia = (_INERTIA * 0.5 * (seconds + part[0])) ** 2
+            spread = inertia + np.diag(step.clouds.covariance) * (seconds**-2 + part[0] ** -2)
+            jump = part[1] / part[0] - driven / seconds, part[2] / part[0] - seen / seconds
+            exponent += 0.5 * float(((jump[0] ** 2 - jump[1] ** 2) / spread).sum())
+            seconds, driven, seen = part
+        return math.exp(min(max(exponent, -30.0), 30.0))
+
+
+def _likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floats:
+    """Return the likelihood of a step's clouds and map where a motion (..., 3) with a covariance (3, 3) is expected."""
+    on_map = _of_map(step, motion, spread)
+    if step.clouds is None:
+        return on_map
+    anywhere = _normal(step.clouds.motion - step.odometry.motion, np.diag(_ANYWHERE**2))
+    right = _normal(step.clouds.motion - motion, step.clouds.covariance + spread)
+    return np.asarray(((1.0 - step.fails) * right + step.fails * anywhere) * _fits(step, alone) * on_map)
+
+
+def _fits(step: Step, apart: float) -> float:
+    """Return the likelihood that a step's clouds fit each other as they do, ``apart`` that they do not."""
+    return apart if step.apart else 1.0 - apart
+
+
+def _slipped(step: Step, spread: Floats) -> float:
+    """Return the likelihood of a step's clouds and map where odometry is off by a covariance and the clouds are not."""
+    if step.clouds is None:
+        return float(_likelihood(step, step.odometry.motion, spread, _ALONE))
+    seen, o = step.clouds, step.odometry.motion
+    anywhere = step.fails * _normal(seen.motion - o, np.diag(_ANYWHERE**2)) * _of_map(step, o, spread)
+    right = (1.0 - step.fails) * _normal(seen.motion - o, seen.covariance + spread)
+    return float(_fits(step, _ALONE) * (right * _of_map(step, seen.motion, seen.covariance) + anywhere))
+
+
+def _of_map(step: Step, motion: Floats, spread: Floats) -> Floats:
+    if step.on_map is None:
+        return np.ones(np.shape(motion)[:-1])
+    anywhere = _normal(step.on_map.motion - step.odometry.motion, np.diag(_ANYWHERE**2))
+    right = _normal(step.on_map.motion - motion, step.on_map.covariance + spread)
+    return np.asarray((1.0 - _MAP_FAILS) * right + _MAP_FAILS * anywhere)
+
+
+def _normal(gap: Floats, covariance: Floats) -> Floats:
+    """Return the density of gaps (..., 3) of planar motions."""
+    gap = np.concatenate([gap[..., :2], np.angle(np.exp(1j * gap[..., 2:]))], axis=-1)
+    square = np.einsum("...i,ij,...j", gap, np.linalg.inv(covariance), gap)
+    return np.asarray(np.exp(-0.5 * square) / math.sqrt((2.0 * math.pi) ** 3 * np.linalg.det(covariance)))
+
+
+def _density(C: Floats, sigmas: Floats) -> float:
+    return float(_normal(C, np.diag(sigmas**2)))
+
+
+def compose(a: Floats, b: Floats) -> Floats:
+    """Return planar motion ``a`` (3,) followed by ``b`` (3,)."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap_angle(float(a[2] + b[2]))])
+
+
+def inverted(a: Floats) -> Floats:
+    """Return the planar motion (3,) back."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
+
+
+def _between(before: Floats, now: Floats) -> Floats:
+    """Return the motion (L, M, 3) from each of the poses (L, 3) to each of others (M, 3)."""
+    gap = now[None] - before[:, None]
+    c, s = np.cos(before[:, 2])[:, None], np.sin(before[:, 2])[:, None]
+    x, y = c * gap[..., 0] + s * gap[..., 1], c * gap[..., 1] - s * gap[..., 0]
+    return np.stack([x, y, gap[..., 2]], axis=-1)
+
+
+def _grid_spread(o: Floats, dt: float) -> Floats:
+    """Covariance (3, 3) of a motion between lags of the grid, which is as coarse as it is."""
+    return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
+
+
+def _lag_rates(dt: float, come: float) -> tuple[Floats, Floats, Floats]:
+    """Return the transitions (L, L) between constant lags, from growing ones to constant ones, and among growing ones.
+
+    The first row of the constant ones is the good state, from which any lag may come.
+    """
+    n, ends = len(LAGS), 1.0 - math.exp(-_ENDS * dt)
+    steady = (1.0 - ends) * np.eye(n)
+    steady[1:, 0] = ends
+    steady[0] = come / (n - 1)
+    steady[0, 0] = 1.0 - 2.0 * come
+    most = max(1, round(_FASTEST * dt / float(LAGS[1] - LAGS[0])))
+    growth = np.triu(np.tri(n, k=most)) / (most + 1)
+    growth[:, -1] += 1.0 - growth.sum(axis=1)
+    return steady, (1.0 - _GROWS_ON) * np.eye(n), _GROWS_ON * growth

@@ -1,0 +1,231 @@
+"""The witness of a robot's motion: clouds held against odometry and map, about once a metre or a second."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
+from coview_stream.geometry.transforms import Points, Pose, inverse, rot_z, yaw_of
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.tracking.map_matching import MapMatch
+from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.tracking.pose_graph import Estimate
+from coview_stream.localization.tracking.tracker import Tracker
+from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter, planar
+from coview_stream.localization.witness.faults import (
+    FAILS,
+    LAGS,
+    Accusation,
+    FaultPosterior,
+    Seen,
+    Step,
+    compose,
+    inverted,
+)
+
+_METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # of a step, whichever comes first
+_SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
+_FAR = 5.0  # metres
+_LONGEST = 12.0  # metres of a step of which the clouds still show the same
+_RECENT = 3  # frames of odometry of which the velocity is taken
+_HISTORY = 600  # frames of odometry
+_HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
+_APART = 2.0  # times worse than usual: clouds do not fit each other
+_RISK = 1e-3  # of a protection level
+_JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
+
+
+class _Frame(NamedTuple):
+    stamp: float
+    cloud: Points
+    scan: RawScan
+    on_map: Estimate | None = None
+
+
+class Witness:
+    """Judge of one robot's clouds and odometry.
+
+    Attributes:
+        faults: probabilities of the faults.
+    """
+
+    def __init__(self, config: RegistrationConfig, estimator: CalibrationEstimator) -> None:
+        """Judge with the calibration of ``estimator``, which is told to look for faults of mount and clock."""
+        self._estimator = estimator
+        self._accused: RejectionReason | None = None
+        self._meter = CloudMotionMeter(config)
+        self.faults = FaultPosterior()
+        self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
+        self._odometry: Pose | None = None
+        self._newest: _Frame | None = None
+        self._previous: _Frame | None = None
+        self._reference: _Frame | None = None
+        self._reference_at = np.zeros(3)
+        self._calibration = Calibration()
+        self._copied = False  # the newest cloud has the bytes of the one before
+
+    def forget_scan(self) -> None:
+        """Compare the next frame with none before it: its scan is about another origin."""
+        self._reference = self._previous = self._newest = None
+
+    def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
+        """Add a frame: its cloud as it came, its scan, and its odometry (4, 4) as it came."""
+        calibration = self._estimator.calibration
+        pose = np.zeros(3)
+        if self._odometry is not None:
+            step = planar(self._odometry, T_odom_raw)
+            step[:2] *= 1.0 + calibration.scale
+            step[2] += calibration.turn * float(np.linalg.norm(step[:2]))
+            before = self._path[-1][1]
+            pose = before + rot_z(before[2]) @ [step[0], step[1], 0.0] + [0.0, 0.0, step[2]]
+        self._odometry = T_odom_raw
+        self._path.append((stamp, pose))
+        before_cloud = None if self._newest is None else self._newest.cloud
+        self._copied = before_cloud is not None and np.array_equal(before_cloud, cloud)
+        self._previous, self._newest = self._newest, _Frame(stamp, cloud, scan)
+        if self._reference is None:
+            self._reference, self._reference_at = self._newest, pose
+
+    def while_searching(self, drift: Drift) -> Accusation | None:
+        """Compare the newest frame if that is due; return the fault that would make a place wrong, if there is one."""
+        if self._is_due():
+            self._compare(drift)
+        return self._accusation(0.5 * ALERT_METRES, 0.5 * ALERT_DEGREES)
+
+    def while_tracking(self, match: MapMatch, belief: Estimate | None, tracker: Tracker) -> MapMatch:
+        """Compare the newest frame if that is due; return its match, rejected where a fault makes poses wrong.
+
+        ``belief`` is of its pose without the match, if there is a pose.
+        """
+        fits = match.scan is not None and match.verdict.cause in (RejectionReason.VERIFIED, RejectionReason.ODOMETRY)
+        registered = Estimate(match.T_map_body, match.covariance) if fits else None
+        contradicted = belief is not None and (match.moves_place or not match.verdict.verified)
+        if contradicted or self._is_due():
+            self._compare(tracker.odometry.drift, registered, belief, contradicted)
+        level = tracker.protection_level()
+        accused = self._accusation(min(level.metres, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
+        if accused is None:
+            return match
+        verdict = replace(match.verdict, cause=accused.cause, reason=accused.sentence)
+        return replace(match, verdict=verdict, moves_place=False)
+
+    def _accusation(self, metres: float, degrees: float) -> Accusation | None:
+        """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
+        accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._accused
+        self._accused = None if accused is None else accused.cause
+        if self._accused is not before:
+            if self._accused is RejectionReason.MOUNT:
+                self._estimator.widen_mount()
+            elif self._accused is RejectionReason.CLOCK:
+                self._estimator.widen_clock()
+        return accused
+
+    def _is_due(self) -> bool:
+        if self._reference is None or self._newest is None:
+            return False
+        seconds = self._newest.stamp - self._reference.stamp
+        step = self._path[-1][1] - self._reference_at
+        far = float(np.linalg.norm(step[:2]))
+        moved = far >= _METRES or abs(step[2]) >= _TURN
+        return seconds >= _SECONDS or far >= _FAR or (moved and seconds >= _SHORTEST)
+
+    def _compare(
+        self,
+        drift: Drift,
+        registered: Estimate | None = None,
+        belief: Estimate | None = None,
+        contradicted: bool = False,
+    ) -> None:
+        """Compare the newest frame with the one of the last comparison.
+
+        Args:
+            drift: of odometry.
+            registered: the newest frame's registration to the map, the prior removed, if it fits.
+            belief: of the newest frame's pose without it, if there is a pose.
+            contradicted: by the map, so the frame just before is compared, too: bodies do not jump.
+        """
+        before, now = self._reference, self._newest
+        if before is None or now is None or now.stamp <= before.stamp:
+            return
+        now = now._replace(on_map=registered or belief)
+        calibration = self._follow()
+        delay = calibration.delay
+        past, present = self._by_lags(before.stamp - delay), self._by_lags(now.stamp - delay)
+        o = _motion(past[0], present[0])
+        driven, turned = float(np.linalg.norm(o[:2])), abs(float(o[2]))
+        x, y, yaw = drift.variances(driven, turned)[[3, 4, 2]]
+        along, across = calibration.sigma_scale * driven, max(calibration.sigma_heading, _HEADING) * driven
+        noise = np.diag(_JITTER**2 + [x + along**2, y + across**2, yaw + (calibration.sigma_turn * driven) ** 2])
+        seen: CloudMotion | None = None
+        if driven <= _LONGEST:
+            seen = self._meter.measure(before.scan, now.scan, calibration)
+        clouds = None if seen is None else Seen(seen.motion, seen.covariance)
+        misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
+        on_map = None if registered is None else _on_map(before.on_map, registered)
+        parts = self._parts(seen, before, now, calibration) if contradicted and seen is not None else ()
+        fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
+        step = Step(
+            now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
+            fails=fails, apart=misfit > _APART, copied=self._copied, parts=parts,
+        )  # fmt: skip
+        self.faults.add(step)
+        self._reference, self._reference_at = now, self._path[-1][1]
+
+    def _parts(
+        self, seen: CloudMotion, before: _Frame, now: _Frame, calibration: Calibration
+    ) -> tuple[tuple[float, Floats, Floats], ...]:
+        """Return a step's motions before and since the last frame but one: seconds, odometry, clouds."""
+        middle = self._previous
+        if middle is None or not before.stamp < middle.stamp < now.stamp:
+            return ()
+        last = self._meter.measure(middle.scan, now.scan, calibration)
+        if last is None:
+            return ()
+        poses = [self._by_lags(frame.stamp - calibration.delay)[0] for frame in (before, middle, now)]
+        return (
+            (middle.stamp - before.stamp, _motion(*poses[:2]), compose(seen.motion, inverted(last.motion))),
+            (now.stamp - middle.stamp, _motion(*poses[1:]), last.motion),
+        )
+
+    def _follow(self) -> Calibration:
+        """Take over a changed calibration; return it."""
+        calibration = self._estimator.calibration
+        moved = calibration.T_body_cloud @ inverse(self._calibration.T_body_cloud)
+        self.faults.corrected(planar(np.eye(4), moved), calibration.delay - self._calibration.delay)
+        self._calibration = calibration
+        return calibration
+
+    def _by_lags(self, stamp: float) -> Floats:
+        """Return odometry's planar poses (L, 3) by LAGS before a stamp.
+
+        Before the first frame it stood still, after the newest it goes on as before.
+        """
+        stamps = np.array([at for at, _ in self._path])
+        poses = np.stack([pose for _, pose in self._path])
+        if len(stamps) > _RECENT:
+            velocity = (poses[-1] - poses[-1 - _RECENT]) / (stamps[-1] - stamps[-1 - _RECENT])
+            stamps, poses = np.append(stamps, stamps[-1] + 1.0), np.vstack([poses, poses[-1] + velocity])
+        return np.stack([np.interp(stamp - LAGS, stamps, column) for column in poses.T], axis=1)
+
+
+def _motion(before: Floats, now: Floats) -> Floats:
+    step = rot_z(-before[2]) @ np.array([*(now - before)[:2], 0.0])
+    return np.array([step[0], step[1], now[2] - before[2]])
+
+
+def _on_map(before: Estimate | None, now: Estimate | None) -> Seen | None:
+    """Return the motion between two poses on the map; None without either."""
+    if before is None or now is None:
+        return None
+    motion = planar(before.T_map_body, now.T_map_body)
+    R, axes = rot_z(-yaw_of(before.T_map_body)), np.ix_([3, 4, 2], [3, 4, 2])
+    lever = np.array([0.0, float(np.linalg.norm(motion[:2])), 0.0]) * np.sqrt(before.covariance[2, 2])
+    return Seen(motion, R @ (before.covariance[axes] + now.covariance[axes]) @ R.T + np.diag(lever**2 + 1e-6))

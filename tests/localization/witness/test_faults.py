@@ -1,0 +1,190 @@
+"""Faults of clouds and odometry: synthetic drives with one fault each, and the probabilities that they get."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.witness.faults import LAGS, FaultPosterior, Seen, Step, compose, inverted
+
+DT, SPEED = 0.5, 2.0
+NOISE = np.diag([0.02, 0.02, np.radians(0.3)]) ** 2
+LEVEL, RISK = (0.3, np.radians(1.0)), 1e-3
+
+
+def pose(t):
+    """A robot that drives an S: planar poses (..., 3) at times; it stood still before time zero."""
+    t = np.maximum(np.asarray(t, dtype=float), 0.0)
+    fine = np.linspace(0.0, 60.0, 6001)
+    yaw = 0.5 * np.sin(0.3 * fine)
+    steps = 0.01 * SPEED * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    xy = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)[:-1]])
+    return np.stack([np.interp(t, fine, column) for column in (*xy.T, yaw)], axis=-1)
+
+
+def moved(before, now):
+    return compose(inverted(before), now)
+
+
+class Odometry:
+    """Planar path of odometry, step by step; it stood still before."""
+
+    def __init__(self, t):
+        self.times, self.poses = [t - 10.0, t], [np.zeros(3), np.zeros(3)]
+
+    def move(self, o):
+        """Move on; return the path by lags before and after."""
+        before = self.by_lags(self.times[-1])
+        self.poses.append(compose(self.poses[-1], o))
+        self.times.append(self.times[-1] + DT)
+        return before, self.by_lags(self.times[-1])
+
+    def by_lags(self, t):
+        return np.stack([np.interp(t - LAGS, self.times, column) for column in np.transpose(self.poses)], axis=1)
+
+
+def drive(change, way=pose, begin=10.0, until=20.0, **given):
+    """Drive until a time; from ``begin`` on, ``change(o, t)`` gives odometry's and the clouds' motion of a step."""
+    faults, rng, odometry = FaultPosterior(), np.random.default_rng(3), Odometry(5.0)
+    for t in np.arange(5.0, until, DT):
+        o = seen = moved(way(t), way(t + DT))
+        if t >= begin:
+            o, seen = change(o, t)
+        seen, on_map = (Seen(seen + rng.normal(size=3) * np.sqrt(np.diag(NOISE)), NOISE) for _ in range(2))
+        faults.add(Step(DT, Seen(o, NOISE), seen, on_map, *odometry.move(o), **given))
+        accused = faults.accusation(*LEVEL, RISK)
+        if accused is not None:
+            return faults, accused, t + DT - begin
+    return faults, None, until - begin
+
+
+def test_nothing_is_wrong_where_all_agree():
+    faults, accused, _ = drive(lambda o, t: (o, o), until=50.0)
+    assert accused is None
+    assert faults.good > 0.99
+
+
+def test_repeated_scan_is_named_after_a_step():
+    _, accused, seconds = drive(lambda o, t: (o, np.zeros(3)))
+    assert accused.cause is RejectionReason.REPEATED
+    assert "the lidar repeats itself" in accused.sentence
+    assert seconds <= DT
+
+
+def test_robot_that_stands_does_not_repeat_itself():
+    faults, accused, _ = drive(lambda o, t: (0.0 * o, 0.0 * o), until=60.0)
+    assert accused is None
+    o = np.array([0.2, 0.0, 0.0])
+    faults.add(Step(DT, Seen(o, NOISE), Seen(o, NOISE), None, *Odometry(60.0).move(o)))
+    assert faults.accusation(*LEVEL, RISK) is None  # nor when it drives on
+
+
+@pytest.mark.parametrize("lag", [0.4, 1.0, 2.0])
+def test_clouds_that_are_late_are_named_with_their_lag(lag):
+    def late(o, t):
+        before = lag if t >= 10.0 + DT else 0.0
+        return o, moved(pose(t - before), pose(t + DT - lag))
+
+    faults, accused, seconds = drive(late)
+    assert accused.cause is RejectionReason.CLOCK
+    assert "older than their stamps" in accused.sentence
+    assert seconds <= 4.0
+    shares = faults.steady + faults.growing
+    assert LAGS[shares[1:].argmax() + 1] == pytest.approx(lag, abs=0.1)
+
+
+def test_lag_that_grows_is_named_before_it_is_long():
+    def growing(o, t):
+        return o, moved(pose(t - 0.1 * (t - 10.0)), pose(t + DT - 0.1 * (t + DT - 10.0)))
+
+    _, accused, seconds = drive(growing)
+    assert accused.cause is RejectionReason.CLOCK
+    assert 0.1 * seconds * SPEED < 1.0  # metres that poses are off
+
+
+@pytest.mark.parametrize("degrees", [-10.0, 5.0, 90.0])
+def test_sensor_that_turned_on_its_mount_is_named_with_its_angle(degrees):
+    C = np.array([0.0, 0.0, np.radians(degrees)])
+
+    def turned(o, t):
+        return o, compose(o, C) if t < 10.0 + DT else compose(compose(inverted(C), o), C)
+
+    _, accused, seconds = drive(turned)
+    assert accused.cause is RejectionReason.MOUNT
+    assert f"turned by {abs(degrees):.0f} degrees" in accused.sentence
+    assert seconds <= 3.0
+
+
+def test_clouds_that_jump_are_named():
+    C = np.array([0.5, 4.0, 0.0])
+
+    def jumped(o, t):
+        return o, compose(o, C) if t < 10.0 + DT else compose(compose(inverted(C), o), C)
+
+    _, accused, seconds = drive(jumped)
+    assert accused.cause is RejectionReason.MOUNT
+    assert "clouds jumped by 4.0 m" in accused.sentence
+    assert seconds <= 3.0
+
+
+def test_a_mount_that_the_calibration_has_followed_is_no_fault():
+    C = np.array([0.0, 0.0, np.radians(10.0)])
+    faults, accused, _ = drive(lambda o, t: (o, compose(o, C) if t < 10.4 else compose(compose(inverted(C), o), C)))
+    assert accused is not None
+    faults.corrected(C, 0.0)
+    assert faults.accusation(*LEVEL, RISK) is None
+
+
+def test_a_delay_that_the_calibration_has_followed_is_no_fault():
+    def late(o, t):
+        return o, moved(pose(t - (1.0 if t >= 10.4 else 0.0)), pose(t + DT - 1.0))
+
+    faults, accused, _ = drive(late)
+    assert accused is not None
+    faults.corrected(np.zeros(3), 1.0)
+    assert faults.accusation(*LEVEL, RISK) is None
+
+
+@pytest.mark.parametrize(
+    "slip", [np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.8, 0.1]), np.array([3.0, 1.0, np.radians(15.0)])]
+)
+def test_wheels_that_slip_are_no_fault_of_the_lidar(slip):
+    _, accused, _ = drive(lambda o, t: (o + slip * (t < 10.4), o))
+    assert accused is None
+
+
+def test_odometry_that_stands_still_is_no_fault_of_the_lidar():
+    faults, accused, _ = drive(lambda o, t: (0.0 * o, o), until=15.0)
+    assert accused is None
+    assert faults.slip > 0.9
+
+
+def test_clouds_without_a_direction_accuse_nobody():
+    """In a tunnel the clouds know nothing of the way along it."""
+    wide = np.diag([10.0, 0.02, np.radians(0.3)]) ** 2
+    faults, o, odometry = FaultPosterior(), np.array([SPEED * DT, 0.0, 0.0]), Odometry(5.0)
+    for _ in range(70):
+        faults.add(Step(DT, Seen(o, NOISE), Seen(0.0 * o, wide), None, *odometry.move(o)))
+        assert faults.accusation(*LEVEL, RISK) is None
+
+
+def test_one_wrong_registration_that_the_map_contradicts_accuses_nobody():
+    faults, odometry = FaultPosterior(), Odometry(5.0)
+    for k, t in enumerate(np.arange(5.0, 25.0, DT)):
+        o = moved(pose(t), pose(t + DT))
+        seen = 0.4 * o if k % 10 == 9 else o
+        faults.add(Step(DT, Seen(o, NOISE), Seen(seen, NOISE), Seen(o, NOISE), *odometry.move(o)))
+        assert faults.accusation(*LEVEL, RISK) is None
+
+
+def test_clouds_of_two_places_in_turns_are_named():
+    faults, rng, odometry = FaultPosterior(), np.random.default_rng(2), Odometry(5.0)
+    accused = None
+    for t in np.arange(5.0, 12.0, DT):
+        o = moved(pose(t), pose(t + DT))
+        seen = o + rng.normal(size=3) * [2.0, 2.0, 0.3]
+        path = odometry.move(o)
+        faults.add(Step(DT, Seen(o, NOISE), Seen(seen, NOISE), None, *path, fails=0.9, apart=True))
+        accused = accused or faults.accusation(*LEVEL, RISK)
+    assert accused.cause is RejectionReason.MIXED
