@@ -60,6 +60,9 @@ BENCHMARKS = {
     "ablation": Benchmark("accuracy.ablation", "effect of each choice of the method"),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "smooth": Benchmark("tracking.smoothing", "locate --smooth against live poses and the truth"),
+    "covariance": Benchmark(
+        "tracking.covariance", "errors against their covariance, on real runs and simulated drives"
+    ),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
     "faults": Benchmark("faults.run", "sensors that lie: false frames, the last pose, the cause being named"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),

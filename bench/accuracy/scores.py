@@ -25,19 +25,20 @@ class Track:
     states: Sequence[str]  # names; ``SKIPPED`` for a frame that it refused
     poses: Floats  # (N, 4, 4) map <- body, NaN where there was none
     covariances: Floats  # (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose
-    levels: Floats  # (N, 2) protection levels, metres and degrees, likewise
+    levels: Floats  # (N, 4) protection levels: metres, degrees, metres in the plane and in height, likewise
 
     @classmethod
     def of(cls, fixes: Sequence[Fix | None], stamps: Floats) -> Track:
         """Collect fixes at the ``stamps``; a refused frame has None."""
-        poses, covariances, levels = (np.full((len(fixes), *shape), np.nan) for shape in ((4, 4), (6, 6), (2,)))
+        poses, covariances, levels = (np.full((len(fixes), *shape), np.nan) for shape in ((4, 4), (6, 6), (4,)))
         for k, fix in enumerate(fixes):
             if fix is not None and fix.T_map_body is not None:
                 poses[k] = fix.T_map_body
             if fix is not None and fix.covariance is not None:
                 covariances[k] = fix.covariance
             if fix is not None and fix.protection is not None:
-                levels[k] = fix.protection.metres, fix.protection.degrees
+                level = fix.protection
+                levels[k] = level.metres, level.degrees, level.horizontal, level.vertical
         states = ["SKIPPED" if fix is None else fix.state.reported for fix in fixes]
         return cls(stamps, states, poses, covariances, levels)
 

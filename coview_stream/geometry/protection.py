@@ -21,7 +21,7 @@ RISK = 1e-3
 ALERT_METRES, ALERT_DEGREES = 1.0, 3.0
 """Alert limit: a pose that is given may not be off by more; set by hand."""
 
-TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7)}
+TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7), "horizontal": (1.03, 3.9), "vertical": (1.03, 3.9)}
 """Factor on the sigma, and degrees of freedom: set by hand; ``python -m bench protection`` prints what fits.
 
 It fits (1.2, 16) and (0.6, 2.5) on campuses and sparse forests: at 1e-3 the tail of metres is heavier than that, the
@@ -67,8 +67,8 @@ def protection_level(covariance: Floats, doubt: float = 1.0, risk: float = RISK)
         risk: probability with which an error may exceed the level.
     """
     metres, horizontal, vertical = (
-        doubt * _quantile(covariance[axes, axes], *TAILS["metres"], risk)
-        for axes in (slice(0, 3), slice(0, 2), slice(2, 3))
+        doubt * _quantile(covariance[axes, axes], *TAILS[name], risk)
+        for name, axes in (("metres", slice(0, 3)), ("horizontal", slice(0, 2)), ("vertical", slice(2, 3)))
     )
     radians = doubt * _quantile(covariance[3:, 3:], *TAILS["degrees"], risk)
     return ProtectionLevel(metres, min(180.0, float(np.degrees(radians))), horizontal, vertical, doubt)

@@ -17,7 +17,7 @@ def way(count=1500, step=0.2):
     return np.stack([pose_from(rot_z(h) @ tilt, p) for h, p in zip(heading, places, strict=True)])
 
 
-def track(states, poses=None, covariance=None, stamps=None, level=(0.2, 1.0)):
+def track(states, poses=None, covariance=None, stamps=None, level=(0.2, 1.0, 0.15, 0.1)):
     count = len(states)
     known = np.array([state == "TRACKING" for state in states])
     poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses.copy()

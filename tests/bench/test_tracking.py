@@ -11,7 +11,8 @@ from drives_with_truth import track, way
 from bench.accuracy.scores import errors, losses, recovery, score
 from bench.harness.rows import Row
 from bench.tracking import protection, smoothing, tracking
-from bench.tracking.protection import PRODUCT, Sample, beyond_alert_limit, misleading, tail
+from bench.tracking.covariance import BAND, figures, judge
+from bench.tracking.protection import PARTS, PRODUCT, Sample, beyond_alert_limit, blocks, conformal, misleading
 from bench.tracking.tracking import AXES, NOMINAL, coverage, pooled, shares, since_fix, spread, squares
 from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
@@ -129,37 +130,57 @@ def test_targets_are_judged(honest, changes, missed):
     assert missed_by([row(**changes)], honest) == missed
 
 
-def drawn(count, factor, freedom):
+def drawn(count, factor, freedom, seed=5):
     """A sample whose errors have a known tail."""
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     scale = factor * np.sqrt(freedom / rng.chisquare(freedom, (count, 2)))
-    twist = rng.multivariate_normal(np.zeros(6), C, count)
-    metres = scale[:, 0] * np.linalg.norm(twist[:, :3], axis=1)
-    degrees = np.degrees(scale[:, 1] * np.linalg.norm(twist[:, 3:], axis=1))
+    twist = rng.multivariate_normal(np.zeros(6), C, count) * np.repeat(scale, 3, axis=1)
+    norms = [np.linalg.norm(twist[:, part], axis=1) for part in PARTS.values()]
+    norms[1] = np.degrees(norms[1])
     one = track(["TRACKING"], covariance=C)
-    one = Sample.of(one, errors(one, way(1)), np.zeros(1))
-    ones = np.ones((count, 2))
-    return Sample(np.column_stack([metres, degrees]), ones, ones * one.trace, ones * one.axes)
+    one = Sample.of(one, errors(one, way(1)), [0])
+    ones = np.ones((count, len(PARTS)))
+    return Sample(np.column_stack(norms), ones, ones * one.trace, ones * one.axes)
 
 
 def test_one_pose_counts_of_each_ten_metres_with_its_reported_level():
     level = protection_level(C, doubt=1.2)
+    wanted = [level.metres, level.degrees, level.horizontal, level.vertical]
     states = ["SEARCHING"] * 30 + ["TRACKING"] * 170
-    drive = track(states, way(200), covariance=C, level=(level.metres, level.degrees))
-    sample = Sample.of(drive, errors(drive, way(200)), 0.2 * np.arange(200))  # 40 m, the first six without a pose
+    drive = track(states, way(200), covariance=C, level=wanted)
+    rows = blocks(drive, 0.2 * np.arange(200))  # 40 m, the first six without a pose
+    sample = Sample.of(drive, errors(drive, way(200)), rows)
     assert len(sample.error) == 4
     np.testing.assert_allclose(sample.doubt, 1.2)
-    np.testing.assert_allclose(sample.level(PRODUCT), [[level.metres, level.degrees]] * 4)
+    np.testing.assert_allclose(sample.level(PRODUCT), [wanted] * 4)
     np.testing.assert_array_equal(Sample.joined([sample.to_json()]).trace, sample.trace)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("factor", "freedom"), [(1.0, 4.0), (0.7, 3.0), (1.5, 12.0)])
-def test_the_tail_of_drawn_errors_is_recovered(factor, freedom):
-    sample = drawn(20_000, factor, freedom)
-    for part in (0, 1):
-        assert tail(sample, part) == (pytest.approx(factor, rel=0.05), pytest.approx(freedom, rel=0.2))
-    assert max(sample.above([(factor, freedom)] * 2)) < 2e-3 * 20_000
+def test_conformal_factor_covers_further_blocks_of_any_tail():
+    above = []
+    for seed in range(200):
+        factors, held = conformal(drawn(99, 0.7, 2.0, seed), risk=0.05)
+        assert held == 0.05
+        further = drawn(50, 0.7, 2.0, 1000 + seed)
+        tails = [(factor, freedom) for factor, (_, freedom) in zip(factors, PRODUCT, strict=True)]
+        above.append((further.error > further.level(tails, 0.05)).mean(axis=0))
+    assert (np.mean(above, axis=0) < 0.06).all()
+    assert (np.mean(above, axis=0) > 0.03).all()  # and not by being far too wide
+
+
+def test_few_blocks_hold_for_no_less_than_their_number():
+    sample = drawn(9, 1.0, 4.0)
+    factors, held = conformal(sample)
+    assert held == pytest.approx(0.1)
+    tails = [(factor, freedom) for factor, (_, freedom) in zip(factors, PRODUCT, strict=True)]
+    np.testing.assert_allclose((sample.error / sample.level(tails, held)).max(axis=0), 1.0)
+    with pytest.raises(ValueError, match="no block"):
+        conformal(Sample.joined([]))
+
+
+def test_rate_has_its_poisson_bound():
+    assert protection.rate(0, 10.0) == "0 (below 0.3)"
+    assert protection.rate(3, 2.0) == "1.5 (below 3.9)"
 
 
 def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time():
@@ -175,9 +196,9 @@ def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time()
 
 
 def test_families_share_no_kind_and_no_seed():
-    fitted, reported = (protection.FAMILIES[name] for name in ("fitted", "reported"))
-    assert not set(fitted.kinds) & set(reported.kinds)
-    assert not {w.seed for w, _ in fitted.worlds(100)} & {w.seed for w, _ in reported.worlds(100)}
+    calibrated, reported = (protection.FAMILIES[name] for name in ("calibrated", "reported"))
+    assert not set(calibrated.kinds) & set(reported.kinds)
+    assert not {w.seed for w, _ in calibrated.worlds(100)} & {w.seed for w, _ in reported.worlds(100)}
 
 
 def smoothed_run(**figures):
@@ -200,3 +221,14 @@ def test_no_two_columns_about_smoothing_have_one_heading():
     for table in smoothing.tables([run], Namespace()).values():
         headings = [cell.strip() for cell in table.splitlines()[0].strip("|").split("|")]
         assert len(set(headings)) == len(headings)
+
+
+@pytest.mark.parametrize(("scale", "holds"), [(0.5, False), (1.0, True), (2.0, False)])
+def test_a_mean_distance_outside_its_band_does_not_hold(covariance, scale, holds):
+    twist = np.random.default_rng(4).multivariate_normal(np.zeros(6), covariance, 2000)
+    found = figures(twist, np.tile(covariance * scale**2, (2000, 1, 1)))
+    assert found["mean"] == pytest.approx(6.0 / scale**2, rel=0.05)
+    assert found["position"] == pytest.approx(3.0 / scale**2, rel=0.1)
+    row = judge("run", False, "exact", found)
+    assert row.holds is holds
+    assert (BAND[0] <= row.ours <= BAND[1]) is holds
