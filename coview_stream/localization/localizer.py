@@ -307,12 +307,17 @@ class Localizer:
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
         self._witness.add(stamp, cloud, frame.scan, T_odom_body)
-        if not searching:
-            if self._frames.conventions.doubtful:
-                self.require_verification()
-                self._evidence = KeyframeEvidence(stamp, self.state, DOUBT, cause=RejectionReason.CONVENTIONS)
+        doubtful = self._frames.conventions.doubtful
+        if not searching and not doubtful:
             return frame, None
         accused = self._witness.while_searching(self._tracker.odometry.drift)
+        if not searching:
+            self.require_verification()
+            reason, cause = DOUBT, RejectionReason.CONVENTIONS
+            if accused is not None:
+                reason, cause = accused.sentence, accused.cause
+            self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=cause)
+            return frame, None
         if accused is not None:  # no place is found by clouds that may lie
             self._requests.begin_anew()
             self._evidence = KeyframeEvidence(stamp, self.state, accused.sentence, cause=accused.cause)
