@@ -124,22 +124,24 @@ class Posterior:
         return float(self.place[~same].sum() + self.none)
 
 
-def posterior(ratios: Floats, votes: Ints, count: int) -> Posterior:
+def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1) -> Posterior:
     """Return the posterior of places.
 
     It may be looked at after every keyframe: where every place is wrong the odds of all places together are a
-    martingale, so they ever exceed 1 / e with a probability of at most e (Ville's inequality).
+    martingale, so they ever exceed 1 / e with a probability of at most e (Ville's inequality). A search that starts
+    anew has another chance of an error; as the inverse squares add up, all starts together have less than 2 e.
 
     Args:
         ratios: (P,) log-likelihood ratios against chance.
         votes: (P,) ranks in the votes, from 0.
         count: number N of scored places, these included: the others have the likelihood of chance.
+        starts: how often the search has started since a place was accepted.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
     # two recognizers rank places, and followed places keep their ranks: the sum may exceed that of one list
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
     total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
-    logs = np.append(ratios - np.log1p(ranks) - np.log(total), 0.0)
+    logs = np.append(ratios - np.log1p(ranks) - np.log(total * starts**2), 0.0)
     odds = np.exp(logs - logs.max())
     odds /= odds.sum()
     return Posterior(odds[:-1], float(odds[-1]))

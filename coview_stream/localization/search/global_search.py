@@ -105,8 +105,9 @@ class GlobalSearch:
     def update(self, request: SearchRequest) -> SearchResult:
         """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
         if request.epoch != self._epoch:
+            starts = self._scorer.starts + bool(self._scorer.scans)
             self.clear()
-            self._epoch = request.epoch
+            self._epoch, self._scorer.starts = request.epoch, starts
         cloud = prepare_scan(request.submap, request.position, self.config.registration)
         scan = ObservedScan.of(cloud, request.cloud, request.T_odom_body)
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns

@@ -138,7 +138,11 @@ class _Observed:
 
 
 class PlaceScorer:
-    """Scorer of a search's places, with the keyframes' observations there."""
+    """Scorer of a search's places, with the keyframes' observations there.
+
+    Attributes:
+        starts: how often the search has started since a place was accepted.
+    """
 
     def __init__(self, base_map: BaseMap) -> None:
         """Score by a map's likelihood field, which is loaded at the first keyframe."""
@@ -151,7 +155,8 @@ class PlaceScorer:
         return self._scans[-_NEWEST:]
 
     def clear(self) -> None:
-        """Forget all places and keyframes."""
+        """Forget all places, keyframes and starts."""
+        self.starts = 1
         self._followed = _Followed.none()
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
@@ -183,7 +188,7 @@ class PlaceScorer:
         self._scans.append(scan)
         self._followed = followed = followed[order]
         self._thin_out()
-        chances = posterior(ratios[order], followed.votes, len(first))
+        chances = posterior(ratios[order], followed.votes, len(first), self.starts)
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)

@@ -158,6 +158,15 @@ def test_good_place_is_observed_again_without_votes(never_sure, world_drive):
     assert (nothing.evidence.score, nothing.evidence.state, len(nothing.rivals)) == (0.0, State.SEARCHING, 0)
 
 
+def test_every_start_of_a_search_is_another_chance_until_a_place_is_accepted(search, never_sure, world_drive):
+    def none(of, restart):
+        return of.update(next(run_of(world_drive, 1, epoch=Epoch(0, restart)))).considered.none
+
+    never = [none(never_sure, restart) for restart in (1, 2, 3)]
+    np.testing.assert_allclose(np.divide(never, never[0]), [1.0, 4.0, 9.0], rtol=1e-6)
+    assert none(search, 1) == pytest.approx(none(search, 2)) == pytest.approx(never[0])
+
+
 def test_request_of_another_epoch_or_an_acceptance_starts_anew(search, never_sure, world_drive):
     never_sure.update(next(run_of(world_drive, 1)))
     name_instead(never_sure)
