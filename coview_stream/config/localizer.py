@@ -76,7 +76,7 @@ class RegistrationConfig:
     source_points: int = 5000
     source_range: float = 50.0
     inflation: float = 3.0
-    shared: float = 1.0
+    shared: float = 1.25
     gravity_sigma: float = math.radians(1.0)
 
     def __post_init__(self) -> None:

@@ -32,6 +32,8 @@ _MOVED = {
     "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
 }  # fmt: skip
 """Least sigmas of a calibration from before the node started."""
+HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
+"""Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
 _ACCELERATION, _TURN_ACCELERATION = 1.0, 0.5  # m/s2 and rad/s2 of wheeled robots: late odometry does not show them
 
 
@@ -125,13 +127,16 @@ class Calibration:
 
         ``R_map_body`` (3, 3); ``rates`` (3,) velocities x, y and rotation about z of the body, its axes. A cloud that
         is late leaves the robot behind; odometry that is late is bridged to the stamp, and errs by accelerations.
+
+        The body is where the stated mount has it, and the stamp is the cloud's: only what is uncertain beyond the
+        tolerances of a correct robot counts.
         """
         spread = self._extrapolated.copy()
-        spread[2, 2] += self.sigma_heading**2
-        spread[[3, 4], [3, 4]] += self.sigma_lever**2
+        spread[2, 2] += max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
+        spread[[3, 4], [3, 4]] += max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
         moving = np.concatenate([[0.0, 0.0, rates[2]], R_map_body @ [rates[0], rates[1], 0.0]])
         late = 0.5 * (1.0 + math.erf(self.delay / max(self.sigma_delay, 1e-9) / math.sqrt(2.0)))  # probability
-        return np.asarray(spread + np.outer(moving, moving) * late * self.sigma_delay**2)
+        return np.asarray(spread + np.outer(moving, moving) * late * max(0.0, self.sigma_delay**2 - CLOCK_TOLERANCE**2))
 
     @property
     def _extrapolated(self) -> Floats:

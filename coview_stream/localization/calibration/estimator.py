@@ -29,7 +29,12 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, exp_so3, inverse, log_so3, pose_from
-from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.calibration import (
+    CLOCK_TOLERANCE,
+    HEADING_TOLERANCE,
+    LEVER_TOLERANCE,
+    Calibration,
+)
 
 
 class _Prior(NamedTuple):
@@ -51,13 +56,13 @@ _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4, ("scale",), "sigma_scale")
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4), ("turn",), "sigma_turn")
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
 # Clocks and mounts are stated by who built the robot: a wrong one is a fault, rarer than the levels' risk or so.
-# Clocks that are set by PTP or by an edge agree within milliseconds, drawings within 0.2 degrees and a centimetre; a
-# queue is late by up to a second, a sensor sits within a metre or two
-_CLOCK = _Prior(slice(6, 7), 0.002, 0.5, 0.001, 3e-4, ("delay",), "sigma_delay")
+# Clocks that are set by PTP or by an edge agree within a millisecond, drawings within 0.1 degrees and half a
+# centimetre; a queue is late by up to a second, a sensor sits within a metre or two
+_CLOCK = _Prior(slice(6, 7), CLOCK_TOLERANCE, 0.5, 0.001, 3e-4, ("delay",), "sigma_delay")
 _HEADING = _Prior(
-    slice(7, 8), math.radians(0.2), math.radians(15.0), 0.002, math.radians(0.01), ("heading",), "sigma_heading"
+    slice(7, 8), HEADING_TOLERANCE, math.radians(15.0), 0.002, math.radians(0.01), ("heading",), "sigma_heading"
 )
-_LEVER = _Prior(slice(8, 10), 0.01, 0.7, 0.0005, 5e-4, ("lever_x", "lever_y"), "sigma_lever")
+_LEVER = _Prior(slice(8, 10), LEVER_TOLERANCE, 0.7, 0.0005, 5e-4, ("lever_x", "lever_y"), "sigma_lever")
 _GROUPS = (_TILT, _SCALE, _TURN, _CLOCK, _HEADING, _LEVER)  # corrected components
 _MOUNT = (_TILT, _HEADING, _LEVER)
 _RARE = (_CLOCK, _HEADING, _LEVER)

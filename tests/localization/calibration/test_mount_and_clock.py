@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,12 @@ from se3 import exp_se3
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
-from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.calibration import (
+    CLOCK_TOLERANCE,
+    HEADING_TOLERANCE,
+    LEVER_TOLERANCE,
+    Calibration,
+)
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.frame import OdometryCorrection, OdometryHistory
 
@@ -144,16 +150,18 @@ def test_odometry_is_read_between_and_beyond_its_samples():
 
 
 def test_errors_of_mount_and_clock_are_in_the_poses_covariance():
-    sure = Calibration(sigma_heading=0.0, sigma_lever=0.0, sigma_delay=0.0)
+    sure = Calibration(sigma_heading=HEADING_TOLERANCE, sigma_lever=LEVER_TOLERANCE, sigma_delay=CLOCK_TOLERANCE)
     ahead = np.array([2.0, 0.0, 0.1])
     assert not sure.pose_covariance(np.eye(3), ahead).any()
     north = rot_z(np.pi / 2)
-    late = Calibration(delay=0.5, sigma_delay=0.02, sigma_heading=0.0, sigma_lever=0.0)
-    np.testing.assert_allclose(np.diag(late.pose_covariance(north, ahead)), [0, 0, 0.002**2, 0, 0.04**2, 0], atol=1e-12)
+    late = replace(sure, delay=0.5, sigma_delay=0.02)
+    moved = np.array([0, 0, 0.01, 0, 4.0, 0]) * (0.02**2 - CLOCK_TOLERANCE**2)
+    np.testing.assert_allclose(np.diag(late.pose_covariance(north, ahead)), moved, atol=1e-15)
     standing = late.pose_covariance(north, np.zeros(3))
     assert not standing.any()
-    turned = Calibration(sigma_heading=0.01, sigma_lever=0.1, sigma_delay=0.0).pose_covariance(north, ahead)
-    np.testing.assert_allclose(np.diag(turned), [0, 0, 1e-4, 0.01, 0.01, 0])
+    turned = replace(sure, sigma_heading=0.01, sigma_lever=0.1).pose_covariance(north, ahead)
+    lever = 0.1**2 - LEVER_TOLERANCE**2
+    np.testing.assert_allclose(np.diag(turned), [0, 0, 1e-4 - HEADING_TOLERANCE**2, lever, lever, 0])
 
 
 def test_mount_is_said_beyond_the_one_given():
