@@ -2,9 +2,9 @@
 
 Each drive is localized undisturbed and with each fault of :mod:`bench.faults.faults`, frame by frame, in this process:
 simulated ones, and the real runs of ``--data`` (``base.laz``, ``run/``, ``truth.tum``; not part of the repository). A
-pose is false if it is more than 3 m or 5 degrees off. A cause is named by the reason of a frame without a pose, by what
-the calibration says of its corrections, or by the error of a frame that is refused. Results stay in ``--work``, so a
-run can be made in portions.
+pose is false if it is more than 3 m or 5 degrees off. A cause is named by the reason of a frame without a pose, by a
+clause about the calibration, or by the error of a frame that is refused, if it was not said before the fault. Results
+stay in ``--work``, so a run can be made in portions.
 """
 
 from __future__ import annotations
@@ -113,6 +113,7 @@ def scored(fault: Fault, feed: Feed, site: BaseMap) -> dict[str, Any]:
     """Localize a drive from its first frame on; score it. Seconds and metres count from the fault's beginning."""
     localizer, fixes = Localizer(site), list[Fix | None]()
     named: tuple[int, str] | None = None
+    before: set[str] = set()  # clauses of the time before the fault
     for k in range(len(feed)):
         try:
             fix = localizer.step(feed.clouds[k], feed.odometry[k], float(feed.stamps[k]))
@@ -120,8 +121,11 @@ def scored(fault: Fault, feed: Feed, site: BaseMap) -> dict[str, Any]:
         except (CloudError, RunError) as error:
             fix, said = None, [str(error)]
         fixes.append(fix)
-        if named is None and fault.named and k >= feed.begins:
-            named = next(((k, clause) for clause in said if re.search(fault.named, clause)), None)
+        if k < feed.begins:
+            before = {_without_numbers(clause) for clause in said}
+        elif named is None and fault.named:
+            new = (clause for clause in said if _without_numbers(clause) not in before)
+            named = next(((k, clause) for clause in new if re.search(fault.named, clause)), None)
     track = Track.of(fixes, feed.stamps)
     error, known = errors(track, feed.truth), track.tracking
     false = known & ((error.metres > FALSE_METRES) | (error.degrees > FALSE_DEGREES))
@@ -143,6 +147,10 @@ def scored(fault: Fault, feed: Feed, site: BaseMap) -> dict[str, Any]:
         "named_m": None if named is None else float(metres[named[0]]),
         "name": "" if named is None else named[1],
     }  # fmt: skip
+
+
+def _without_numbers(clause: str) -> str:
+    return re.sub(r"[\d.]+", "", clause)
 
 
 def _said(fix: Fix) -> list[str]:
