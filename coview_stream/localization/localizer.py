@@ -117,7 +117,8 @@ class Localizer:
     @property
     def calibration(self) -> Calibration:
         """The present calibration of sensor and odometry, and the site's ground offset."""
-        return replace(self._frames.calibration, ground=self._tracker.ground.metres)
+        ground, changed = self._tracker.ground.metres, self._tracker.change.metres
+        return replace(self._frames.calibration, ground=ground, changed=changed)
 
     def prepare(self) -> None:
         """Do the work that the first search and the first registrations would wait for: some seconds, once.

@@ -11,7 +11,16 @@ from coview_kernels.arrays import OverheadGrid, PolarGrid, Raster
 from coview_kernels.covisibility import coview, paper_context
 from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.distinct import distinct_poses
-from coview_kernels.field import FieldMap, FieldScan, FieldScores, Move, field_scores, near_structure, unexplained
+from coview_kernels.field import (
+    FieldMap,
+    FieldScan,
+    FieldScores,
+    Move,
+    field_scores,
+    ground_heights,
+    near_structure,
+    unexplained,
+)
 from coview_kernels.icp import SCATTER, Prior, Registration, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
@@ -50,6 +59,7 @@ __all__ = [
     "crop_points",
     "distinct_poses",
     "field_scores",
+    "ground_heights",
     "height_columns",
     "lowest_heights",
     "near_structure",

@@ -247,6 +247,12 @@ def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask
     return _structure_at(field, structure, pose)[1]
 
 
+def ground_heights(field: FieldMap, points: F32) -> F32:
+    """Height (N,) of the map's ground below or above points (N, 3), map frame, metres; NaN where there is none."""
+    corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0]).astype(np.float32)
+    return reference.ground_heights(field.layers, as_float32("points", points, None, 3) - corner)
+
+
 def _structure_at(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple[Mask, Mask, Mask, Mask]:
     at = as_finite64("pose", np.reshape(np.asarray(pose, dtype=np.float64), (1, -1)), 1, 4)[0]
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])

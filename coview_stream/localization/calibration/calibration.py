@@ -57,6 +57,7 @@ class Calibration:
         sigma_heading: one sigma of the heading, radians.
         sigma_lever: one sigma of each of lever_x and lever_y, metres.
         sigma_delay: one sigma of the delay, seconds.
+        changed: metres of the ground around above the survey's, where it was dug or filled since; 0 where it was not.
     """
 
     roll: float = 0.0
@@ -74,6 +75,7 @@ class Calibration:
     sigma_heading: float = math.radians(0.2)
     sigma_lever: float = 0.01
     sigma_delay: float = 0.002
+    changed: float = 0.0
 
     @cached_property
     def R_tilt(self) -> Floats:
@@ -183,6 +185,12 @@ class Calibration:
             clauses.append(
                 f"the ground lies {abs(self.ground):.2f} m {side} the survey's (grass, snow): heights follow the rest"
             )
+        if abs(self.changed) >= 2.0 * _GROUND:
+            side, how = ("above", "filled, piled up") if self.changed > 0 else ("below", "dug")
+            clauses.append(
+                f"the ground here lies {abs(self.changed):.1f} m {side} the survey's ({how}): "
+                "heights follow odometry and what stands around"
+            )
         return clauses
 
     def doubted(self) -> Calibration:
@@ -207,6 +215,7 @@ class Calibration:
             "clouds_late_s": round(self.delay, 4),
             "clouds_late_sigma_s": round(self.sigma_delay, 4),
             "ground_offset_m": round(self.ground, 3),
+            "changed_ground_m": round(self.changed, 2),
             "says": self.describe(mount),
         }
 

@@ -52,6 +52,8 @@ class _Prior(NamedTuple):
 _TILT = _Prior(
     slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03), ("roll", "pitch"), "sigma_tilt"
 )
+TILT_SIGMA = _TILT.wide
+"""Radians: one sigma of the lean of a sensor that is not known."""
 _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4, ("scale",), "sigma_scale")
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4), ("turn",), "sigma_turn")
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
@@ -157,6 +159,13 @@ class CalibrationBelief:
         self.x[GRAVITY.axes] = 0.0
         self.P[GRAVITY.axes], self.P[:, GRAVITY.axes] = 0.0, 0.0
         self.P[GRAVITY.axes, GRAVITY.axes] = np.eye(2) * GRAVITY.wide**2
+
+    def forget_tilt(self) -> None:
+        """See :meth:`CalibrationEstimator.forget_tilt`."""
+        self.x[_TILT.axes] = 0.0
+        self.P[_TILT.axes], self.P[:, _TILT.axes] = 0.0, 0.0
+        self.P[_TILT.axes, _TILT.axes] = np.eye(2) * _TILT.wide**2
+        self._stand_straight()
 
     def walk(self, driven: float) -> None:
         """Widen all components by their random walks over ``driven`` metres."""
@@ -275,6 +284,12 @@ class CalibrationEstimator:
     def forget_leader(self) -> None:
         """Forget the measurement at a place that led a search."""
         self._supposed = None
+        self._apply()
+
+    def forget_tilt(self) -> None:
+        """Forget the lean of the sensor: it was measured on ground that is not the survey's."""
+        self._supposed = None
+        self._known.forget_tilt()
         self._apply()
 
     def begin_odometry(self) -> None:

@@ -109,16 +109,29 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
     bend = below - 2.0 * here + above
     between = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
     level = float(_SHIFTS[k] + (_SHIFTS[1] - _SHIFTS[0]) * np.clip(between, -1.0, 1.0))
-    fits = _fits(structure, T_map_source, target)
-    cell = np.floor(structure[:, :2] / _PATCH).astype(np.int64) @ np.array([1 << 20, 1])
-    _, patch, count = np.unique(cell, return_inverse=True, return_counts=True)
-    shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
-    shares = shares[count >= _FEW]
+    shares = _patch_shares(structure, _fits(structure, T_map_source, target))
     # at the structure's height, the ground is off by their difference
     at = _OFFSETS + level - cloud.ground_offset
     still = _between(shares, at)
     rows = [np.log(_CHANCE + (1.0 - q) * still + q * _between(shares, at - g)).sum(axis=0) for g, q in _GROWTHS]
     return np.stack(rows)
+
+
+def structure_fits(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap, shifts: Reals) -> Floats | None:
+    """Return the log-likelihoods (K,) of a scan's structure at shifts (K,) up; None without structure."""
+    structure = _some(cloud.points[cloud.high])
+    if len(structure) < _FEW:
+        return None
+    shares = _patch_shares(structure, _fits(structure, T_map_source, target, shifts))
+    return np.asarray(np.log(_CHANCE + (1.0 - _CHANCE) * shares).sum(axis=0))
+
+
+def _patch_shares(structure: Points, fits: Floats) -> Floats:
+    """Mean fits (P, K) of the patches of structure (N, 3), which have fits (N, K)."""
+    cell = np.floor(structure[:, :2] / _PATCH).astype(np.int64) @ np.array([1 << 20, 1])
+    _, patch, count = np.unique(cell, return_inverse=True, return_counts=True)
+    shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
+    return np.asarray(shares[count >= _FEW])
 
 
 def _between(profiles: Floats, at: Reals) -> Floats:
@@ -128,10 +141,10 @@ def _between(profiles: Floats, at: Reals) -> Floats:
     return np.asarray(profiles[:, k] * (1.0 - where + k) + profiles[:, k + 1] * (where - k))
 
 
-def _fits(points: Points, T_map_source: Pose, target: LocalMap) -> Floats:
+def _fits(points: Points, T_map_source: Pose, target: LocalMap, shifts: Reals = _SHIFTS) -> Floats:
     """Return the fit (N, K) in [0, 1] of points (N, 3) to the map at the shifts up and down."""
-    moved = np.repeat(transform(T_map_source, points)[:, None], len(_SHIFTS), axis=1)
-    moved[:, :, 2] += _SHIFTS
+    moved = np.repeat(transform(T_map_source, points)[:, None], len(shifts), axis=1)
+    moved[:, :, 2] += shifts
     flat = moved.reshape(-1, 3).astype(np.float32)
     distance, partner = kernels.nearest(target.grid, flat, _REACH)
     paired = distance < _REACH

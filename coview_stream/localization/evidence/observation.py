@@ -122,20 +122,22 @@ class ScanPart:
     Attributes:
         points: of each kind, relative to the body, axes of the odometry frame, metres.
         weights: how many of the scan's structure, ground and free points each sampled one stands for.
+        level: share of the scan's ground that may be held against the survey's: the rest was dug or filled since.
     """
 
     points: kernels.FieldScan
     weights: tuple[float, float, float]
+    level: float = 1.0
 
     @classmethod
-    def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int]) -> ScanPart:
+    def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int], level: float = 1.0) -> ScanPart:
         """Take at most ``counts`` points of each kind."""
         samples = [
             points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
             for points, count in zip(kinds, counts, strict=True)
         ]
         structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, samples, strict=True))
-        return cls(kernels.FieldScan(*samples), (structure, low, free))
+        return cls(kernels.FieldScan(*samples), (structure, low, free), level)
 
     def look_up(self, field: kernels.FieldMap, poses: Floats, move: Move) -> Observations:
         """Observe the map from poses (H, 4), as in :class:`Observations`, each moved as far as ``move`` allows first.
@@ -146,7 +148,8 @@ class ScanPart:
         structure, low, free = (max(len(p), 1) for p in (self.points.structure, self.points.low, self.points.free))
         shares = np.column_stack([
             scores.on / structure, scores.near / structure, (scores.covered - scores.near) / structure,
-            scores.structure / structure, scores.grounded / low, scores.low / low, scores.passed / free,
+            scores.structure / structure, self.level * scores.grounded / low, self.level * scores.low / low,
+            scores.passed / free,
         ])  # fmt: skip
         return Observations(scores.pose, shares.astype(np.float32), self._parts(scores))
 
@@ -194,11 +197,12 @@ class ObservedScan:
         points = cloud.points - body.astype(np.float32)
         order = _by_patch(points)
         points, high, above = points[order], cloud.high[order], cloud.above[order]
-        free = (RangeImage.of(frame).passed_points() @ T_odom_body[:3, :3].T).astype(np.float32)
+        free = (RangeImage.of(frame).passed_points(cloud.dug) @ T_odom_body[:3, :3].T).astype(np.float32)
         kinds = points[high], points[~above], free[_by_patch(free)]
         filled = _filled(kinds[0][:, :2] + body[:2])
         patches = float(len(filled)), float(len(_filled(kinds[2])))
-        return cls(cloud, T_odom_body, ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY), patches, filled)
+        few, many = (ScanPart.of(kinds, counts, 1.0 - cloud.changed) for counts in (_FEW, _MANY))
+        return cls(cloud, T_odom_body, few, many, patches, filled)
 
     @property
     def body(self) -> Floats:
@@ -255,12 +259,15 @@ class RangeImage:
         """Return the points of a frame (N, 3) that :meth:`of` uses; they alone give the same image."""
         return cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
 
-    def passed_points(self) -> Floats:
-        """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground."""
+    def passed_points(self, dug: float = 0.0) -> Floats:
+        """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground.
+
+        The ground that was there before lay ``dug`` metres higher.
+        """
         points, ranges, cells = _samples()
         beyond = ranges + _MARGIN
         passed: Bools = (beyond > _MIN_RANGE) & (beyond < self.nearest[cells] - (_SLACK + _SLACK_SLOPE * beyond))
-        return points[passed & (points[:, 2] > self.floor + _MIN_HEIGHT)]
+        return points[passed & (points[:, 2] > self.floor + dug + _MIN_HEIGHT)]
 
 
 def _filled(points: Points | Floats) -> Ints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,6 +28,7 @@ _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom w
 _CLEAR = 0.5  # metres above the lowest point nearby, of points that are not ground
 _FLOOR_PERCENTILE = 1.0  # of the heights: a few returns lie below the ground
 STRUCTURE_HEIGHT = 1.0  # metres above the lowest ground nearby
+_TILT, _VIEWED = math.radians(0.35), 0.12  # radians, metres: sigmas of a registration without ground
 _SEED = 20240  # of the choice among too many points
 
 
@@ -38,6 +40,8 @@ class RegistrationCloud:
     above: Bools  # (N,) whether a point stands above the ground or lies on it
     height: Floats32  # (N,) metres above the lowest ground nearby
     ground_offset: float = 0.0  # metres by which the points on the ground have been lowered
+    changed: float = 0.0  # share of the ground that was left out, as it does not lie on the survey's
+    dug: float = 0.0  # metres that the survey's ground lies above that ground, at most
 
     @property
     def high(self) -> Bools:
@@ -49,6 +53,18 @@ class RegistrationCloud:
         points = self.points.copy()
         points[~self.above, 2] -= np.float32(metres)
         return replace(self, points=points, ground_offset=self.ground_offset + metres)
+
+    def doubted(self, covariance: Floats) -> Floats:
+        """Return a registration's covariance (6, 6) over (rx, ry, rz, x, y, z), wider where the ground has changed.
+
+        Structure alone, seen from below now and from above before, leaves tilt and height to its own errors.
+        """
+        return np.asarray(covariance + self.groundless * np.diag([_TILT**2, _TILT**2, 0.0, 0.0, 0.0, _VIEWED**2]))
+
+    @property
+    def groundless(self) -> float:
+        """Probability that no ground holds height and tilt: three patches do, and all three have changed."""
+        return self.changed**3
 
     def every(self, nth: int) -> RegistrationCloud:
         """Return a thinner scan: every ``nth`` point of each kind."""

@@ -170,7 +170,7 @@ class MapMatcher:
         try:
             of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
             T_map_body, measured = remove_prior(of_body, Prior(belief.T_map_body, information), settings)
-            covariance = registration_covariance(measured, settings)
+            covariance = scan.cloud.doubted(registration_covariance(measured, settings))
             innovation = predicted.innovation(T_map_body, covariance)
         except InputError as error:
             return _failed(belief, str(error), evidence, observation)

@@ -80,7 +80,9 @@ class SharedErrorModel:
 
 def clustered_covariance(gradients: Floats, curvature: Floats) -> Floats:
     """Return the sandwich (6, 6) of (K, 8, 6) gradients, cut in K ways, and the curvature (6, 6)."""
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-12))
+    diagonal = np.diag(curvature).reshape(2, 3)  # angles, shifts
+    least = np.maximum(_LEAST * diagonal.max(axis=1, keepdims=True), 1e-12)  # a direction may be without ground
+    unit = 1.0 / np.sqrt(np.maximum(diagonal, least)).ravel()
     strength, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
     inverse = unit[:, None] * (directions / np.maximum(strength, _LEAST)) @ directions.T * unit
     middle = np.einsum("ksi,ksj->ij", gradients, gradients) / len(gradients)
@@ -105,7 +107,9 @@ def disagreement(
     paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed: the best pairs disagree least
     if paired.sum() < _MIN_PAIRS:
         return None
-    counts = [max(1, int((kind & paired).sum())) for kind in (source.above, ~source.above)]
+    # a handful of points does not outweigh thousands, as in registration
+    few = len(source.points) // 10
+    counts = [max(1, few, int((kind & paired).sum())) for kind in (source.above, ~source.above)]
     weight = np.where(source.above, 1.0 / counts[0], 1.0 / counts[1])  # both kinds weigh the same
     arm = (moved - body).astype(np.float32)
     gradient = _gradient(moved, arm, weight, target, reach)

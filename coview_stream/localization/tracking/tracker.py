@@ -11,9 +11,10 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
-from coview_stream.geometry.transforms import Points, Pose, inverse, transform, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, transform, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.estimator import TILT_SIGMA, CalibrationEstimator
+from coview_stream.localization.calibration.ground_change import GroundChange
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, prepare_scan
@@ -39,6 +40,9 @@ _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried."""
 
+_RISEN = np.diag([np.radians(1.0), np.radians(1.0), 0.0, 0.0, 0.0, 0.3]) ** 2
+"""Covariance of a height by structure alone, and of an attitude by odometry."""
+
 
 class Tracker:
     """Belief over the robot's pose: a graph of keyframes, one per registration, and odometry since the newest.
@@ -57,6 +61,7 @@ class Tracker:
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
         self.ground = GroundOffset()
+        self.change = GroundChange(base_map.field)
         self._graph = PoseGraph(config.graph)  # of clouds in the sensor's own axes: independent of the calibration
         self._calibration = calibration
         self.odometry = OdometryTracker(config.tracking, calibration)
@@ -117,6 +122,7 @@ class Tracker:
         """
         self._matcher.clear()
         self.ground.clear()
+        self.change.clear()
         self.odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.usual = None
@@ -152,6 +158,8 @@ class Tracker:
             return MapMatch.without_registration(verdict, belief)
         points = prepare_scan(self._scans.window(), T_odom_body[:3, 3], self.config.registration)
         points = self.ground.lower(points)
+        T_map_odom = belief.T_map_body @ inverse(T_odom_body)
+        points = self.change.without_changed(points, T_map_odom, T_odom_body[:3, 3], target)
         newest = self._scans.newest
         # older frames add to a sparse newest one, but cannot replace a blind one
         count = 0 if newest is None else min(len(points.points), len(newest))
@@ -185,8 +193,14 @@ class Tracker:
             self._matcher.dispute.clear()
             self._graph.correct(T_map_cloud, match.covariance)
             self._set_belief(T_odom_body)
-            self._learn(match, T_odom_body[:3, 3])
+            rise = self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
+            if rise:  # the ground is not the survey's: a lean that was measured on it was none
+                here = self.belief
+                self._calibration.forget_tilt()
+                self.odometry.forget_registration()
+                T_map_body = pose_from(np.eye(3), [0.0, 0.0, rise]) @ here.T_map_body
+                self._restart(self._of_cloud(T_map_body), here.covariance + _RISEN, T_odom_body)
             return
         self._scans.keep_newest(0)  # bad frames among the newest must not spoil the next registration too
 
@@ -204,12 +218,14 @@ class Tracker:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
         Sum of the cloud's by the graph and by odometry since, the error that all registrations share, the tilt that
-        trembles, and errors of mount and clock.
+        trembles, and errors of mount, clock and ground.
         """
         R = self.T_map_odom[:3, :3] if self.odometry.pose is None else (self.T_map_odom @ self.odometry.pose)[:3, :3]
         calibration = self._calibration.calibration.pose_covariance(R, np.nan_to_num(self.odometry.rates))
         repeated = self._shared_error.covariance + self.odometry.tremble
-        return swap_rotation_translation(self.predicted_covariance() + repeated + calibration)
+        covariance = self.predicted_covariance() + repeated + calibration
+        covariance[5, 5] += self.change.variance + self.ground.sigma**2
+        return swap_rotation_translation(covariance)
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
@@ -253,18 +269,27 @@ class Tracker:
     def _set_belief(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, match: MapMatch, position: Floats) -> None:
-        """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat."""
+    def _learn(self, match: MapMatch, position: Floats) -> float:
+        """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat.
+
+        Return metres by which the robot has to rise, as the ground is not the survey's.
+        """
         verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
         evidence, observation = verdict.evidence, verdict.observation
         if evidence is None or observation is None or scan is None or target is None or newest is None:
             raise ValueError("nothing can be learned from a match without a registration")
-        self._doubt = self._matcher.baseline.fallen(evidence)
+        self._doubt, rise = self._matcher.baseline.fallen(evidence), 0.0
         self._matcher.baseline.learn(evidence)
         if self.odometry.travelled - self._learned_at >= self.config.tracking.distance:  # once per view
+            driven = min(self.odometry.travelled - self._learned_at, 100.0)
             self._learned_at = self.odometry.travelled
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
             self._shared_error.learn(scan.cloud, self.T_map_odom, target, position, self.odometry.travelled)
+            drift = self.config.tracking.height_drift
+            rise = self.change.learn(self.T_map_odom, position, target, driven, drift)
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
+        covariance = match.covariance.copy()
+        covariance[[0, 1], [0, 1]] += self.change.probability * TILT_SIGMA**2  # ground that was dug is no lean
+        self.odometry.learn(self._of_cloud(match.T_map_body), covariance)
+        return rise

@@ -143,6 +143,12 @@ def _heights(layers: FieldLayers, cell: tuple[I64, I64, I64]) -> tuple[F32, Mask
     return height, stored > NOT_SURVEYED, stored != NOT_SURVEYED
 
 
+def ground_heights(layers: FieldLayers, points: F32) -> F32:
+    """Height (N,) of the ground in the cells of points (N, 3); NaN where there is none."""
+    height, has, _ = _heights(layers, _cells(layers, points))
+    return np.where(has, height, np.float32(np.nan))
+
+
 def _rise(layers: FieldLayers, low: F32, pose: F64, reach: float) -> float:
     """Metres by which the scan has to rise for its ground to lie on the map's, from points within ``reach`` of it."""
     placed = _placed(low, pose)

@@ -43,6 +43,7 @@ def test_lean_is_reported_as_the_mount_that_silences_it():
         ({"scale": -0.05}, "odometry measures 5.0% too long"),
         ({"turn": np.radians(-0.1)}, "odometry turns 0.10 deg per metre too far left"),
         ({"ground": 0.25}, "0.25 m above the survey's"),
+        ({"changed": -1.6}, "the ground here lies 1.6 m below the survey's (dug): heights follow odometry"),
     ],
 )
 def test_only_noticeable_corrections_are_reported(correction, clause):
@@ -60,6 +61,21 @@ def test_known_calibration_is_a_prior_and_no_more():
     estimator.learn(known)
     assert estimator.calibration.pitch == pytest.approx(known.pitch, rel=0.02)
     assert estimator.calibration.scale == pytest.approx(known.scale, rel=0.02)
+
+
+def test_lean_that_was_measured_on_changed_ground_is_forgotten_and_the_rest_stays():
+    estimator = CalibrationEstimator()
+    fresh = estimator.calibration
+    leaning = pose_from(exp_so3(np.radians([0.0, 2.0, 0.0])), np.zeros(3))
+    for _ in range(10):
+        estimator.measure_attitude(leaning, np.eye(4), 1e-6)
+        estimator.measure_motion(np.eye(4), pose_from(np.eye(3), [2.1, 0, 0]), pose_from(np.eye(3), [2.0, 0, 0]), NOISE)
+    scale = estimator.calibration.scale
+    assert np.degrees(estimator.calibration.pitch) > 1.5
+    estimator.forget_tilt()
+    assert (estimator.calibration.roll, estimator.calibration.pitch) == (0.0, 0.0)
+    assert estimator.calibration.sigma_tilt == pytest.approx(fresh.sigma_tilt, rel=0.01)
+    assert estimator.calibration.scale == scale > 0.01
 
 
 def test_sensor_that_cannot_lean_does_not():

@@ -178,6 +178,19 @@ def test_rays_pass_through_the_space_before_their_returns_and_no_other():
     assert len(RangeImage.of(np.empty((0, 3), np.float32)).passed_points()) == 0
 
 
+def test_rays_below_the_ground_that_was_dug_away_contradict_nothing():
+    points = RangeImage.of(fan(20.0)).passed_points(dug=2.0)
+    assert len(points) > 10
+    assert points[:, 2].min() > -1.5 + 2.8
+
+
+def test_ground_that_was_dug_is_not_held_against_a_place(world_map, scan, truth):
+    dug = ObservedScan.of(replace(scan.cloud, changed=0.75), np.empty((0, 3), np.float32), scan.T_odom_body)
+    whole, part = (each.look_up(world_map.field, truth, Move.NONE).shares[0] for each in (scan.many, dug.many))
+    for column in (Share.GROUND, Share.COVERED_GROUND):
+        assert part[column] == pytest.approx(0.25 * whole[column], rel=1e-5)
+
+
 def test_single_returns_say_nothing_about_a_direction():
     axis = np.radians(np.arange(1.0, 360.0, 2.0))
     alone = np.column_stack([20 * np.cos(axis), 20 * np.sin(axis), np.ones_like(axis)]).astype(np.float32)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.descriptors.coview import EYE
-from coview_stream.localization.registration.clouds import height_above_lowest, prepare_scan, thinned
+from coview_stream.localization.registration.clouds import RegistrationCloud, height_above_lowest, prepare_scan, thinned
 
 
 def ground(slope=0.0, half=30.0, z=5.0):
@@ -57,6 +59,14 @@ def test_range_and_count_are_limited_deterministically():
     assert np.linalg.norm(one.points - position, axis=1).max() < 20.0 + 0.5
     # a fair choice: from all sides
     assert np.abs(np.median(one.points - position, axis=0)[:2]).max() < 2.0
+
+
+def test_registration_without_ground_tells_less_of_height_and_tilt():
+    cloud = RegistrationCloud(ground(), np.zeros(0, bool), np.zeros(0, np.float32))
+    np.testing.assert_array_equal(cloud.doubted(np.eye(6)), np.eye(6))
+    none, half = (np.diag(replace(cloud, changed=share).doubted(np.zeros((6, 6)))) for share in (1.0, 0.5))
+    np.testing.assert_allclose(half, none / 8.0)
+    assert (none > 0.0).tolist() == [True, True, False, False, False, True]
 
 
 def test_one_point_per_voxel():

@@ -360,4 +360,4 @@ def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_
     moving = on_the_way(world_map, slow_drive, WIDE, 4)
     for k in (1, 2):
         moving.see(garbage(k), slow_drive.T_map_body[4])
-    assert moving.update(garbage(3), slow_drive.T_map_body[4]).score > verdict.score
+    assert moving.update(garbage(3), slow_drive.T_map_body[4]).ratio > verdict.ratio

@@ -1,0 +1,283 @@
+"""Changed ground: dug, filled, piled up or snowed on by decimetres to metres since the survey; a Bayes filter tells.
+
+The unknown is h, the height of odometry's frame on the map; it walks by odometry's drift. The ground around the robot
+is of one of two kinds: *as surveyed* (S), most patches of it lie where the survey has them at the right h; or *changed*
+(C), as in a pit, where patches tell nothing about h. A robot comes upon changed ground once in a kilometre and
+leaves it within some dozen metres. Two things are observed once per view:
+
+* Patches of ground, by their height above the survey's at the registered pose. Under S their likelihood is greatest at
+  the h that puts most of them on the survey's ground. Changed ground is of another shape than the survey's, or, as a
+  level site dug by two metres, a copy of it at another height; that becomes less probable by the metre.
+* Structure, under both kinds: roofs, crowns and the ends of walls lie where the survey has them at the right h alone.
+
+So the height goes on by odometry into a pit whose ramp the survey does not have, follows structure where that shows a
+height, and comes back onto ground as surveyed. Where nothing tells, all heights stay possible, and the variance says
+so. Changed ground is left out of registration: it would shift the robot in height and look like a lean of the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import uniform_filter, uniform_filter1d
+
+import coview_kernels as kernels
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
+from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.localization.calibration.ground_offset import structure_fits
+from coview_stream.localization.registration.clouds import STRUCTURE_HEIGHT, LocalMap, RegistrationCloud
+
+# chosen on a simulated town and campus that were dug, filled and snowed on; other sites: `python -m bench ground`
+_STEP = 0.1  # metres between the heights
+_HEIGHTS = _STEP * np.arange(-40, 41)  # metres above the registered one
+_SHIFTS = 0.2 * np.arange(-17, 18)  # metres at which structure is compared
+_LEAST, _DEEPEST = 0.35, 5.0  # metres: smaller changes are a ground offset; no ground changes by more
+_DEPTH = 1.5  # metres, mean of a change beyond the least
+_SITES = 1e-2  # share of the sites where the robot starts on changed ground
+_BECOMES, _ENDS = 1e-3, 0.03  # probability per metre that changed ground begins, and that it ends: sites are small
+_COPY = 0.1  # per metre: how fast a copy of the survey's ground becomes improbable
+_BROKEN = 5.0  # nats against ground that copies the survey's, but now at another height
+_ANEW = 1e-6  # probability per metre that all this is wrong
+_START = 0.1  # metres, one sigma of a registered height on ground as surveyed
+
+_PATCH, _FEW = 4.0, 3  # metres; points of a patch: fewer say nothing
+_INDEPENDENT = 0.1  # observations per patch: ground within a dozen metres is dug together
+_SURVEY, _LEAN = 0.07, math.radians(0.5)  # one sigma of a patch's height, metres, and of the cloud's attitude
+_CHANGES = ((0.3, 0.5), (1.5, 0.5))  # metres, mean of a change by plants and of one by diggers; shares
+_KEPT = np.array([0.3, 0.5, 0.7, 0.85, 0.95, 0.99])  # share of the patches that are as surveyed, under S
+_KEPT_PRIOR = np.array([0.02, 0.03, 0.05, 0.1, 0.3, 0.5])
+_ODDS = 4.0  # most that a patch says against its neighbours, in nats
+_ON_MAP = 0.5  # metres to a map point that a point lies on
+
+# undisturbed sites and real runs: structure never preferred a height metres off by more than 3.4 nats with these
+_STRUCTURE = 0.3  # observations per patch of structure, as of a ground offset
+_SEEN = 10.0  # metres of driving over which the same structure is seen
+_BLUR = 5  # shifts, within which structure from below differs from structure from above
+_VIEWED = 0.07  # metres, one sigma of a height without ground
+_ELSEWHERE = np.abs(_HEIGHTS) > np.array([[1.5 * _STEP], [_LEAST]])
+"""(2, H) heights that are not the registered one, by kind: ground as surveyed shows decimetres, structure does not."""
+
+
+class GroundChange:
+    """Belief over the robot's height and the kind of ground around it.
+
+    Attributes:
+        share: of the newest scan's ground that has been left out as changed.
+        metres: median height of that ground above the survey's, if it is most of the ground; 0 otherwise.
+    """
+
+    def __init__(self, field: kernels.FieldMap) -> None:
+        """Hold the present ground against that of a map's ``field``."""
+        self._field = field
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all: the place is another."""
+        self.share = self.metres = 0.0
+        self._scan: RegistrationCloud | None = None  # the newest, with all of its ground
+        self._started = False
+        self._h = 0.0  # metres: odometry's frame on the map, which the heights count from
+        self._copied = 0.0  # likewise: the height at which the patches lately fitted the survey best
+        size = np.abs(_HEIGHTS) - _LEAST
+        dug = np.where(size > 0.0, np.exp(-size / _DEPTH), 0.0)
+        as_surveyed = np.exp(-0.5 * (_HEIGHTS / _START) ** 2)
+        self._prior = np.stack([(1.0 - _SITES) * as_surveyed / as_surveyed.sum(), _SITES * dug / dug.sum()])
+        self._kinds = self._prior.copy()  # (2, H) probabilities of S and C by the patches
+        self._structure = np.zeros(len(_HEIGHTS))  # log-likelihood of structure lately seen
+
+    def without_changed(
+        self, cloud: RegistrationCloud, T_map_source: Pose, position: Floats, target: LocalMap
+    ) -> RegistrationCloud:
+        """Return a scan without the ground that does not lie on the survey's, by its predicted pose.
+
+        Args:
+            cloud: the scan.
+            T_map_source: (4, 4) its predicted pose. The first one comes from the search, and is not held against it.
+            position: (3,) of the body, the scan's frame.
+            target: the map around.
+        """
+        self._scan, self.share, self.metres = cloud, 0.0, 0.0
+        if not self._started:
+            return cloud
+        patches = _Patches(cloud, T_map_source, position, self._field, target)
+        changed = patches.changed(self.probability)
+        drop = changed & (cloud.height < STRUCTURE_HEIGHT)  # the ground of a ramp looks like low structure
+        ground = drop & ~cloud.above
+        if not ground.any():
+            return cloud
+        self.share = float(ground.sum() / (~cloud.above).sum())
+        off = patches.off[ground & np.isfinite(patches.off)]
+        if len(off) and self.share > 0.5:
+            self.metres = float(np.median(off))
+        return replace(
+            cloud, points=cloud.points[~drop], above=cloud.above[~drop], height=cloud.height[~drop],
+            changed=self.share, dug=patches.dug,
+        )  # fmt: skip
+
+    def learn(self, T_map_source: Pose, position: Floats, target: LocalMap, driven: float, drift: float) -> float:
+        """Learn from a believed registration of the newest scan; return metres by which the robot has to rise.
+
+        Args:
+            T_map_source: (4, 4) the scan's pose, as registered.
+            position: (3,) of the body, the scan's frame.
+            target: the map around.
+            driven: metres since the last lesson.
+            drift: one sigma of odometry's height, metres per square root of a metre.
+        """
+        if self._scan is None:
+            return 0.0
+        h = float(transform(T_map_source, position[None])[0, 2] - position[2])
+        if self._started:
+            self._walk(driven, drift)
+        else:
+            self._started, self._h, driven = True, h, 0.0
+            self._copied = h
+        self._count_from(h)
+        patches = _Patches(self._scan, T_map_source, position, self._field, target)
+        same = patches.likelihoods(_HEIGHTS)
+        changed = np.full(len(_HEIGHTS), patches.other_shape())
+        fits = float(_HEIGHTS[same.argmax()])
+        moved = abs(h + fits - self._copied) > 2.0 * _STEP  # a pit that ends is no copy that goes on
+        copied = np.abs(_HEIGHTS - fits) > _LEAST
+        changed[copied] = np.maximum(changed[copied], same.max() - _COPY * driven - _BROKEN * moved)
+        self._copied = h + fits
+        logs = np.stack([same, changed])
+        self._kinds *= np.exp(logs - logs.max())
+        self._kinds /= self._kinds.sum()
+        self._structure *= math.exp(-driven / _SEEN)
+        structure = structure_fits(self._scan, T_map_source, target, _SHIFTS)
+        if structure is not None:
+            self._structure += _STRUCTURE * np.interp(_HEIGHTS, _SHIFTS, uniform_filter1d(structure, _BLUR))
+        return self._rise(h)
+
+    @property
+    def probability(self) -> float:
+        """Probability that the ground around the robot has been changed."""
+        return float(self._belief()[1].sum()) if self._started else 0.0
+
+    @property
+    def variance(self) -> float:
+        """Variance of the height, metres^2: other heights that are possible, and the error of structure alone."""
+        alone = self.share**3 * _VIEWED**2  # see RegistrationCloud.groundless
+        if not self._started:
+            return alone
+        return float((self._belief() * _ELSEWHERE).sum(axis=0) @ _HEIGHTS**2) + alone
+
+    def _belief(self) -> Floats:
+        """Probabilities (2, H) of both kinds and all heights, by patches and structure."""
+        belief = self._kinds * np.exp(self._structure - self._structure.max())
+        return np.asarray(belief / belief.sum())
+
+    def _rise(self, h: float) -> float:
+        """Return metres to the probable height, if it is another than the registered one, and count from there."""
+        belief = self._belief()
+        heights, elsewhere = belief.sum(axis=0), (belief * _ELSEWHERE).sum(axis=0)
+        if elsewhere.sum() <= 0.5:
+            return 0.0
+        best = int(np.convolve(elsewhere, np.ones(7), mode="same").argmax())
+        mode = slice(max(0, best - 5), best + 6)
+        rise = float(heights[mode] @ _HEIGHTS[mode] / heights[mode].sum())
+        self._count_from(h + rise)
+        return rise
+
+    def _walk(self, driven: float, drift: float) -> None:
+        """Let the height drift, and the ground change its kind, over ``driven`` metres."""
+        out = min(0.3, 0.5 * drift**2 * driven / _STEP**2)
+        known = (1.0 - 2.0 * out) * self._kinds
+        known[:, 1:] += out * self._kinds[:, :-1]
+        known[:, :-1] += out * self._kinds[:, 1:]
+        becomes, ends, anew = (min(0.5, rate * driven) for rate in (_BECOMES, _ENDS, _ANEW))
+        same, changed = known
+        known = np.stack([(1.0 - becomes) * same + ends * changed, becomes * same + (1.0 - ends) * changed])
+        self._kinds = (1.0 - anew) * known + anew * self._prior
+
+    def _count_from(self, h: float) -> None:
+        """Let the heights count from another one; those beyond the ends are forgotten."""
+        steps = round((h - self._h) / _STEP)
+        if steps:
+            rows = np.arange(len(_HEIGHTS)) + steps
+            inside = (rows >= 0) & (rows < len(_HEIGHTS))
+            rows = np.clip(rows, 0, len(_HEIGHTS) - 1)
+            self._kinds = np.where(inside, self._kinds[:, rows], 0.0) + 1e-12
+            self._structure = self._structure[rows]
+            self._h += steps * _STEP
+
+
+class _Patches:
+    """Patches of the present ground of a scan at a pose.
+
+    Attributes:
+        off: (N,) metres of the scan's points above the survey's ground; NaN where it has none.
+        height: (P,) median of it on the ground of each patch.
+        dug: metres that the survey's ground lies above the deepest tenth of the patches.
+    """
+
+    def __init__(
+        self, cloud: RegistrationCloud, T_map_source: Pose, position: Floats, field: kernels.FieldMap, target: LocalMap
+    ) -> None:
+        points = transform(T_map_source, cloud.points).astype(np.float32)
+        here = transform(T_map_source, position[None])[0]
+        cell = np.floor((points[:, :2] - here[:2]) / _PATCH).astype(np.int64)
+        low = cell.min(axis=0)
+        rows, columns = (cell.max(axis=0) - low + 1).tolist()
+        self._shape = rows, columns
+        self._cell = (cell[:, 0] - low[0]) * columns + cell[:, 1] - low[1]
+        self.off: Floats32 = points[:, 2] - kernels.ground_heights(field, points)
+        ground = ~cloud.above & (np.abs(self.off) < _DEEPEST)  # False where the survey has no ground
+        # where the ground is hidden, the lowest points of a wall or a crown look like ground; they lie on the map's
+        apart = np.flatnonzero(ground & (np.abs(self.off) > _LEAST))
+        ground[apart] = kernels.nearest(target.grid, points[apart], _ON_MAP)[0] >= _ON_MAP
+        chosen = np.flatnonzero(ground)
+        chosen = chosen[np.lexsort((self.off[chosen], self._cell[chosen]))]
+        count = np.bincount(self._cell[chosen], minlength=rows * columns)
+        self._known = np.flatnonzero(count >= _FEW)
+        middle = (np.cumsum(count) - count + count // 2)[self._known]
+        self.height = self.off[chosen[middle]].astype(np.float64)
+        centre = (np.column_stack(np.divmod(self._known, columns)) + low + 0.5) * _PATCH
+        self._sigma = np.hypot(_SURVEY, _LEAN * np.hypot(*centre.T))
+        deep = np.sort(self.height)[: max(1, len(self.height) // 10)]
+        self.dug = max(0.0, -float(deep[-1])) if len(deep) else 0.0
+
+    def likelihoods(self, heights: Reals) -> Floats:
+        """Log-likelihoods (H,) of ground as surveyed if the robot stands ``heights`` (H,) metres higher."""
+        logs, _, _ = self._shares(heights)
+        top = logs.max(axis=0)
+        return np.asarray(top + np.log(_KEPT_PRIOR @ np.exp(logs - top)))
+
+    def other_shape(self) -> float:
+        """Log-likelihood of ground that has been changed to another shape, at any height."""
+        off = np.abs(self.height - np.median(self.height)) if len(self.height) else self.height
+        return -_INDEPENDENT * float((off + math.log(2.0)).sum())
+
+    def changed(self, probability: float) -> Bools:
+        """Tell which points lie on patches that are probably changed, if the pose is right.
+
+        ``probability`` is that of the changed kind of ground. A patch goes with its neighbours unless it is clear.
+        """
+        if not len(self.height):
+            return np.zeros(len(self._cell), dtype=bool)
+        logs, same, other = self._shares(np.zeros(1))
+        weights = _KEPT_PRIOR * np.exp(logs[:, 0] - logs.max())
+        kept = float(weights @ _KEPT / weights.sum())
+        kept += probability * (min(kept, float(_KEPT[0])) - kept)
+        odds = math.log(kept / (1.0 - kept)) + np.clip(np.log(same[0] / other[0]), -_ODDS, _ODDS)
+        total, known = np.zeros((2, self._shape[0] * self._shape[1]))
+        total[self._known], known[self._known] = odds, 1.0
+        total, known = (
+            uniform_filter(each.reshape(self._shape), 3, mode="constant").ravel() for each in (total, known)
+        )
+        mean = total / np.maximum(known, 1e-9)
+        around = mean[self._known]
+        mean[self._known] = np.where(around * odds < 0.0, around + 0.5 * odds, odds)
+        return np.asarray((mean < 0.0)[self._cell])
+
+    def _shares(self, heights: Reals) -> tuple[Floats, Floats, Floats]:
+        """Log-likelihoods (K, H) by the share that is as surveyed; densities (H, P) as surveyed and as changed."""
+        at = self.height + heights[:, None]
+        z = at / self._sigma
+        same = (0.9 * np.exp(-0.5 * z**2) + 0.1 / 3.0 * np.exp(-(z**2) / 18.0)) / (self._sigma * math.sqrt(2 * math.pi))
+        other = sum(share * np.exp(-np.abs(at) / size) / (2.0 * size) for size, share in _CHANGES)
+        logs = np.stack([np.log(u * same + (1.0 - u) * other).sum(axis=1) for u in _KEPT])
+        return _INDEPENDENT * logs, np.maximum(same, 1e-12), np.asarray(other)
