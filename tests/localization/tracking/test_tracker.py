@@ -351,13 +351,13 @@ def test_repeated_registrations_while_standing_do_not_shrink_covariance(world_ma
 
 def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_drive):
     """It may have been carried meanwhile: the frames before the last look are of another place."""
-    ride = on_the_way(world_map, slow_drive, WIDE, 4)
-    for k in (1, 2):
-        ride.see(garbage(k), slow_drive.T_map_body[4])
-    verdict = ride.update(garbage(3), slow_drive.T_map_body[4], standing_still=True)
-    assert not verdict.verified
-    assert verdict.ratio < -5.0
-    moving = on_the_way(world_map, slow_drive, WIDE, 4)
-    for k in (1, 2):
-        moving.see(garbage(k), slow_drive.T_map_body[4])
-    assert moving.update(garbage(3), slow_drive.T_map_body[4]).ratio > verdict.ratio
+    there, near = slow_drive.T_map_body[4], []
+    for standing_still in (True, False):
+        ride = on_the_way(world_map, slow_drive, WIDE, 4)
+        for k in (1, 2, 3):
+            ride.see(garbage(k), there)
+        match = ride.tracker.match_to_map(garbage(3), ride.odometry(there), standing_still=standing_still)
+        assert not match.verdict.verified
+        near.append(match.scan.evidence(world_map.field, inverse(ride.T_odom_map)).near)
+    assert match.verdict.ratio < -5.0
+    assert near[0] < near[1]
