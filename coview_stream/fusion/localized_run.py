@@ -16,11 +16,11 @@ from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, InputError, warn
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, pose_from, transform
+from coview_stream.geometry.transforms import Points, Pose, Poses, inverse, pose_from, transform
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.odometry_history import OdometryHistory
 from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.smoothing import PoseKind
-from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.run import Run
 
 _SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least
@@ -97,11 +97,13 @@ class LocalizedRun:
         measured = ~_bridged(stamps, result)
         stamps, poses = stamps[measured], poses[measured]
         calibration = _part(result, "calibration")
-        self._R_level = exp_so3(np.radians([_number(calibration, "roll_deg"), _number(calibration, "pitch_deg"), 0.0]))
-        scale = _number(calibration, "odometry_scale", 1.0) - 1.0
-        self._correction = SweepCorrection(self._R_level, scale)
-        turn = np.radians(_number(calibration, "odometry_turn_deg_per_m"))
-        self._calibration = Calibration(scale=scale, turn=float(turn))
+        names = ("roll_deg", "pitch_deg", "odometry_turn_deg_per_m", "heading_deg")
+        roll, pitch, turn, heading = np.radians([_number(calibration, name) for name in names]).tolist()
+        lever = _number(calibration, "lever_x_m"), _number(calibration, "lever_y_m")
+        scale, delay = _number(calibration, "odometry_scale", 1.0) - 1.0, _number(calibration, "clouds_late_s")
+        self._calibration = Calibration(
+            roll, pitch, scale, turn, heading=heading, lever_x=lever[0], lever_y=lever[1], delay=delay
+        )
         mount = _part(result, "mount")
         axes = ("roll", "pitch", "yaw", "x", "y", "z")
         self._run = open_it(pair.run, Mount(**{name: _number(mount, name) for name in axes}) if mount else None)
@@ -133,22 +135,25 @@ class LocalizedRun:
     def frames(self, wanted: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
         """Yield the frames with a pose, in order; None for damaged frames and those that ``wanted`` refuses."""
         lever = np.zeros(3) if self._run.mount is None else self._run.mount.T_body_sensor[:3, 3]
+        history = OdometryHistory.of(self._run.stamps, self._run.poses)
+        since = history.since_clouds(self.stamps, self._calibration.delay, self._calibration.scale)
         for k, index in enumerate(self._index):
             if wanted is not None and not wanted(k):
                 yield None
                 continue
             try:
-                frame = self._run.read(int(index), self._correction)
+                frame = self._run.read(int(index), self._calibration.sweep)
             except CloudError:
                 self.damaged.add(int(index))
                 yield None
                 continue
             finite = frame.points[np.isfinite(frame.points).all(axis=1)]
-            points = transform(pose_from(self._R_level, np.zeros(3)), finite)
+            points = self._calibration.level(finite)
             # a single scan may be stored far from its zero: the pose is in the file's coordinates
-            T = self.poses[k] @ pose_from(np.eye(3), frame.origin)
+            T = self.poses[k] @ inverse(since[k]) @ pose_from(np.eye(3), frame.origin)
             T[:3, 3] -= self._origin
-            yield PosedFrame(float(self.stamps[k]), points, T, self._R_level @ lever)
+            eye = transform(self._calibration.T_body_cloud, lever[None])[0]
+            yield PosedFrame(float(self.stamps[k]), points, T, eye)
 
 
 def _matched(frames: Floats, stamps: Floats) -> tuple[Any, Any]:

@@ -8,7 +8,7 @@ that was carried or odometry that began anew ends it just as it ends live tracki
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class BelievedRegistration:
     Attributes:
         T_map_cloud: (4, 4) of the cloud in the sensor's axes, about the map's origin, the prior removed.
         covariance: (6, 6) over (rx, ry, rz, x, y, z), map axes, of this registration alone.
-        shared: (6, 6) likewise, of the error that neighbouring registrations share.
+        shared: (6, 6) likewise, of the error that neighbouring registrations share, but for mount and clock.
         doubt: times as wide as usual its protection level is.
         slipped: odometry has slipped since the registration before it, in the order of tracking.
         backward: tracked backwards.
@@ -93,6 +93,8 @@ class RecordingLocalizer(Localizer):
         """Forget everything and track from the registered pose of a frame; its arguments as of :meth:`step`."""
         self.reset()
         self._slipped, self._backward = False, True
+        calibration = replace(calibration, delay=-calibration.delay)  # time runs backwards
+        self._frames.estimator.learn(calibration, same_run=True)
         self.hint_calibration(calibration)
         frame, _ = self._predict(cloud, T_odom_body, stamp)
         level = self._frames.calibration
@@ -122,7 +124,7 @@ class RecordingLocalizer(Localizer):
         self._slipped |= match.moves_place
         if ruling.believed and not match.moves_place:
             level = self._tracker.protection_level()
-            shared = swap_rotation_translation(self._tracker.reported_covariance())
+            shared = swap_rotation_translation(self._tracker.reported_covariance(mount_and_clock=False))
             shared -= self._tracker.predicted_covariance()
             self.registered = BelievedRegistration(
                 T_map_cloud, match.covariance, shared, level.doubt, self._slipped, self._backward

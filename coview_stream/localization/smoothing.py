@@ -36,6 +36,7 @@ from coview_stream.geometry.transforms import (
 )
 from coview_stream.localization.backward import BelievedRegistration, RecordedFrame, RecordingLocalizer, track_backward
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.odometry_history import OdometryHistory
 from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.registration.register import swap_rotation_translation
 from coview_stream.localization.tracking.motion import Drift
@@ -113,6 +114,11 @@ class _Chain:
     measured: dict[int, Pose]  # (4, 4) of their bodies
     driven: Floats  # (N,) metres up to each frame
     spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
+    since_cloud: Poses = field(
+        kw_only=True
+    )  # (N, 4, 4) motion of the body from the cloud's moment, which may be late, to the stamp
+    rates: Floats = field(kw_only=True)  # (N, 3) velocities of the body, as of a Moment
+    calibration: Calibration = field(kw_only=True)
     broken: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Frames whose motion from the one before is unknown, and the registered frames before and after."""
     unknown: set[int] = field(default_factory=set)
@@ -126,7 +132,11 @@ class _Chain:
     ) -> _Chain:
         """Correct the odometry, and find where it is broken."""
         correction, level = OdometryCorrection(), inverse(calibration.T_body_cloud)
-        odometry = np.array([correction.correct(frame.T_odom_body, calibration) for frame in frames])
+        stamps, poses = np.array([frame.fix.stamp for frame in frames]), np.array([f.T_odom_body for f in frames])
+        history, late = OdometryHistory.of(stamps, poses), calibration.delay
+        if late and len(frames) > 1:
+            poses = history.all_at(stamps - late)
+        odometry = np.array([correction.correct(T, calibration) for T in poses])
         registered = {k: frame.registered for k, frame in enumerate(frames) if frame.registered is not None}
         measured = {k: kept.T_map_cloud @ level for k, kept in registered.items()}
         steps = np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1)
@@ -134,7 +144,20 @@ class _Chain:
         for k, (a, b) in enumerate(pairwise(odometry), start=1):
             spread[k] = drift.covariance(float(steps[k - 1]), abs(yaw_of(inverse(a) @ b)))
         keys = np.array(list(registered))
-        chain = cls(frames, odometry, registered, keys, measured, driven, spread)
+        since = history.since_clouds(stamps, late, calibration.scale)
+        rates = np.nan_to_num([history.rates(stamp - late) for stamp in stamps.tolist()])
+        chain = cls(
+            frames,
+            odometry,
+            registered,
+            keys,
+            measured,
+            driven,
+            spread,
+            since_cloud=since,
+            rates=rates,
+            calibration=calibration,
+        )
         chain._spread_calibration(calibration)
         live = [at for at, kept in enumerate(registered.values()) if not kept.backward]
         for before, after in pairwise([0, *live]):
@@ -278,7 +301,9 @@ class _Chain:
         kept = self.registered[nearest]
         fix = frame.backward if frame.fix.T_map_body is None else frame.fix
         fix = fix or self.frames[nearest].backward or self.frames[nearest].fix
-        reported = swap_rotation_translation(covariance + kept.shared)
+        mount_and_clock = self.calibration.pose_covariance(T[:3, :3], self.rates[k])
+        reported = swap_rotation_translation(covariance + kept.shared + mount_and_clock)
+        T = T @ self.since_cloud[k]
         T_map_body = pose_from(T[:3, :3], T[:3, 3] + origin) @ pose_from(np.eye(3), -frame.origin)
         level = protection_level(reported, kept.doubt)
         return SmoothedPose(frame.fix.stamp, kind, T_map_body, reported, level, fix.confidence)

@@ -49,10 +49,12 @@ def run_of(clouds, odometry):
     return Run(Path("run"), (Path("run"),) * count, stamps, np.array(odometry), Clouds(list(clouds)))
 
 
-def searched_from(world_map, run, first):
-    """Localize a run whose search answers from frame ``first`` on; smooth it."""
+def searched_from(world_map, run, first, known=None):
+    """Localize a run whose search answers from frame ``first`` on; smooth it. A calibration may be known."""
     localizer, frames = RecordingLocalizer(world_map), []
     localizer.prepare()
+    if known is not None:
+        localizer.hint_calibration(known)
     for k, frame in enumerate(run):
         if k < first:
             localizer.add_frame(frame.points, frame.T_odom_body, frame.stamp)
@@ -81,6 +83,23 @@ def way(scene):
 def jumped(odometry, at, metres=4.0):
     """Odometry that begins anew at a frame, elsewhere and turned."""
     return [T if k < at else pose_from(rot_z(0.9), [metres, 9.0, 0.0]) @ T for k, T in enumerate(odometry)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", ["clouds", "odometry"])
+def test_poses_are_of_the_stamp_where_clouds_or_odometry_are_late(world_map, way, late):
+    """By a frame, of 0.5 s and 0.4 m; live, tracked backwards and smoothed."""
+    old, new = slice(0, -1), slice(1, None)
+    clouds, odometry = (old, new) if late == "clouds" else (new, old)
+    run = run_of(way.clouds[clouds], way.T_odom_body[odometry])
+    known = Calibration(delay=0.5 if late == "clouds" else -0.5, sigma_delay=0.002)
+    frames, poses = searched_from(world_map, run, 10, known)
+    assert poses[5].kind is PoseKind.BACKWARD
+    assert_right(poses, way.T_map_body[1:])
+    posed = {k: frame.fix for k, frame in enumerate(frames) if frame.fix.T_map_body is not None}
+    assert len(posed) > 20
+    for k, fix in posed.items():
+        assert pose_error(fix.T_map_body, way.T_map_body[k + 1])[0] < 0.15
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from coview_stream.geometry.transforms import (
     rotation_angle,
     transform,
 )
+from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.odometry.deskew import SweepCorrection
 
 _LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
@@ -34,7 +35,7 @@ _MOVED = {
 """Least sigmas of a calibration from before the node started."""
 HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
 """Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
-_ACCELERATION, _TURN_ACCELERATION = 1.0, 0.5  # m/s2 and rad/s2 of wheeled robots: late odometry does not show them
+_ACCELERATION, _TURN_ACCELERATION = 0.5, 0.2  # m/s2 and rad/s2 of wheeled robots, one sigma
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,9 @@ class Calibration:
     lever_x: float = 0.0
     lever_y: float = 0.0
     delay: float = 0.0
-    sigma_heading: float = math.radians(0.2)
-    sigma_lever: float = 0.01
-    sigma_delay: float = 0.002
+    sigma_heading: float = HEADING_TOLERANCE
+    sigma_lever: float = LEVER_TOLERANCE
+    sigma_delay: float = CLOCK_TOLERANCE
     changed: float = 0.0
 
     @cached_property
@@ -122,27 +123,27 @@ class Calibration:
         if change is not None:
             late = np.array([0.0, 0.0, change[2], change[0], change[1], 0.0])
             spread += np.outer(late, late) * self.sigma_delay**2
-        return np.asarray(spread + 2.0 * self._extrapolated)
+        return np.asarray(spread)
 
     def pose_covariance(self, R_map_body: Floats, rates: Floats) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, that mount and clock add to a pose of the body.
 
         ``R_map_body`` (3, 3); ``rates`` (3,) velocities x, y and rotation about z of the body, its axes. A cloud that
-        is late leaves the robot behind; odometry that is late is bridged to the stamp, and errs by accelerations.
+        is late leaves the robot behind.
 
         The body is where the stated mount has it, and the stamp is the cloud's: only what is uncertain beyond the
         tolerances of a correct robot counts.
         """
-        spread = self._extrapolated.copy()
-        spread[2, 2] += max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
-        spread[[3, 4], [3, 4]] += max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
+        heading = max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
+        lever = max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
+        spread = np.diag([0.0, 0.0, heading, lever, lever, 0.0])
         moving = np.concatenate([[0.0, 0.0, rates[2]], R_map_body @ [rates[0], rates[1], 0.0]])
         late = 0.5 * (1.0 + math.erf(self.delay / max(self.sigma_delay, 1e-9) / math.sqrt(2.0)))  # probability
         return np.asarray(spread + np.outer(moving, moving) * late * max(0.0, self.sigma_delay**2 - CLOCK_TOLERANCE**2))
 
     @property
-    def _extrapolated(self) -> Floats:
-        """(6, 6) covariance of odometry that is late, moved on to the stamp at constant velocities."""
+    def extrapolation(self) -> Floats:
+        """(6, 6) covariance over (rx, ry, rz, x, y, z) of late odometry, which does not show accelerations yet."""
         grown = 0.5 * min(self.delay, 0.0) ** 2
         moved = (grown * _ACCELERATION) ** 2
         return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])
@@ -210,7 +211,8 @@ class Calibration:
             "odometry_turn_sigma_deg_per_m": round(deg(self.sigma_turn), 3),
             "heading_deg": round(deg(self.heading), 2),
             "heading_sigma_deg": round(deg(self.sigma_heading), 2),
-            "lever_m": [round(self.lever_x, 3), round(self.lever_y, 3)],
+            "lever_x_m": round(self.lever_x, 3),
+            "lever_y_m": round(self.lever_y, 3),
             "lever_sigma_m": round(self.sigma_lever, 3),
             "clouds_late_s": round(self.delay, 4),
             "clouds_late_sigma_s": round(self.sigma_delay, 4),
@@ -228,16 +230,16 @@ class RawScan:
     Attributes:
         T_odom_body: (4, 4) odometry of the frame.
         calibration: the calibration of the frame's time.
-        rates: (3,) velocities x, y, metres per second, and rotation about z, radians per second, of the body, its axes.
+        moment: of the frame; None where it is not known.
     """
 
     def __init__(
-        self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None, rates: Floats | None = None
+        self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None, moment: Moment | None = None
     ) -> None:
         """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``calibration`` (default: none)."""
         self.T_odom_body = T_odom_body
         self.calibration = calibration or Calibration()
-        self.rates = np.zeros(3) if rates is None else rates
+        self.moment = moment
         self._newest = self.calibration.T_body_cloud, points
         self._raw: Points | None = None
 

@@ -35,6 +35,11 @@ from coview_stream.localization.calibration.calibration import (
     LEVER_TOLERANCE,
     Calibration,
 )
+from coview_stream.localization.calibration.delay_search import RESOLUTION, DelaySearch, SeenMotion
+from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
+
+Moments = tuple[Moment | None, Moment | None]
+"""Moments of two clouds."""
 
 
 class _Prior(NamedTuple):
@@ -62,7 +67,7 @@ GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.
 # centimetre; a queue is late by up to a second, a sensor sits within a metre or two
 _CLOCK = _Prior(slice(6, 7), CLOCK_TOLERANCE, 0.5, 0.001, 3e-4, ("delay",), "sigma_delay")
 _HEADING = _Prior(
-    slice(7, 8), HEADING_TOLERANCE, math.radians(15.0), 0.002, math.radians(0.01), ("heading",), "sigma_heading"
+    slice(7, 8), HEADING_TOLERANCE, math.radians(10.0), 0.001, math.radians(0.01), ("heading",), "sigma_heading"
 )
 _LEVER = _Prior(slice(8, 10), LEVER_TOLERANCE, 0.7, 0.0005, 5e-4, ("lever_x", "lever_y"), "sigma_lever")
 _GROUPS = (_TILT, _SCALE, _TURN, _CLOCK, _HEADING, _LEVER)  # corrected components
@@ -129,7 +134,7 @@ class CalibrationBelief:
         self._sensor_leans = sensor_leans
         self._stand_straight()
 
-    def learn(self, earlier: Calibration) -> None:
+    def learn(self, earlier: Calibration, same_run: bool) -> None:
         """See :meth:`CalibrationEstimator.learn`."""
         present = self.applied()
         for group in _GROUPS:
@@ -138,6 +143,9 @@ class CalibrationBelief:
             if group in _RARE and sigma**2 < self.P[axes, axes].mean():  # as it was, rather than as it should be
                 self.x[group.axes] = self._centre[group.axes] = values
                 self._exact[group.sigma] = max(sigma, group.exact)
+                if same_run:
+                    self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
+                    self.P[axes, axes] = sigma**2
             elif group not in _RARE and sigma < getattr(present, group.sigma):
                 self.x[group.axes] = values
                 self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
@@ -165,6 +173,17 @@ class CalibrationBelief:
         self.x[_TILT.axes] = 0.0
         self.P[_TILT.axes], self.P[:, _TILT.axes] = 0.0, 0.0
         self.P[_TILT.axes, _TILT.axes] = np.eye(2) * _TILT.wide**2
+        self._stand_straight()
+
+    def begin_at(self, delay: float, sigma: float) -> None:
+        """Begin anew at a delay; scale and turn, which may have stood in for it, are forgotten."""
+        for group, mean, spread in ((_CLOCK, delay, sigma), (_SCALE, 0.0, _SCALE.wide), (_TURN, 0.0, _TURN.wide)):
+            self.x[group.axes] = mean
+            self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
+            self.P[group.axes, group.axes] = spread**2
+        self._centre[_CLOCK.axes] = delay
+        self._exact[_CLOCK.sigma] = max(sigma, _CLOCK.exact) if delay else _CLOCK.exact
+        self._shares[_CLOCK.sigma] = _STEPPED if delay else _CLOCK.share
         self._stand_straight()
 
     def walk(self, driven: float) -> None:
@@ -215,6 +234,8 @@ class CalibrationBelief:
             weights = np.exp(prior - 0.5 * fit - (prior - 0.5 * fit).max())
             weights /= weights.sum()
             means = x - pull[:, :, 0] @ (P / wide).T  # (M, K)
+            if groups == (_TILT,):  # a small lean is odometry's gravity
+                means = np.where(free, means, 0.0)
             variances = np.diag(P) - wide * np.einsum("ij,mji->mi", P / np.outer(wide, wide), pull[:, :, 1:]) * wide
             mean = weights @ means
             variance = weights @ (variances + means**2) - mean**2
@@ -266,19 +287,24 @@ class CalibrationEstimator:
 
     Attributes:
         calibration: the applied calibration.
+        history: odometry as it came.
     """
 
     def __init__(self, sensor_leans: bool = True) -> None:
         """Begin with the priors; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
         self._known = CalibrationBelief(sensor_leans)
+        self.history, self._delays = OdometryHistory(), DelaySearch()
         self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
         self._probability = 0.0  # that the leading place is right
         self._apply()
 
-    def learn(self, earlier: Calibration) -> None:
-        """Take over the components of an earlier calibration that have a smaller sigma than the present ones."""
+    def learn(self, earlier: Calibration, same_run: bool = False) -> None:
+        """Take over the components of an earlier calibration that have a smaller sigma than the present ones.
+
+        Mount and clock may be others since, unless it is of the ``same_run``.
+        """
         self._supposed = None
-        self._known.learn(earlier)
+        self._known.learn(earlier, same_run)
         self._apply()
 
     def forget_leader(self) -> None:
@@ -294,6 +320,7 @@ class CalibrationEstimator:
 
     def begin_odometry(self) -> None:
         """Forget the lean of the odometry frame, as a new one begins; the robot's constants stay."""
+        self.history, self._delays = OdometryHistory(), DelaySearch()
         self._supposed = None
         self._known.begin_odometry()
         self._apply()
@@ -323,6 +350,7 @@ class CalibrationEstimator:
 
     def widen_clock(self) -> None:
         """Suppose that the clock of clouds or odometry may have taken a step."""
+        self._delays = DelaySearch()
         self._widen((_CLOCK,))
 
     def _widen(self, groups: tuple[_Prior, ...]) -> None:
@@ -330,8 +358,27 @@ class CalibrationEstimator:
         self._known.widen(groups)
         self._apply()
 
+    def search_delay(self) -> None:
+        """Judge the motions after which odometry has gone on for a second; call it at each frame.
+
+        The state begins anew at another delay if they speak for it. Where odometry is late it learns from them only
+        now, as until then odometry at the clouds' moments was not known.
+        """
+        judged = self._delays.judge(self.history)
+        for seen, step, rates in judged:
+            if seen.applied.delay < 0.0:
+                step[:3, 3] *= 1.0 + seen.applied.scale
+                J = motion_jacobian(step, rates, seen.applied.scale)
+                self._learn_motion(seen.motion, step, J, seen.noise, seen.applied)
+        if judged:
+            now, surprise = self.calibration, math.log((1.0 - _CLOCK.share) / _CLOCK.share)
+            delay = self._delays.better_than(now.delay, now.sigma_delay, surprise)
+            if delay is not None:
+                self._known.begin_at(delay, RESOLUTION)
+                self._apply()
+
     def measure_motion(
-        self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats, rates: Floats | None = None
+        self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats, moments: Moments = (None, None)
     ) -> Pose:
         """Add the motion between two registrations (eq. C2); return ``step`` corrected by the new calibration.
 
@@ -341,30 +388,39 @@ class CalibrationEstimator:
             step: (4, 4) odometry between them, corrected by the calibration of its time.
             noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at the start, without the
                 calibration's.
-            rates: (2, 3) as of :func:`motion_jacobian`; None without a delay. Where they are not known (NaN) the motion
-                is not used: a robot that begins to move looks as if its clouds were late.
+            moments: of both poses; without, the motion does not tell a delay. Where the rates are not known (NaN) it is
+                not used: a robot that begins to move looks as if its clouds were late.
         """
         driven = float(np.linalg.norm(step[:3, 3]))
         turned = abs(float(log_so3(step[:3, :3])[2]))
-        if (driven < _MIN_STEP and turned < _MIN_TURN) or (rates is not None and not np.isfinite(rates).all()):
+        first, last = moments
+        rates = np.zeros((2, 3)) if first is None or last is None else np.array([first.rates, last.rates])
+        if (driven < _MIN_STEP and turned < _MIN_TURN) or not np.isfinite(rates).all():
             return step
         for belief in filter(None, (self._known, self._supposed)):
             belief.walk(driven)
-        motion = inverse(T_map_before) @ T_map_body
-        gap = np.append(motion[:2, 3] - step[:2, 3], log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
-        before = self.calibration
-        J = motion_jacobian(step, np.zeros((2, 3)) if rates is None else rates, before.scale)
-        H = np.zeros((3, SIZE))
-        H[:, _MOTION] = J
-        self._update(gap + J @ _motion_part(before), H, noise)
+        motion, before = inverse(T_map_before) @ T_map_body, self.calibration
+        J = motion_jacobian(step, rates, before.scale)
+        if first is not None and last is not None:
+            self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
+        if first is None or last is None or before.delay >= 0.0:
+            self._learn_motion(motion, step, J, noise, before)
         now = self.calibration
         moved = J @ (_motion_part(now) - _motion_part(before))
         t = np.append(step[:2, 3] + moved[:2], (1.0 + now.scale) / (1.0 + before.scale) * step[2, 3])
         return pose_from(exp_so3(np.array([0.0, 0.0, moved[2]])) @ step[:3, :3], t)
 
+    def _learn_motion(self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration) -> None:
+        """Add a motion to the beliefs; ``applied`` has corrected it and ``step``."""
+        gap = np.append(motion[:2, 3] - step[:2, 3], log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
+        H = np.zeros((3, SIZE))
+        H[:, _MOTION] = J
+        self._update(gap + J @ _motion_part(applied), H, noise)
+
     def measure_frames(
-        self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float, rates: Floats | None = None
-    ) -> Pose:
+        self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float,
+        moments: Moments = (None, None),
+    ) -> Pose:  # fmt: skip
         """Add a motion between frames measured by the lidar alone (eq. C4); return ``step``, newly corrected.
 
         Args:
@@ -373,7 +429,7 @@ class CalibrationEstimator:
             variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
             position: sigma of ``motion``, metres.
             angle: sigma of ``motion``, radians.
-            rates: as of :meth:`measure_motion`.
+            moments: as of :meth:`measure_motion`.
         """
         t, before = step[:3, 3], self.calibration
         applied = np.array([before.roll, before.pitch])
@@ -388,7 +444,7 @@ class CalibrationEstimator:
         self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
         noise = np.diag(variances[[3, 4, 2]] + np.array([position, position, angle]) ** 2)
         level = self.calibration.T_body_cloud @ inverse(before.T_body_cloud)
-        return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, rates)
+        return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, moments)
 
     def _update(self, measured: Floats, H: Floats, R: Floats) -> None:
         """Add a measurement ``measured`` = H x + noise of covariance R to both beliefs."""

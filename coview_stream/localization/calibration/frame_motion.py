@@ -25,7 +25,8 @@ from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator, heavier
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
+from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
 from coview_stream.localization.registration.surfaces import motion_prior, register_to_cloud, surface_points
 
@@ -49,7 +50,7 @@ class _Reference(NamedTuple):
     points: Points  # (K, 3) on surfaces, sensor's axes
     normals: Floats32  # (K, 3) of the points
     T_odom_body: Pose  # (4, 4) corrected odometry
-    rates: Floats | None  # (3,) as of a RawScan
+    moment: Moment | None
 
 
 class FrameMotion:
@@ -73,7 +74,7 @@ class FrameMotion:
 
     def refine(
         self, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator, drift: Variances,
-        rates: Floats | None = None,
+        moment: Moment | None = None,
     ) -> Pose:  # fmt: skip
         """Register a frame to the previous keyframe; return its odometry (4, 4), corrected by the result.
 
@@ -82,15 +83,15 @@ class FrameMotion:
             T_odom_body: (4, 4) odometry, corrected by the estimator's calibration.
             estimator: gets the motion as a measurement.
             drift: of odometry.
-            rates: (3,) as of a RawScan.
+            moment: of the frame.
         """
         reference = self._reference
         if reference is not None:
             T_registered = self._registered(reference, points, T_odom_body, estimator)
             if T_registered is not None:
-                both = None if reference.rates is None or rates is None else np.array([reference.rates, rates])
+                both = reference.moment, moment
                 T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift, both)
-        self._reference = _Reference(*surface_points(points), T_odom_body, rates)
+        self._reference = _Reference(*surface_points(points), T_odom_body, moment)
         return T_odom_body
 
     def _registered(
@@ -116,7 +117,7 @@ class FrameMotion:
 
 def _corrected(
     before: Pose, T_odom_body: Pose, T_registered: Pose, estimator: CalibrationEstimator, drift: Variances,
-    rates: Floats | None,
+    moments: Moments,
 ) -> Pose:  # fmt: skip
     """Give the estimator a registered motion from ``before`` (4, 4); return the newest odometry (4, 4), fused."""
     level = estimator.calibration.T_body_cloud
@@ -126,7 +127,7 @@ def _corrected(
     position = math.hypot(_POSITION, _POSITION_METRE * far)
     right = _probability_right(motion, step, variances, estimator.calibration, position)
     sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
-    step = estimator.measure_frames(motion, step, variances, *sigmas, rates)
+    step = estimator.measure_frames(motion, step, variances, *sigmas, moments)
     turn = estimator.calibration.T_body_cloud @ inverse(level)
     motion = turn @ motion @ inverse(turn)
     return _fused(before @ step, before @ motion, variances, *sigmas)

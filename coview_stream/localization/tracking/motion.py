@@ -7,7 +7,7 @@ the motion between two registrations less odometry's is its drift plus the noise
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import exp
 
 import numpy as np
@@ -17,6 +17,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, rotate_covariance, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, motion_jacobian, tilt_variance
+from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 
 MAX_FRAMES = 40
@@ -131,12 +132,12 @@ def worth_learning(driven: float, turned: float) -> bool:
 
 @dataclass(frozen=True)
 class _Mark:
-    """Odometry at one moment: pose (4, 4), metres driven and radians turned so far, rates (3,) as of a RawScan."""
+    """Odometry at one moment: pose (4, 4), metres driven and radians turned so far, and the frame's moment."""
 
     T_odom_body: Pose
     travelled: float
     turned: float
-    rates: Floats = field(default_factory=lambda: np.zeros(3))
+    moment: Moment | None = None
 
 
 @dataclass(frozen=True)
@@ -154,14 +155,13 @@ class OdometryTracker:
     Attributes:
         travelled: metres driven.
         pose: (4, 4) the newest; None before the first, and where odometry may have jumped.
-        rates: (3,) of the newest, as of a RawScan.
     """
 
     def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
         """Begin with the configured rates; ``calibration`` learns the systematic part."""
         self.travelled = 0.0
         self.pose: Pose | None = None
-        self.rates = np.zeros(3)
+        self._moment: Moment | None = None
         self._calibration = calibration
         self._turned = 0.0
         self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
@@ -169,9 +169,9 @@ class OdometryTracker:
         self._registered: _Registered | None = None
         self._unconfirmed: _Registered | None = None  # the one that odometry contradicts
 
-    def add_pose(self, T_odom_body: Pose, rates: Floats | None = None) -> None:
-        """Add the pose (4, 4) of a frame, and its rates (3,) if they are known."""
-        self.rates = np.zeros(3) if rates is None else rates
+    def add_pose(self, T_odom_body: Pose, moment: Moment | None = None) -> None:
+        """Add the pose (4, 4) of a frame, and its moment if it is known."""
+        self._moment = moment
         if self.pose is not None:
             self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self.pose[:3, 3]))
             # about the vertical: a robot that shakes does not turn
@@ -184,7 +184,7 @@ class OdometryTracker:
 
     def set_keyframe(self, T_odom_body: Pose) -> None:
         """Take the newest frame as a keyframe."""
-        self._keyframe = _Mark(T_odom_body, self.travelled, self._turned, self.rates)
+        self._keyframe = _Mark(T_odom_body, self.travelled, self._turned, self._moment)
 
     def since_keyframe(self) -> tuple[float, float]:
         """Return metres driven and radians turned since the newest keyframe."""
@@ -197,7 +197,12 @@ class OdometryTracker:
     def change(self) -> Floats:
         """Return the change (3,) of a motion since the newest keyframe per second of delay, axes of its start."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
-        return np.asarray(motion_jacobian(motion, np.nan_to_num([self._keyframe.rates, self.rates]))[:, 2])
+        return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
+
+    @property
+    def rates(self) -> Floats:
+        """(3,) velocities of the newest frame, as of a Moment; zero where they are not known."""
+        return _rates(self._moment)
 
     @property
     def drift(self) -> Drift:
@@ -245,13 +250,17 @@ class OdometryTracker:
             moved = T_now[:3, 3] - T_before[:3, 3]
             errors = rotate_covariance(now.covariance + propagate(before.covariance, moved), R)
             spread = _OWN_NOISE * errors[np.ix_(_FLAT, _FLAT)] + np.diag(self.drift.variances(driven, turned)[_FLAT])
-            rates = np.array([before.mark.rates, now.mark.rates])
-            step = self._calibration.measure_motion(T_before, T_now, step, spread, rates)
+            moments = before.mark.moment, now.mark.moment
+            step = self._calibration.measure_motion(T_before, T_now, step, spread, moments)
             level = inverse(self._calibration.calibration.T_body_cloud)
             T_before, T_now = before.T_map_cloud @ level, now.T_map_cloud @ level
             self._estimator.add(boxminus(T_now, T_before @ step), noise, driven, turned)
         self._calibration.measure_attitude(now.T_map_cloud, now.mark.T_odom_body, tilt_variance(now.covariance))
         self._registered = now
+
+
+def _rates(moment: Moment | None) -> Floats:
+    return np.zeros(3) if moment is None else np.nan_to_num(moment.rates)
 
 
 class ScanBuffer:

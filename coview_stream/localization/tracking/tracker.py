@@ -76,7 +76,7 @@ class Tracker:
 
     def add_scan(self, scan: RawScan) -> None:
         """Add a frame: its points, one per voxel, and its odometry."""
-        self.odometry.add_pose(scan.T_odom_body, scan.rates)
+        self.odometry.add_pose(scan.T_odom_body, scan.moment)
         self._scans.add(scan, self.odometry.travelled)
         self._unregistered += 1
 
@@ -212,20 +212,21 @@ class Tracker:
         belief = self.belief
         here = self.T_map_odom @ last
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
-        return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
+        drifted = self.odometry.drift.covariance(*self.odometry.since_keyframe())
+        return np.asarray(carried + drifted + self._calibration.calibration.extrapolation)
 
-    def reported_covariance(self) -> Floats:
+    def reported_covariance(self, mount_and_clock: bool = True) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
         Sum of the cloud's by the graph and by odometry since, the error that all registrations share, the tilt that
-        trembles, and errors of mount, clock and ground.
+        trembles, the ground's, and, unless they are left out, errors of mount and clock.
         """
-        R = self.T_map_odom[:3, :3] if self.odometry.pose is None else (self.T_map_odom @ self.odometry.pose)[:3, :3]
-        calibration = self._calibration.calibration.pose_covariance(R, np.nan_to_num(self.odometry.rates))
-        repeated = self._shared_error.covariance + self.odometry.tremble
-        covariance = self.predicted_covariance() + repeated + calibration
-        covariance[5, 5] += self.change.variance + self.ground.sigma**2
-        return swap_rotation_translation(covariance)
+        total = self.predicted_covariance() + self._shared_error.covariance + self.odometry.tremble
+        total[5, 5] += self.change.variance + self.ground.sigma**2
+        if mount_and_clock:
+            R = (self.T_map_odom if self.odometry.pose is None else self.T_map_odom @ self.odometry.pose)[:3, :3]
+            total += self._calibration.calibration.pose_covariance(R, self.odometry.rates)
+        return swap_rotation_translation(total)
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
@@ -250,6 +251,7 @@ class Tracker:
         change = self.odometry.change()
         change[:2] = R[:2, :2] @ change[:2]
         spread += calibration.motion_covariance(R @ motion[:3, 3], yaw_of(motion), change)
+        spread += 2.0 * calibration.extrapolation
         level = calibration.T_body_cloud
         self._graph.move(inverse(level) @ motion @ level, spread)
         self.odometry.set_keyframe(T_odom_body)

@@ -1,0 +1,111 @@
+"""Search for the delay between clouds and odometry, by the motions between registrations."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose, inverse
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.odometry_history import OdometryHistory
+
+RESOLUTION = 0.05  # seconds, within which the filter finds a delay
+DELAYS: Floats = RESOLUTION * np.arange(-20.0, 21.0)
+"""Delays that are compared, seconds."""
+_FADES = 100.0  # metres over which evidence for a delay is forgotten, as clocks drift
+_FREEDOM = 4.0  # degrees of freedom of Student's distribution
+_TILT = 2.0  # ratio of a registration's errors of roll and pitch to that of its heading
+
+
+class SeenMotion(NamedTuple):
+    """Registered motion between two clouds.
+
+    Attributes:
+        motion: (4, 4) in the body's axes.
+        begin: stamp of the first cloud, seconds.
+        end: of the second.
+        applied: calibration of that time.
+        noise: (3, 3) covariance of x, y and heading without the calibration's.
+        J: (3, 6) derivatives of x, y and heading by the calibration (eq. C2).
+    """
+
+    motion: Pose
+    begin: float
+    end: float
+    applied: Calibration
+    noise: Floats
+    J: Floats
+
+    @property
+    def spread(self) -> Floats:
+        """(3, 3) covariance with the calibration's, but for the delay."""
+        known = self.applied
+        sigmas = [known.sigma_scale, known.sigma_turn, 0.0, known.sigma_heading, known.sigma_lever, known.sigma_lever]
+        others = self.J * np.array(sigmas)
+        return np.asarray(self.noise + others @ others.T)
+
+
+class DelaySearch:
+    """Search for the delay of the clouds on a grid.
+
+    The filter follows a delay that it nearly knows; here each delay is held against odometry itself at that time, so
+    that a large one is found, and the shaking of the body tells it, too. A motion is judged once odometry has gone on
+    by the largest delay.
+
+    Attributes:
+        evidence: (D,) log-likelihoods of DELAYS, up to a constant.
+    """
+
+    def __init__(self) -> None:
+        self.evidence = np.zeros(len(DELAYS))
+        self._waiting: deque[SeenMotion] = deque(maxlen=30)
+
+    def add(self, seen: SeenMotion) -> None:
+        """Add a motion, to be judged later."""
+        self._waiting.append(seen)
+
+    def judge(self, odometry: OdometryHistory) -> list[tuple[SeenMotion, Pose, Floats]]:
+        """Judge the motions that odometry covers by now.
+
+        Returns:
+            The motions, odometry's (4, 4) at the applied delay, and its velocities (2, 3) at both ends.
+        """
+        judged: list[tuple[SeenMotion, Pose, Floats]] = []
+        while self._waiting and odometry.covers(self._waiting[0].begin, self._waiting[0].end + DELAYS[-1]):
+            seen = self._waiting.popleft()
+            if odometry.covers(seen.begin - DELAYS[-1], seen.end):
+                self._judge(seen, odometry)
+                begin, end = seen.begin - seen.applied.delay, seen.end - seen.applied.delay
+                step = inverse(odometry.at(begin)) @ odometry.at(end)
+                judged.append((seen, step, np.array([odometry.rates(begin), odometry.rates(end)])))
+        return judged
+
+    def _judge(self, seen: SeenMotion, odometry: OdometryHistory) -> None:
+        """Hold a motion against odometry at each delay."""
+        before, after = odometry.all_at(seen.begin - DELAYS), odometry.all_at(seen.end - DELAYS)
+        R = before[:, :3, :3].transpose(0, 2, 1)
+        moved = (1.0 + seen.applied.scale) * np.einsum("dij,dj->di", R, after[:, :3, 3] - before[:, :3, 3])
+        turned = seen.motion[:3, :3] @ (R @ after[:, :3, :3]).transpose(0, 2, 1)
+        twice = turned.transpose(0, 2, 1) - turned  # the rotation, for small ones
+        tilts, heading = 0.5 * np.stack([twice[:, 1, 2], twice[:, 2, 0]], axis=1), 0.5 * twice[:, 0, 1]
+        spread = seen.spread
+        flat = np.column_stack([seen.motion[:2, 3] - moved[:, :2], heading])
+        squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat)
+        shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2])
+        evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM)
+        evidence -= 0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
+        fade = math.exp(-float(np.linalg.norm(seen.motion[:3, 3])) / _FADES)
+        self.evidence = fade * self.evidence + evidence - evidence.max()
+
+    def better_than(self, delay: float, sigma: float, surprise: float) -> float | None:
+        """Return the delay with the most evidence, if it is beyond the applied ``delay`` with its ``sigma``, seconds.
+
+        None if it is not, or not by the log-odds of a ``surprise`` that may be at any place of the grid.
+        """
+        near = np.abs(DELAYS - delay) <= 3.0 * sigma + RESOLUTION
+        best, there = int(self.evidence.argmax()), self.evidence[near].max(initial=-math.inf)
+        return float(DELAYS[best]) if self.evidence[best] - there > surprise + math.log(len(DELAYS)) else None
