@@ -32,6 +32,7 @@ _USUAL = 0.7  # times the usual fit, below which other starts are tried
 _LEARNS = 0.1  # weight of a new fit in the usual one
 _STARTS = 2  # registered of those, the best
 _ALIKE = 0.03  # difference of fits that counting so many points does not resolve (one sigma)
+_STAYS = 0.06  # metres: three sigmas of a motion
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
 _NOISE = np.array([0.02, 0.02, np.radians(0.2)])  # sigma of a motion, as of `frame_motion`
 _NOISE_METRE = np.array([0.01, 0.01, 0.0])  # and per metre of it
@@ -60,8 +61,13 @@ class CloudMotionMeter:
         self._config = config
         self._usual = 0.0
 
-    def measure(self, before: RawScan, now: RawScan, calibration: Calibration) -> CloudMotion | None:
-        """Return the motion between two scans; None where there is too little to register."""
+    def measure(
+        self, before: RawScan, now: RawScan, calibration: Calibration, guess: Floats | None = None
+    ) -> CloudMotion | None:
+        """Return the motion between two scans; None where there is too little to register.
+
+        ``guess`` (3,) is a motion to begin with beside odometry's.
+        """
         here = np.zeros(3)
         target = LocalMap(*surface_points(before.levelled(calibration) - before.position.astype(np.float32)))
         scan = prepare_scan(now.levelled(calibration) - now.position.astype(np.float32), here, self._config)
@@ -73,14 +79,23 @@ class CloudMotionMeter:
         turned = before.T_odom_body[:3, :3] @ now.T_odom_body[:3, :3].T
         none = pose_from(turned, here)
         found = [self._registered(scan, target, odometry)]
+        if guess is not None:
+            turn = guess[2] - planar(before.T_odom_body, now.T_odom_body)[2]
+            shift = rot_z(yaw_of(before.T_odom_body)) @ [guess[0], guess[1], odometry[2, 3]]
+            found.append(self._registered(scan, target, pose_from(rot_z(turn), shift)))
         structured = int(scan.above.sum()) >= _FEWEST
-        if _fit(scan, target, none, _ON_SURFACE) > found[0][2] - _ALIKE:
-            found.append(self._registered(scan, target, none))
+        if _fit(scan, target, none, _ON_SURFACE) > max(fit for *_, fit in found):
+            still = self._registered(scan, target, none)
+            # rings lie on each other where nothing moves, too; but a copy stays where it began
+            if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
+                found.append(still)
         if structured and max(fit for *_, fit in found) < _USUAL * self._usual:
             starts = _starts(odometry, turned)
             fits = np.array([_fit(scan, target, T, _COARSE) for T in starts])
             found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
-        best = max(found, key=lambda each: each[2])
+        best = max(found[1:], key=lambda each: each[2], default=found[0])
+        if best[2] <= found[0][2] + 2.0 * _ALIKE:
+            best = found[0]
         usual = self._usual or best[2]
         if not structured:
             usual = best[2]

@@ -40,6 +40,8 @@ _GROWS_ON = 0.95  # probability that a lag that grows does so in the next step
 LAGS = np.arange(0.0, 3.01, 0.05)
 """Lags of clouds, seconds; the first is none, the last is "as long or longer"."""
 _FASTEST = 0.5  # seconds per second by which a lag grows
+_SLACK = 0.1  # seconds that lags may grow without a hole in the stamps: a turn of a lidar
+_NO_HOLE = 0.05  # probability that they grow by more without one: clouds were dropped before
 FAILS = 0.05
 """Probability that clouds are registered wrongly, where they fit each other as usual."""
 _MAP_FAILS = 0.02  # likewise a verified registration to the map
@@ -80,6 +82,8 @@ class Step:
     fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
     apart: bool = False  # the clouds fit each other much less than usual
     copied: bool = False  # the clouds are the same bytes
+    excess: float = 3.0  # seconds by which the clouds' stamps are farther apart than usual
+    holes: float = 1.0  # share of steps with such an excess
     parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
 
 
@@ -157,6 +161,7 @@ class FaultPosterior:
         pairs = like(between, noise + _grid_spread(o, dt))
         np.fill_diagonal(pairs, like(between.diagonal().T))  # a lag that stays is off by as much at both ends
         pairs[0, 0], pairs[-1, -1] = like(o), max(pairs[-1, -1], like(o, np.diag(_ANYWHERE**2)))
+        pairs = pairs * _stamps_allow(step)
         on, to_steady, to_growing = _lag_rates(dt, come)
         grown = self.growing + np.eye(1, len(LAGS))[0] * good * come
         steady: Floats = self.steady @ (on * pairs) + self.growing @ (to_steady * pairs)
@@ -311,6 +316,17 @@ def _between(before: Floats, now: Floats) -> Floats:
 def _grid_spread(o: Floats, dt: float) -> Floats:
     """Covariance (3, 3) of a motion between lags of the grid, which is as coarse as it is."""
     return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
+
+
+def _stamps_allow(step: Step) -> Floats:
+    """Return the likelihood of the stamps' distances for each pair (L, L) of lags, against no lag.
+
+    A lidar turns at a constant rate. So where clouds become late by a second, their stamps have a hole of a second:
+    the clock has jumped, or they are stamped where they arrive.
+    """
+    longer = LAGS[None] - LAGS[:, None]
+    allowed = longer <= step.excess + _SLACK
+    return np.where(longer <= _SLACK, 1.0, np.where(allowed, (1.0 - _NO_HOLE) / step.holes, _NO_HOLE))
 
 
 def _lag_rates(dt: float, come: float) -> tuple[Floats, Floats, Floats]:

@@ -38,6 +38,7 @@ _LONGEST = 12.0  # metres of a step of which the clouds still show the same
 _RECENT = 3  # frames of odometry of which the velocity is taken
 _HISTORY = 600  # frames of odometry
 _HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
+_HOLES, _HOLES_OVER = 0.02, 100.0  # share of steps with a hole in the stamps, at first; steps that it is measured over
 _APART = 2.0  # times worse than usual: clouds do not fit each other
 _RISK = 1e-3  # of a protection level
 _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
@@ -60,7 +61,7 @@ class Witness:
     def __init__(self, config: RegistrationConfig, estimator: CalibrationEstimator) -> None:
         """Judge with the calibration of ``estimator``, which is told to look for faults of mount and clock."""
         self._estimator = estimator
-        self._accused: RejectionReason | None = None
+        self._decided: RejectionReason | None = None  # of a fault more probable than not
         self._meter = CloudMotionMeter(config)
         self.faults = FaultPosterior()
         self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
@@ -70,6 +71,7 @@ class Witness:
         self._reference: _Frame | None = None
         self._reference_at = np.zeros(3)
         self._calibration = Calibration()
+        self._holes = _HOLES
         self._copied = False  # the newest cloud has the bytes of the one before
 
     def forget_scan(self) -> None:
@@ -119,12 +121,12 @@ class Witness:
 
     def _accusation(self, metres: float, degrees: float) -> Accusation | None:
         """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
-        accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._accused
-        self._accused = None if accused is None else accused.cause
-        if self._accused is not before:
-            if self._accused is RejectionReason.MOUNT:
+        accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._decided
+        self._decided = None if accused is None or accused.probability < 0.5 else accused.cause
+        if self._decided is not before:
+            if self._decided is RejectionReason.MOUNT:
                 self._estimator.widen_mount()
-            elif self._accused is RejectionReason.CLOCK:
+            elif self._decided is RejectionReason.CLOCK:
                 self._estimator.widen_clock()
         return accused
 
@@ -164,20 +166,31 @@ class Witness:
         x, y, yaw = drift.variances(driven, turned)[[3, 4, 2]]
         along, across = calibration.sigma_scale * driven, max(calibration.sigma_heading, _HEADING) * driven
         noise = np.diag(_JITTER**2 + [x + along**2, y + across**2, yaw + (calibration.sigma_turn * driven) ** 2])
+        on_map = None if registered is None else _on_map(before.on_map, registered)
         seen: CloudMotion | None = None
         if driven <= _LONGEST:
-            seen = self._meter.measure(before.scan, now.scan, calibration)
+            guess = on_map.motion if contradicted and on_map is not None else None
+            seen = self._meter.measure(before.scan, now.scan, calibration, guess)
         clouds = None if seen is None else Seen(seen.motion, seen.covariance)
         misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
-        on_map = None if registered is None else _on_map(before.on_map, registered)
         parts = self._parts(seen, before, now, calibration) if contradicted and seen is not None else ()
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
+        excess = self._excess(before.stamp, now.stamp)
+        self._holes += (float(excess > 0.0) - self._holes) / _HOLES_OVER
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
             fails=fails, apart=misfit > _APART, copied=self._copied, parts=parts,
+            excess=excess, holes=self._holes,
         )  # fmt: skip
         self.faults.add(step)
         self._reference, self._reference_at = now, self._path[-1][1]
+
+    def _excess(self, begin: float, end: float) -> float:
+        """Return the seconds by which stamps from ``begin`` to ``end`` are farther apart than usual; 0 within half."""
+        stamps = np.array([at for at, _ in self._path])
+        usual = float(np.median(np.diff(stamps)))
+        excess = end - begin - usual * float(np.count_nonzero((stamps > begin) & (stamps <= end)))
+        return excess if excess > 0.5 * usual else 0.0
 
     def _parts(
         self, seen: CloudMotion, before: _Frame, now: _Frame, calibration: Calibration
