@@ -152,6 +152,13 @@ class CalibrationBelief:
                 self.P[axes, axes] = sigma**2
         self._stand_straight()
 
+    def rescale(self, factor: float, sigma: float) -> None:
+        """See :meth:`CalibrationEstimator.rescale`."""
+        scale = 1.0 + self.applied().scale
+        self.x[_SCALE.axes] = factor * scale - 1.0
+        self.P[_SCALE.axes], self.P[:, _SCALE.axes] = 0.0, 0.0
+        self.P[_SCALE.axes, _SCALE.axes] = (sigma * scale) ** 2
+
     def widen(self, groups: tuple[_Prior, ...]) -> None:
         """Suppose that components have taken a step from their present values, or not."""
         present = self.applied()
@@ -352,6 +359,12 @@ class CalibrationEstimator:
         """Suppose that the clock of clouds or odometry may have taken a step."""
         self._delays = DelaySearch()
         self._widen((_CLOCK,))
+
+    def rescale(self, factor: float, sigma: float) -> None:
+        """Take over a step of odometry's scale by a factor, less or more sure by ``sigma``: no walk is so fast."""
+        self._supposed = None
+        self._known.rescale(factor, sigma)
+        self._apply()
 
     def _widen(self, groups: tuple[_Prior, ...]) -> None:
         self._supposed = None

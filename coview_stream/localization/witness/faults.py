@@ -5,6 +5,7 @@ All three agree where nothing is wrong. A fault makes them disagree in a way of 
 
 * good: l = o; m = l in all cases, as the map sees the same clouds.
 * slip: o is wrong (wheels slip, odometry stands still or jumps), l is right, and smooth, as bodies have inertia.
+* scaled: l = s o along the way, with the heading as it was; l is right.
 * repeated: l = 0, whatever o is.
 * late: l = o at an earlier time. The lag is constant, or grows.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
@@ -19,7 +20,7 @@ algorithm). A lag is a state of its own on a grid; each step begins a hypothesis
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +41,7 @@ _GROWS_ON = 0.95  # probability that a lag that grows does so in the next step
 LAGS = np.arange(0.0, 3.01, 0.05)
 """Lags of clouds, seconds; the first is none, the last is "as long or longer"."""
 _FASTEST = 0.5  # seconds per second by which a lag grows
-_SLACK = 0.1  # seconds that lags may grow without a hole in the stamps: a turn of a lidar
+_SLACK = 0.05  # seconds that lags may grow in a step without a hole in the stamps: half a turn of a lidar
 _NO_HOLE = 0.05  # probability that they grow by more without one: clouds were dropped before
 FAILS = 0.05
 """Probability that clouds are registered wrongly, where they fit each other as usual."""
@@ -57,7 +58,8 @@ _INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleratio
 _COPY = 1e-6  # probability that another cloud has the same bytes
 _BOLT = np.array([0.1, 0.1, math.radians(10.0)])  # sigmas of C where a mount gives way, and of another frame
 _FRAME = np.array([3.0, 3.0, math.radians(3.0)])
-_KEPT = 5  # hypotheses about C
+_SCALES = 1.0  # range of scales of odometry that are out by a fault
+_KEPT = 5  # hypotheses about C, and about a scale
 _TURNED = math.radians(2.0)  # of C, from which it is said to be a turn
 _NEGLIGIBLE = 1e-6  # probability below which a fault has not begun
 
@@ -101,6 +103,20 @@ class _Moved:
         return compose(compose(inverted(self.C), o), self.C), noise + np.diag([*lateral, 0.0]) ** 2
 
 
+@dataclass
+class _Scaled:
+    """Hypothesis that odometry is out of scale by a factor since a step: lidar and poses are right."""
+
+    weight: float
+    scale: float
+    sigma: float
+
+    def expected(self, o: Floats, noise: Floats) -> tuple[Floats, Floats]:
+        """Return the clouds' motion (3,) by odometry's, and its covariance (3, 3)."""
+        along = np.append(o[:2], 0.0) * self.sigma
+        return o * [self.scale, self.scale, 1.0], noise + np.outer(along, along)
+
+
 class Accusation(NamedTuple):
     """A fault that may make poses wrong."""
 
@@ -119,6 +135,7 @@ class FaultPosterior:
     steady: Floats = field(default_factory=lambda: np.eye(1, len(LAGS))[0])  # of each constant lag; the first: good
     growing: Floats = field(default_factory=lambda: np.zeros(len(LAGS)))  # of each lag that grows
     moved: list[_Moved] = field(default_factory=list)
+    scaled: list[_Scaled] = field(default_factory=list)
     _driven: float = 0.0  # metres by odometry since the scan began to be repeated
     _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
@@ -127,6 +144,11 @@ class FaultPosterior:
     def good(self) -> float:
         """Probability that nothing is wrong."""
         return float(self.steady[0])
+
+    @property
+    def odometry(self) -> float:
+        """Probability that odometry is wrong, and the lidar right."""
+        return self.slip + sum(h.weight for h in self.scaled)
 
     def add(self, step: Step) -> None:
         """Move the probabilities over a step (see the module)."""
@@ -178,12 +200,24 @@ class FaultPosterior:
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
         moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
 
-        total = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum() + sum(h.weight for h in moved)
+        # nor does odometry mend its scale
+        scaled = [_Scaled(h.weight * float(like(*h.expected(o, noise))), h.scale, h.sigma) for h in self.scaled]
+        if step.clouds is not None and not stands:
+            scale = float(step.clouds.motion[:2] @ o[:2]) / driven**2
+            sigma = math.sqrt(float(step.clouds.covariance[0, 0] + noise[0, 0])) / driven
+            h = _Scaled(_PER_METRE * driven * (good + slip) * sigma / _SCALES, scale, sigma)
+            h.weight *= float(like(*h.expected(o, noise)))
+            scaled.append(h)
+        scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
+
+        total = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum()
+        total += sum(h.weight for h in moved) + sum(h.weight for h in scaled)
         if not (math.isfinite(total) and total > 0.0):
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
         self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
-        self.moved = [_Moved(h.weight / total, h.C, h.sigmas) for h in moved]
+        self.moved = [replace(h, weight=h.weight / total) for h in moved]
+        self.scaled = [replace(h, weight=h.weight / total) for h in scaled]
         if not stands:
             self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
         self._speed = np.abs(o) / dt
@@ -205,6 +239,16 @@ class FaultPosterior:
                     place[0] = 0.0  # the good state stays good by the new calibration
                 lags[:] = 0.0
                 np.add.at(lags, np.clip(np.round(place), 0, len(LAGS) - 1).astype(np.int64), shares)
+
+    def rescaled(self, risk: float) -> tuple[float, float] | None:
+        """Return the factor by which odometry is out of scale, and its sigma, if that is sure; it is good again then."""
+        share = sum(h.weight for h in self.scaled)
+        if share < 1.0 - risk:
+            return None
+        best = max(self.scaled, key=lambda h: h.weight)
+        self.scaled = []
+        self.steady[0] += share
+        return best.scale, best.sigma
 
     def accusation(self, metres: float, radians: float, risk: float) -> Accusation | None:
         """Return the most probable fault by which poses are off by more than a level, if all together reach a risk."""

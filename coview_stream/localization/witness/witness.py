@@ -61,7 +61,9 @@ class Witness:
     def __init__(self, config: RegistrationConfig, estimator: CalibrationEstimator) -> None:
         """Judge with the calibration of ``estimator``, which is told to look for faults of mount and clock."""
         self._estimator = estimator
-        self._decided: RejectionReason | None = None  # of a fault more probable than not
+        self._decided: RejectionReason | None = (
+            None  # of a fault more probable than a slip, which would be taken for it
+        )
         self._meter = CloudMotionMeter(config)
         self.faults = FaultPosterior()
         self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
@@ -122,7 +124,7 @@ class Witness:
     def _accusation(self, metres: float, degrees: float) -> Accusation | None:
         """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
         accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._decided
-        self._decided = None if accused is None or accused.probability < 0.5 else accused.cause
+        self._decided = None if accused is None or accused.probability < self.faults.odometry else accused.cause
         if self._decided is not before:
             if self._decided is RejectionReason.MOUNT:
                 self._estimator.widen_mount()
@@ -183,6 +185,8 @@ class Witness:
             excess=excess, holes=self._holes,
         )  # fmt: skip
         self.faults.add(step)
+        if (rescaled := self.faults.rescaled(_RISK)) is not None:
+            self._estimator.rescale(*rescaled)
         self._reference, self._reference_at = now, self._path[-1][1]
 
     def _excess(self, begin: float, end: float) -> float:

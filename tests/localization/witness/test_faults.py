@@ -154,10 +154,26 @@ def test_wheels_that_slip_are_no_fault_of_the_lidar(slip):
     assert accused is None
 
 
+@pytest.mark.parametrize("factor", [1.5, 0.7])
+def test_odometry_that_goes_out_of_scale_is_no_fault_of_the_lidar(factor):
+    faults, accused, _ = drive(lambda o, t: (o * [factor, factor, 1.0], o), until=20.0)
+    assert accused is None
+    scale, sigma = faults.rescaled(RISK)
+    assert abs(scale * factor - 1.0) < 4.0 * sigma
+    assert faults.good > 0.99
+
+
 def test_odometry_that_stands_still_is_no_fault_of_the_lidar():
     faults, accused, _ = drive(lambda o, t: (0.0 * o, o), until=15.0)
     assert accused is None
     assert faults.slip > 0.9
+
+
+def test_lag_without_a_hole_in_the_stamps_is_a_slip():
+    def short(o, t):
+        return (o if t >= 10.4 else 1.5 * o), o
+
+    assert drive(short, excess=0.0, holes=0.02)[1] is None
 
 
 def test_clouds_without_a_direction_accuse_nobody():
