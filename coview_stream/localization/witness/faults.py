@@ -241,7 +241,7 @@ class FaultPosterior:
                 np.add.at(lags, np.clip(np.round(place), 0, len(LAGS) - 1).astype(np.int64), shares)
 
     def rescaled(self, risk: float) -> tuple[float, float] | None:
-        """Return the factor by which odometry is out of scale, and its sigma, if that is sure; it is good again then."""
+        """Return the factor by which odometry is out of scale, and its sigma, if that is sure: good again."""
         share = sum(h.weight for h in self.scaled)
         if share < 1.0 - risk:
             return None
