@@ -56,7 +56,7 @@ BENCHMARKS = {
     "accuracy": Benchmark("accuracy.accuracy", "errors, runs localized and false fixes in held-out worlds"),
     "conditions": Benchmark("accuracy.conditions", "real runs: leaning sensor, bad odometry, airborne-like maps"),
     "odometry": Benchmark("accuracy.odometry", "lidar odometry of whole runs: jitter in roll and pitch, lean, steps"),
-    "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
+    "ground": Benchmark("accuracy.ground", "ground that was dug or filled; the ground filter on labelled LAS files"),
     "ablation": Benchmark("accuracy.ablation", "effect of each choice of the method"),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "smooth": Benchmark("tracking.smoothing", "locate --smooth against live poses and the truth"),
