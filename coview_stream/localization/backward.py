@@ -122,12 +122,14 @@ class RecordingLocalizer(Localizer):
         T_map_cloud = match.T_map_body @ self._frames.calibration.T_body_cloud  # before the calibration learns
         ruling = super()._update(match)
         self._slipped |= match.moves_place
-        if ruling.believed and not match.moves_place:
+        if ruling.believed and not (match.moves_place or self._tracker.risen):
+            covariance = match.covariance.copy()
+            covariance[5, 5] += self._tracker.change.variance  # heights that were possible then
             level = self._tracker.protection_level()
             shared = swap_rotation_translation(self._tracker.reported_covariance(mount_and_clock=False))
             shared -= self._tracker.predicted_covariance()
             self.registered = BelievedRegistration(
-                T_map_cloud, match.covariance, shared, level.doubt, self._slipped, self._backward
+                T_map_cloud, covariance, shared, level.doubt, self._slipped, self._backward
             )
             self._slipped = False
         return ruling

@@ -132,7 +132,7 @@ def test_a_blind_stretch_is_bridged_and_its_protection_level_grows(world_map, wa
     blind = [k for k in range(15, 25) if k in found and found[k].kind is PoseKind.BRIDGED]
     assert len(blind) >= 8
     assert not set(blind) & {round((fix.stamp - 100.0) / 0.5) for fix in located.posed}
-    assert found[20].protection.metres > 1.5 * found[30].protection.metres
+    assert found[20].protection.horizontal > 1.5 * found[30].protection.horizontal
     assert_right(located.smoothed, way.T_map_body)
 
 

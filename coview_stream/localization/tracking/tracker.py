@@ -50,6 +50,8 @@ class Tracker:
     Attributes:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
         ground: offset of the site's ground against the survey's.
+        change: ground that was dug or filled since the survey.
+        risen: metres by which the newest registration has put the robot higher, as its ground is not the survey's.
         odometry: metres driven, and drift.
     """
 
@@ -62,6 +64,7 @@ class Tracker:
         self.T_map_odom: Pose = np.eye(4)
         self.ground = GroundOffset()
         self.change = GroundChange(base_map.field)
+        self.risen = 0.0
         self._graph = PoseGraph(config.graph)  # of clouds in the sensor's own axes: independent of the calibration
         self._calibration = calibration
         self.odometry = OdometryTracker(config.tracking, calibration)
@@ -193,13 +196,13 @@ class Tracker:
             self._matcher.dispute.clear()
             self._graph.correct(T_map_cloud, match.covariance)
             self._set_belief(T_odom_body)
-            rise = self._learn(match, T_odom_body[:3, 3])
+            self.risen = self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
-            if rise:  # the ground is not the survey's: a lean that was measured on it was none
+            if self.risen:  # a lean that was measured on ground that is not the survey's was none
                 here = self.belief
                 self._calibration.forget_tilt()
                 self.odometry.forget_registration()
-                T_map_body = pose_from(np.eye(3), [0.0, 0.0, rise]) @ here.T_map_body
+                T_map_body = pose_from(np.eye(3), [0.0, 0.0, self.risen]) @ here.T_map_body
                 self._restart(self._of_cloud(T_map_body), here.covariance + _RISEN, T_odom_body)
             return
         self._scans.keep_newest(0)  # bad frames among the newest must not spoil the next registration too
