@@ -37,6 +37,7 @@ COMMANDS = {
     "dirt": "accuracy --only dirt",
     "peers, tracking": "peers --tracking",
     "conditions beside the paper": "conditions --conditions base --paper",
+    "reliability": "integrity --count 110",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
     "overlap": "conditions --overlaps 5 20 35 50 65 85 "
     "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
