@@ -68,6 +68,10 @@ class DelaySearch:
         """Add a motion, to be judged later."""
         self._waiting.append(seen)
 
+    def forget_motions(self) -> None:
+        """Forget the motions that wait: they are of another mount."""
+        self._waiting.clear()
+
     def judge(self, odometry: OdometryHistory) -> list[tuple[SeenMotion, Pose, Floats]]:
         """Judge the motions that odometry covers by now.
 

@@ -353,6 +353,7 @@ class CalibrationEstimator:
 
     def widen_mount(self) -> None:
         """Suppose that the sensor may have been turned or shifted on the body."""
+        self._delays.forget_motions()
         self._widen(_MOUNT)
 
     def widen_clock(self) -> None:
@@ -379,7 +380,7 @@ class CalibrationEstimator:
         """
         judged = self._delays.judge(self.history)
         for seen, step, rates in judged:
-            if seen.applied.delay < 0.0:
+            if _waits(seen.applied):
                 step[:3, 3] *= 1.0 + seen.applied.scale
                 J = motion_jacobian(step, rates, seen.applied.scale)
                 self._learn_motion(seen.motion, step, J, seen.noise, seen.applied)
@@ -416,7 +417,7 @@ class CalibrationEstimator:
         J = motion_jacobian(step, rates, before.scale)
         if first is not None and last is not None:
             self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
-        if first is None or last is None or before.delay >= 0.0:
+        if first is None or last is None or not _waits(before):
             self._learn_motion(motion, step, J, noise, before)
         now = self.calibration
         moved = J @ (_motion_part(now) - _motion_part(before))
@@ -472,6 +473,11 @@ class CalibrationEstimator:
         self.calibration = self._known.applied()
         if self._supposed is not None:
             self.calibration = mixed(self.calibration, self._supposed.applied(), self._probability)
+
+
+def _waits(applied: Calibration) -> bool:
+    """Return whether odometry is so late that a motion waits for it."""
+    return applied.delay <= -RESOLUTION
 
 
 def _motion_part(calibration: Calibration) -> Floats:

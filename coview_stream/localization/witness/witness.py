@@ -11,7 +11,7 @@ import numpy as np
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
-from coview_stream.geometry.transforms import Points, Pose, inverse, rot_z, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.tracking.map_matching import MapMatch
@@ -115,7 +115,10 @@ class Witness:
         if contradicted or self._is_due():
             self._compare(tracker.odometry.drift, registered, belief, contradicted)
         level = tracker.protection_level()
+        decided = self._decided
         accused = self._accusation(min(level.metres, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
+        if self._decided is not decided:
+            tracker.odometry.forget_registration()  # of another mount or clock
         if accused is None:
             return match
         verdict = replace(match.verdict, cause=accused.cause, reason=accused.sentence)
@@ -185,6 +188,11 @@ class Witness:
             excess=excess, holes=self._holes,
         )  # fmt: skip
         self.faults.add(step)
+        if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None:
+            # nothing else tells the new mount or clock: registrations to the map are not believed meanwhile
+            spread = seen.covariance + np.diag(_JITTER**2 + [x, y, yaw])
+            moments = before.scan.moment, now.scan.moment
+            self._estimator.measure_motion(np.eye(4), _spatial(seen.motion), _spatial(o), spread, moments)
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
             self._estimator.rescale(*rescaled)
         self._reference, self._reference_at = now, self._path[-1][1]
@@ -231,6 +239,11 @@ class Witness:
             velocity = (poses[-1] - poses[-1 - _RECENT]) / (stamps[-1] - stamps[-1 - _RECENT])
             stamps, poses = np.append(stamps, stamps[-1] + 1.0), np.vstack([poses, poses[-1] + velocity])
         return np.stack([np.interp(stamp - LAGS, stamps, column) for column in poses.T], axis=1)
+
+
+def _spatial(motion: Floats) -> Pose:
+    """Return a planar motion (3,) as a pose (4, 4)."""
+    return pose_from(rot_z(float(motion[2])), [motion[0], motion[1], 0.0])
 
 
 def _motion(before: Floats, now: Floats) -> Floats:
