@@ -208,7 +208,7 @@ def lost(world_map, world_drive):
     localizer.hint_pose(world_drive.T_map_body[0])
     k = 5
     while localizer.state is not State.LOST:
-        localizer.step(garbage(), world_drive.T_odom_body[k], 0.5 * k)
+        localizer.step(garbage(k), world_drive.T_odom_body[k], 0.5 * k)
         k += 1
     return localizer, k
 
