@@ -173,3 +173,22 @@ def test_mount_is_said_beyond_the_one_given():
     assert "--mount=180,0,3 " in text[0]
     assert text[1] == "clouds are 0.120 +- 0.004 s later than odometry: corrected"
     assert "odometry is 0.300" in Calibration(delay=-0.3).describe()[0]
+
+
+def test_motions_that_wait_are_forgotten_with_the_mount_that_they_saw():
+    """Where odometry is late a motion waits for it; by then the sensor may have been turned."""
+    for widened in (False, True):
+        estimator = CalibrationEstimator()
+        estimator.learn(Calibration(delay=-0.3), same_run=True)
+        for k in range(40):
+            estimator.history.add(0.1 * k, pose_from(np.eye(3), [0.15 * k, 0.0, 0.0]))
+        step, still = pose_from(np.eye(3), [1.5, 0.0, 0.0]), np.array([1.5, 0.0, 0.0])
+        spread = np.diag([POSITION, POSITION, HEADING]) ** 2
+        estimator.measure_motion(np.eye(4), step, step, spread, (Moment(2.0, still), Moment(3.0, still)))
+        if widened:
+            estimator.widen_mount()
+        before = estimator.calibration.sigma_heading
+        for k in range(40, 50):
+            estimator.history.add(0.1 * k, pose_from(np.eye(3), [0.15 * k, 0.0, 0.0]))
+        estimator.search_delay()
+        assert (estimator.calibration.sigma_heading < 0.99 * before) is not widened
