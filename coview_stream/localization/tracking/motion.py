@@ -233,10 +233,11 @@ class OdometryTracker:
 
     def _learn_unconfirmed(self) -> None:
         if self._unconfirmed is not None:
-            self._learn(self._unconfirmed)
+            self._learn(self._unconfirmed, contradicts=True)
         self._unconfirmed = None
 
-    def _learn(self, now: _Registered) -> None:
+    def _learn(self, now: _Registered, contradicts: bool = False) -> None:
+        """Learn from a registration; the calibration learns nothing from a slip, which is no constant of the robot."""
         before = self._registered
         if before is not None:
             driven, turned = now.mark.travelled - before.mark.travelled, now.mark.turned - before.mark.turned
@@ -251,7 +252,8 @@ class OdometryTracker:
             errors = rotate_covariance(now.covariance + propagate(before.covariance, moved), R)
             spread = _OWN_NOISE * errors[np.ix_(_FLAT, _FLAT)] + np.diag(self.drift.variances(driven, turned)[_FLAT])
             moments = before.mark.moment, now.mark.moment
-            step = self._calibration.measure_motion(T_before, T_now, step, spread, moments)
+            if not contradicts:
+                step = self._calibration.measure_motion(T_before, T_now, step, spread, moments)
             level = inverse(self._calibration.calibration.T_body_cloud)
             T_before, T_now = before.T_map_cloud @ level, now.T_map_cloud @ level
             self._estimator.add(boxminus(T_now, T_before @ step), noise, driven, turned)

@@ -54,12 +54,16 @@ _SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
     (0.4, np.array([0.1, 0.1, math.radians(3.0)]), np.array([0.2, 0.1, 0.0])),  # some of the wheels, to a side
     (0.1, _ANYWHERE, np.zeros(3)),  # odometry jumps
 )
+_ACCELERATIONS = np.array([1.0, 1.0, 0.5])  # m/s^2 and rad/s^2 of wheeled robots, that holes in odometry hide
+_WHOLE = 0.01  # seconds^2: odometry of five frames per second has no holes
 _INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleration of a body, metres and radians per s^2
 _COPY = 1e-6  # probability that another cloud has the same bytes
 _BOLT = np.array([0.1, 0.1, math.radians(10.0)])  # sigmas of C where a mount gives way, and of another frame
 _FRAME = np.array([3.0, 3.0, math.radians(3.0)])
 _SCALES = 1.0  # range of scales of odometry that are out by a fault
 _KEPT = 5  # hypotheses about C, and about a scale
+_EXACT = np.zeros((3, 3))
+_ON_BODY = 2.0  # metres: no mount shifts a sensor farther
 _TURNED = math.radians(2.0)  # of C, from which it is said to be a turn
 _NEGLIGIBLE = 1e-6  # probability below which a fault has not begun
 
@@ -84,6 +88,7 @@ class Step:
     fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
     apart: bool = False  # the clouds fit each other much less than usual
     copied: bool = False  # the clouds are the same bytes
+    unsure: Floats | None = None  # (2, L) seconds^2 by which odometry at these poses misses accelerations in holes
     excess: float = 3.0  # seconds by which the clouds' stamps are farther apart than usual
     holes: float = 1.0  # share of steps with such an excess
     parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
@@ -123,6 +128,7 @@ class Accusation(NamedTuple):
     cause: RejectionReason
     probability: float  # of all such faults
     sentence: str
+    constant: bool = False  # of mount or clock, which the calibration can find
 
 
 @dataclass
@@ -162,9 +168,9 @@ class FaultPosterior:
             """Return the likelihood of the clouds' and the map's motion where this one is expected."""
             return _likelihood(step, motion, spread, _ALONE)
 
-        anything = float(_likelihood(step, o, np.diag(_ANYWHERE**2), _APART))
+        anything = _of_several_places(step)
         kinds = [(share, np.diag((sigmas + metre * driven) ** 2)) for share, sigmas, metre in _SLIP_KINDS]
-        slips = self._smoother(step) * sum(share * _slipped(step, noise + spread) for share, spread in kinds)
+        slips = self._smoother(step) * sum(share * float(like(o, noise + spread)) for share, spread in kinds)
         stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
         copy = like(o) if stands else like(np.zeros(3)) / (_COPY if step.copied else 1.0)
 
@@ -180,9 +186,12 @@ class FaultPosterior:
 
         # lags: every pair of a lag before and one now
         between = _between(step.path_before, step.path_now)
-        pairs = like(between, noise + _grid_spread(o, dt))
-        np.fill_diagonal(pairs, like(between.diagonal().T))  # a lag that stays is off by as much at both ends
-        pairs[0, 0], pairs[-1, -1] = like(o), max(pairs[-1, -1], like(o, np.diag(_ANYWHERE**2)))
+        steady_spread, unsure = noise, _unsure(step)
+        if unsure is not None:
+            steady_spread = noise + unsure[np.arange(len(LAGS)), np.arange(len(LAGS))]
+        pairs = like(between, noise + _grid_spread(o, dt) + (0.0 if unsure is None else unsure))
+        np.fill_diagonal(pairs, like(between.diagonal().T, steady_spread))  # it is off by as much at both ends
+        pairs[0, 0], pairs[-1, -1] = like(o), 0.0
         pairs = pairs * _stamps_allow(step)
         on, to_steady, to_growing = _lag_rates(dt, come)
         grown = self.growing + np.eye(1, len(LAGS))[0] * good * come
@@ -195,8 +204,7 @@ class FaultPosterior:
         if step.clouds is not None:
             C = compose(inverted(o), step.clouds.motion)
             weight = (come + _PER_METRE * driven) * (good + slip) * 0.5 * (_density(C, _BOLT) + _density(C, _FRAME))
-            weight *= _fits(step, _ALONE) * (1.0 - step.fails)
-            weight *= float(_of_map(step, step.clouds.motion, step.clouds.covariance))
+            weight *= float(like(step.clouds.motion, _EXACT)) / float(_normal(np.zeros(3), step.clouds.covariance))
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
         moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
 
@@ -210,8 +218,11 @@ class FaultPosterior:
             scaled.append(h)
         scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
 
-        total = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum()
-        total += sum(h.weight for h in moved) + sum(h.weight for h in scaled)
+        others = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum()
+        others += sum(h.weight for h in moved) + sum(h.weight for h in scaled)
+        longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing: neither gains nor loses
+        steady[-1] += longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
+        total = others + longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         if not (math.isfinite(total) and total > 0.0):
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
@@ -252,32 +263,31 @@ class FaultPosterior:
 
     def accusation(self, metres: float, radians: float, risk: float) -> Accusation | None:
         """Return the most probable fault by which poses are off by more than a level, if all together reach a risk."""
-        wrong: list[tuple[float, RejectionReason, str]] = []
+        wrong: list[Accusation] = []
         if self._driven > metres:
             words = f"the lidar repeats itself: no motion between clouds while odometry drives {self._driven:.1f} m"
-            wrong.append((self.repeated, RejectionReason.REPEATED, words))
-        wrong.append(
-            (self.mixed, RejectionReason.MIXED, "clouds do not fit each other: they are of more than one place")
-        )
+            wrong.append(Accusation(RejectionReason.REPEATED, self.repeated, words))
+        words = "clouds do not fit each other: they are of more than one place"
+        wrong.append(Accusation(RejectionReason.MIXED, self.mixed, words))
         late = self.steady + self.growing
         off = LAGS * float(np.linalg.norm(self._speed[:2])) > metres
         off |= LAGS * self._speed[2] > radians
         if off.any():
             lag, share = float(LAGS[off][late[off].argmax()]), float(late[off].sum())
             grows = " and more and more" if self.growing[off].sum() > 0.5 * share else ""
-            wrong.append((share, RejectionReason.CLOCK, f"clouds are {lag:.1f} s older than their stamps{grows}"))
+            words = f"clouds are {lag:.1f} s older than their stamps{grows}"
+            wrong.append(Accusation(RejectionReason.CLOCK, share, words, True))
         for h in self.moved:
             shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))
             if shift > metres or turn > radians:
                 words = f"clouds jumped by {shift:.1f} m as no body moves"
                 if turn > _TURNED:
                     words = f"the sensor was turned by {math.degrees(turn):.0f} degrees on its mount"
-                wrong.append((h.weight, RejectionReason.MOUNT, words))
-        total = sum(probability for probability, *_ in wrong)
+                wrong.append(Accusation(RejectionReason.MOUNT, h.weight, words, shift < _ON_BODY))
+        total = sum(each.probability for each in wrong)
         if total < risk:
             return None
-        _, cause, sentence = max(wrong, key=lambda each: each[0])
-        return Accusation(cause, total, sentence)
+        return max(wrong, key=lambda each: each.probability)._replace(probability=total)
 
     def _smoother(self, step: Step) -> float:
         """Return how much better the clouds' motion goes on from the step before than odometry's, as a ratio."""
@@ -294,43 +304,46 @@ class FaultPosterior:
 
 
 def _likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floats:
-    """Return the likelihood of a step's clouds and map where a motion (..., 3) with a covariance (3, 3) is expected."""
-    on_map = _of_map(step, motion, spread)
-    if step.clouds is None:
-        return on_map
-    anywhere = _normal(step.clouds.motion - step.odometry.motion, np.diag(_ANYWHERE**2))
-    right = _normal(step.clouds.motion - motion, step.clouds.covariance + spread)
-    return np.asarray(((1.0 - step.fails) * right + step.fails * anywhere) * _fits(step, alone) * on_map)
+    """Return the likelihood of a step's clouds and map if a motion (..., 3) with a covariance (..., 3, 3) is expected.
 
-
-def _fits(step: Step, apart: float) -> float:
-    """Return the likelihood that a step's clouds fit each other as they do, ``apart`` that they do not."""
-    return apart if step.apart else 1.0 - apart
-
-
-def _slipped(step: Step, spread: Floats) -> float:
-    """Return the likelihood of a step's clouds and map where odometry is off by a covariance and the clouds are not."""
-    if step.clouds is None:
-        return float(_likelihood(step, step.odometry.motion, spread, _ALONE))
-    seen, o = step.clouds, step.odometry.motion
-    anywhere = step.fails * _normal(seen.motion - o, np.diag(_ANYWHERE**2)) * _of_map(step, o, spread)
-    right = (1.0 - step.fails) * _normal(seen.motion - o, seen.covariance + spread)
-    return float(_fits(step, _ALONE) * (right * _of_map(step, seen.motion, seen.covariance) + anywhere))
-
-
-def _of_map(step: Step, motion: Floats, spread: Floats) -> Floats:
-    if step.on_map is None:
+    Either registration may be wrong; where both are right they err together by the expected motion's covariance.
+    """
+    seen, on_map, o = step.clouds, step.on_map, step.odometry.motion
+    anywhere = np.diag(_ANYWHERE**2)
+    if seen is None and on_map is None:
         return np.ones(np.shape(motion)[:-1])
-    anywhere = _normal(step.on_map.motion - step.odometry.motion, np.diag(_ANYWHERE**2))
-    right = _normal(step.on_map.motion - motion, step.on_map.covariance + spread)
-    return np.asarray((1.0 - _MAP_FAILS) * right + _MAP_FAILS * anywhere)
+    if seen is None or on_map is None:
+        one, fails = (seen, step.fails) if seen is not None else (on_map, _MAP_FAILS)
+        assert one is not None
+        likely = (1.0 - fails) * _normal(one.motion - motion, one.covariance + spread)
+        likely = likely + fails * _normal(one.motion - o, anywhere)
+    else:
+        L, M = seen.covariance, on_map.covariance
+        gap = on_map.motion - seen.motion
+        gap[2] = wrap_angle(float(gap[2]))
+        gain = L @ np.linalg.inv(L + M)
+        fused = _normal(seen.motion + gain @ gap - motion, L - gain @ L + spread)
+        l_right, l_wrong = _normal(seen.motion - motion, L + spread), _normal(seen.motion - o, anywhere)
+        m_right, m_wrong = _normal(on_map.motion - motion, M + spread), _normal(on_map.motion - o, anywhere)
+        likely = (1.0 - step.fails) * (1.0 - _MAP_FAILS) * _normal(gap, L + M) * fused
+        likely = likely + (1.0 - step.fails) * _MAP_FAILS * l_right * m_wrong
+        likely = likely + step.fails * ((1.0 - _MAP_FAILS) * l_wrong * m_right + _MAP_FAILS * l_wrong * m_wrong)
+    return np.asarray(likely if seen is None else likely * (alone if step.apart else 1.0 - alone))
+
+
+def _of_several_places(step: Step) -> float:
+    """Return the likelihood of a step's clouds and map where each is registered to anything."""
+    likely = 1.0
+    for seen in (step.clouds, step.on_map):
+        likely *= 1.0 if seen is None else float(_normal(seen.motion - step.odometry.motion, np.diag(_ANYWHERE**2)))
+    return likely if step.clouds is None else likely * (_APART if step.apart else 1.0 - _APART)
 
 
 def _normal(gap: Floats, covariance: Floats) -> Floats:
     """Return the density of gaps (..., 3) of planar motions."""
     gap = np.concatenate([gap[..., :2], np.angle(np.exp(1j * gap[..., 2:]))], axis=-1)
-    square = np.einsum("...i,ij,...j", gap, np.linalg.inv(covariance), gap)
-    return np.asarray(np.exp(-0.5 * square) / math.sqrt((2.0 * math.pi) ** 3 * np.linalg.det(covariance)))
+    square = np.einsum("...i,...ij,...j", gap, np.linalg.inv(covariance), gap)
+    return np.asarray(np.exp(-0.5 * square) / np.sqrt((2.0 * math.pi) ** 3 * np.linalg.det(covariance)))
 
 
 def _density(C: Floats, sigmas: Floats) -> float:
@@ -357,6 +370,14 @@ def _between(before: Floats, now: Floats) -> Floats:
     return np.stack([x, y, gap[..., 2]], axis=-1)
 
 
+def _unsure(step: Step) -> Floats | None:
+    """Covariance (L, L, 3, 3) of odometry between each pair of lags, where there are holes in it; None without."""
+    if step.unsure is None or float(step.unsure.max()) < _WHOLE:
+        return None
+    squares = step.unsure[0][:, None] ** 2 + step.unsure[1] ** 2
+    return np.asarray(squares[..., None, None] * np.diag(_ACCELERATIONS**2))
+
+
 def _grid_spread(o: Floats, dt: float) -> Floats:
     """Covariance (3, 3) of a motion between lags of the grid, which is as coarse as it is."""
     return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
@@ -381,7 +402,8 @@ def _lag_rates(dt: float, come: float) -> tuple[Floats, Floats, Floats]:
     n, ends = len(LAGS), 1.0 - math.exp(-_ENDS * dt)
     steady = (1.0 - ends) * np.eye(n)
     steady[1:, 0] = ends
-    steady[0] = come / (n - 1)
+    steady[0] = come / (n - 2)
+    steady[0, -1] = 0.0  # longer ones come by growing
     steady[0, 0] = 1.0 - 2.0 * come
     most = max(1, round(_FASTEST * dt / float(LAGS[1] - LAGS[0])))
     growth = np.triu(np.tri(n, k=most)) / (most + 1)

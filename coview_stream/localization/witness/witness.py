@@ -127,7 +127,8 @@ class Witness:
     def _accusation(self, metres: float, degrees: float) -> Accusation | None:
         """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
         accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._decided
-        self._decided = None if accused is None or accused.probability < self.faults.odometry else accused.cause
+        decided = accused is not None and accused.constant and accused.probability >= self.faults.odometry
+        self._decided = accused.cause if decided and accused is not None else None
         if self._decided is not before:
             if self._decided is RejectionReason.MOUNT:
                 self._estimator.widen_mount()
@@ -185,7 +186,8 @@ class Witness:
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
             fails=fails, apart=misfit > _APART, copied=self._copied, parts=parts,
-            excess=excess, holes=self._holes,
+            unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), excess=excess,
+            holes=self._holes,
         )  # fmt: skip
         self.faults.add(step)
         if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None:
@@ -239,6 +241,13 @@ class Witness:
             velocity = (poses[-1] - poses[-1 - _RECENT]) / (stamps[-1] - stamps[-1 - _RECENT])
             stamps, poses = np.append(stamps, stamps[-1] + 1.0), np.vstack([poses, poses[-1] + velocity])
         return np.stack([np.interp(stamp - LAGS, stamps, column) for column in poses.T], axis=1)
+
+    def _unsure(self, stamp: float) -> Floats:
+        """Return half of the products (L,) of the seconds to the frames of odometry before and after, by LAGS."""
+        stamps = np.array([at for at, _ in self._path])
+        at = np.clip(stamp - LAGS, stamps[0], stamps[-1])
+        after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
+        return np.asarray(0.5 * (at - stamps[after - 1]) * (stamps[after] - at))
 
 
 def _spatial(motion: Floats) -> Pose:

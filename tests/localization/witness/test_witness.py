@@ -1,0 +1,86 @@
+"""The witness on drives through a world: clouds that lie end the poses, and their cause is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.geometry.transforms import inverse, rot_z, rotation_angle
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.state import State
+from coview_stream.localization.tracking.monitor import RejectionReason
+
+BEGIN, DT = 18, 0.2  # frame of the fault; seconds, at two metres per second
+
+
+@pytest.fixture(scope="module")
+def way(scene):
+    """Nineteen metres with a bend, a frame every 0.4 m."""
+    return small_world.record_along(scene, small_world.drive(10), 0.4)
+
+
+def follow(world_map, way, clouds, odometry=None):
+    """Return the fixes from the fault on, and the metres and degrees that the poses among them are off."""
+    localizer, fixes, off = Localizer(world_map), [], []
+    for k, cloud in enumerate(clouds):
+        fix = localizer.step(cloud, (odometry or way.T_odom_body)[k], DT * k)
+        if k >= BEGIN:
+            fixes.append(fix)
+        elif k > 10:
+            assert fix.state is State.TRACKING
+        if k >= BEGIN and fix.T_map_body is not None:
+            gap = inverse(way.T_map_body[k]) @ fix.T_map_body
+            off.append((np.linalg.norm(gap[:3, 3]), np.degrees(rotation_angle(gap))))
+    return fixes, np.array(off).reshape(-1, 2)
+
+
+def causes(fixes):
+    return {fix.evidence.cause for fix in fixes}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_scan_that_is_repeated_ends_the_poses(world_map, way, noise):
+    rng = np.random.default_rng(1)
+    stuck = [(way.clouds[BEGIN] + rng.normal(0, noise, way.clouds[BEGIN].shape)).astype(np.float32) for _ in range(40)]
+    fixes, off = follow(world_map, way, [*way.clouds[:BEGIN], *stuck][: len(way.clouds)])
+    assert RejectionReason.REPEATED in causes(fixes)
+    assert off[:, 0].max(initial=0.0) < 1.5
+    assert all(fix.T_map_body is None for fix in fixes[5:])
+
+
+@pytest.mark.slow
+def test_a_robot_that_stands_is_served(world_map, way):
+    stands = [way.clouds[BEGIN]] * 25
+    odometry = [*way.T_odom_body[:BEGIN], *[way.T_odom_body[BEGIN]] * 25]
+    localizer = Localizer(world_map)
+    for k, cloud in enumerate([*way.clouds[:BEGIN], *stands]):
+        fix = localizer.step(cloud, odometry[k], DT * k)
+        assert fix.state is State.TRACKING or k < 10
+
+
+@pytest.mark.slow
+def test_a_sensor_that_turns_on_its_mount_gives_no_false_pose(world_map, way):
+    turned = [(cloud @ rot_z(np.radians(10.0)).T).astype(np.float32) for cloud in way.clouds[BEGIN:]]
+    fixes, off = follow(world_map, way, [*way.clouds[:BEGIN], *turned])
+    assert RejectionReason.MOUNT in causes(fixes)
+    assert any("turned by 10 degrees" in fix.evidence.reason for fix in fixes)
+    assert off[:, 1].max(initial=0.0) < 5.0
+
+
+@pytest.mark.slow
+def test_clouds_that_jump_end_the_poses(world_map, way):
+    jumped = [cloud + np.float32([0.0, 4.0, 0.0]) for cloud in way.clouds[BEGIN:]]
+    fixes, off = follow(world_map, way, [*way.clouds[:BEGIN], *jumped])
+    assert RejectionReason.MOUNT in causes(fixes)
+    assert off[:, 0].max(initial=0.0) < 3.0
+
+
+@pytest.mark.slow
+def test_clouds_that_become_late_end_the_poses(world_map, way):
+    """By a second: a queue has filled."""
+    late = round(1.0 / DT)
+    fixes, off = follow(world_map, way, [*way.clouds[:BEGIN], *way.clouds[BEGIN - late : -late]])
+    assert RejectionReason.CLOCK in causes(fixes)
+    assert off[:, 0].max(initial=0.0) < 1.5
