@@ -35,10 +35,11 @@ _HEIGHTS = _STEP * np.arange(-40, 41)  # metres above the registered one
 _SHIFTS = 0.2 * np.arange(-17, 18)  # metres at which structure is compared
 _LEAST, _DEEPEST = 0.35, 5.0  # metres: smaller changes are a ground offset; no ground changes by more
 _DEPTH = 1.5  # metres, mean of a change beyond the least
-_SITES = 1e-2  # share of the sites where the robot starts on changed ground
+_SITES = 2e-2  # share of the sites where the robot starts on changed ground
 _BECOMES, _ENDS = 1e-3, 0.03  # probability per metre that changed ground begins, and that it ends: sites are small
 _COPY = 0.1  # per metre: how fast a copy of the survey's ground becomes improbable
 _BROKEN = 5.0  # nats against ground that copies the survey's, but now at another height
+_SURE = 0.9  # probability of a height, within half a metre, to which the robot is moved
 _ANEW = 1e-6  # probability per metre that all this is wrong
 _START = 0.1  # metres, one sigma of a registered height on ground as surveyed
 
@@ -51,7 +52,8 @@ _KEPT_PRIOR = np.array([0.02, 0.03, 0.05, 0.1, 0.3, 0.5])
 _ODDS = 4.0  # most that a patch says against its neighbours, in nats
 _ON_MAP = 0.5  # metres to a map point that a point lies on
 
-# undisturbed sites and real runs: structure never preferred a height metres off by more than 3.4 nats with these
+# structure of undisturbed sites and of one with half of its buildings gone or new preferred no height metres off by
+# more than 4 nats with these
 _STRUCTURE = 0.3  # observations per patch of structure, as of a ground offset
 _SEEN = 10.0  # metres of driving over which the same structure is seen
 _BLUR = 5  # shifts, within which structure from below differs from structure from above
@@ -174,10 +176,10 @@ class GroundChange:
         """Return metres to the probable height, if it is another than the registered one, and count from there."""
         belief = self._belief()
         heights, elsewhere = belief.sum(axis=0), (belief * _ELSEWHERE).sum(axis=0)
-        if elsewhere.sum() <= 0.5:
-            return 0.0
         best = int(np.convolve(elsewhere, np.ones(7), mode="same").argmax())
         mode = slice(max(0, best - 5), best + 6)
+        if elsewhere[mode].sum() <= _SURE:
+            return 0.0
         rise = float(heights[mode] @ _HEIGHTS[mode] / heights[mode].sum())
         self._count_from(h + rise)
         return rise

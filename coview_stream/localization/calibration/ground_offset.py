@@ -29,6 +29,7 @@ _POINTS = 400  # of structure and of ground
 _PATCH = 4.0  # metres: a patch of structure is one observation
 _FEW = 4  # points of a patch; fewer say nothing
 _CHANCE = 0.1  # share of a patch that fits anywhere
+_ANY_HEIGHT = 0.3  # likewise, metres higher or lower
 _NONE = 0.98  # prior probability of none: 0.9 left drives through changed campuses (bench tracking) 0.1 m off in height
 _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
 _VIEWED = 0.07  # metres, one sigma of the height difference of structure seen from below and from above
@@ -123,7 +124,7 @@ def structure_fits(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMa
     if len(structure) < _FEW:
         return None
     shares = _patch_shares(structure, _fits(structure, T_map_source, target, shifts))
-    return np.asarray(np.log(_CHANCE + (1.0 - _CHANCE) * shares).sum(axis=0))
+    return np.asarray(np.log(_ANY_HEIGHT + (1.0 - _ANY_HEIGHT) * shares).sum(axis=0))
 
 
 def _patch_shares(structure: Points, fits: Floats) -> Floats:

@@ -144,7 +144,7 @@ def test_ground_that_comes_back_is_stood_on_again(site):
         T, position = pose_from(np.eye(3), [0.0, 0.0, height]), np.array([0.0, 0.0, 1.5 + drift])
         change.without_changed(scan, T, position, site.target)
         height += change.learn(T, position, site.target, 1.0, 0.004)
-    assert height == pytest.approx(-0.3, abs=0.1)
+    assert height == pytest.approx(-0.3, abs=0.15)
 
 
 def test_heights_of_the_field_are_those_of_the_ground(site):
