@@ -51,7 +51,7 @@ class RegistrationConfig:
     --only registration`` has them together, too, and other values of ``keep`` and ``iterations``.
 
     ``inflation`` is calibrated by ``python -m bench tracking --seeds 5100``, ``shared`` by ``python -m bench
-    covariance`` on kitti04 and simulated towns, and tested on others. The rest is set by hand.
+    covariance`` on kitti04 and simulated towns, with the other real runs in view. The rest is set by hand.
 
     Attributes:
         keep: overlap, the share of the pairs that the last scale keeps, the nearest; the paper keeps 0.6. The scales

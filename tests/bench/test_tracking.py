@@ -229,6 +229,6 @@ def test_a_mean_distance_outside_its_band_does_not_hold(covariance, scale, holds
     found = figures(twist, np.tile(covariance * scale**2, (2000, 1, 1)))
     assert found["mean"] == pytest.approx(6.0 / scale**2, rel=0.05)
     assert found["position"] == pytest.approx(3.0 / scale**2, rel=0.1)
-    row = judge("run", False, "exact", found)
+    row = judge("run", "held out", "exact", found)
     assert row.holds is holds
     assert (BAND[0] <= row.ours <= BAND[1]) is holds
