@@ -201,7 +201,7 @@ def _of_fault(name: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         **{key: worst(key, ended) for key in ("last_s", "last_m")},
         "named": str(len(named)) if runs[0]["to_name"] else NOTHING,
         "named_s": worst("named_s", named),
-        "name": re.sub(r"[|\n]", " ", named[0]["name"])[:80] if named else "",
+        "name": re.sub(r"[|\n]| what the lidar sees.*", "", named[0]["name"])[:80] if named else "",
     }  # fmt: skip
 
 
