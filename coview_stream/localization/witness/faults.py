@@ -31,6 +31,7 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 
 # how often faults come
 _PER_SECOND = 1e-6  # a driver hangs, a clock parts, a second driver starts: once in twelve days of driving
+_PAUSE = 60.0  # seconds that count of a pause: drivers and clocks fail while they run, or when they start again
 _PER_METRE = 1e-6  # a bolt gives way: once in 1000 km
 _FAST = 40.0  # metres per second: no robot is faster, clouds that cannot be registered may be
 _SLIPS = 0.01  # per metre: wheels slip once in 100 m
@@ -161,7 +162,7 @@ class FaultPosterior:
         o, dt = step.odometry.motion, step.seconds
         driven = float(np.linalg.norm(o[:2]))
         noise = step.odometry.covariance
-        come, ends = _PER_SECOND * dt, 1.0 - math.exp(-_ENDS * dt)
+        come, ends = _PER_SECOND * min(dt, _PAUSE), 1.0 - math.exp(-_ENDS * dt)
         good, slip = self.good, self.slip
 
         def like(motion: Floats, spread: Floats = noise) -> Floats:

@@ -176,6 +176,20 @@ def test_lag_without_a_hole_in_the_stamps_is_a_slip():
     assert drive(short, excess=0.0, holes=0.02)[1] is None
 
 
+@pytest.mark.parametrize("pause", [600.0, 1e5, 1e9])
+def test_pause_between_two_frames_accuses_nobody(pause):
+    faults, odometry = FaultPosterior(), Odometry(5.0)
+    step = np.array([SPEED * DT, 0.0, 0.0])
+    for k in range(10):
+        seconds = DT if k != 5 else pause
+        before, now = odometry.move(step)
+        excess = seconds - DT
+        seen = Seen(step, NOISE)
+        faults.add(Step(seconds, seen, seen, seen, before, now, excess=excess, holes=0.02))
+        assert faults.accusation(*LEVEL, RISK) is None
+    assert faults.good > 0.99
+
+
 def test_clouds_without_a_direction_accuse_nobody():
     """In a tunnel the clouds know nothing of the way along it."""
     wide = np.diag([10.0, 0.02, np.radians(0.3)]) ** 2
