@@ -17,7 +17,7 @@ from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, wrap_angle, yaw_of
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan, voxelized
-from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.register import register, registration_covariance
 from coview_stream.localization.registration.surfaces import surface_points
 from coview_stream.localization.witness.conventions import (
     AS_SENT,
@@ -111,7 +111,7 @@ class CloudPairs:
             match = register(scan, start, target, self._config, _SCALES, centre=here)
             if match is None or not match.converged:
                 continue
-            covariance = self._config.inflation**2 * np.linalg.inv(match.information)
+            covariance = registration_covariance(match.information, self._config)  # wide along a corridor
             motions.append((float(np.diag(covariance)[3:5].max()), match.T_map_source))
             at = match.T_map_source[:3, 3]
             if sum(float(np.linalg.norm(T[:3, 3] - at)) < _SAME for _, T in motions) == _ENOUGH:

@@ -62,6 +62,19 @@ def test_a_finding_goes_when_the_sender_is_mended(drive):
 
 
 @pytest.mark.slow
+def test_a_corridor_without_ends_shows_no_motion_along_it():
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-20.0, 20.0, 0.2), np.arange(-2.0, 2.1, 0.2)))
+    floor = np.column_stack([x, y, np.full(len(x), -1.7)])
+    walls = [np.column_stack([x, np.full(len(x), side), y + 0.3]) for side in (-2.1, 2.1)]
+    cloud, conventions = np.concatenate([floor, *walls]).astype(np.float32), Conventions()
+    for k in range(4):
+        T = np.eye(4)
+        T[0, 3] = 1.2 * k
+        conventions.add(cloud, T)
+    assert (conventions.finding, conventions.plausible) == (None, False)
+
+
+@pytest.mark.slow
 def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
     localizer = Localizer(world_map)
     for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):
