@@ -79,9 +79,9 @@ class DelaySearch:
             The motions, odometry's (4, 4) at the applied delay, and its velocities (2, 3) at both ends.
         """
         judged: list[tuple[SeenMotion, Pose, Floats]] = []
-        while self._waiting and odometry.covers(self._waiting[0].begin, self._waiting[0].end + DELAYS[-1]):
+        while self._waiting and odometry.reaches(self._waiting[0].end + DELAYS[-1]):
             seen = self._waiting.popleft()
-            if odometry.covers(seen.begin - DELAYS[-1], seen.end):
+            if odometry.covers(seen.begin - DELAYS[-1], seen.end):  # not after a stop that is longer than the history
                 self._judge(seen, odometry)
                 begin, end = seen.begin - seen.applied.delay, seen.end - seen.applied.delay
                 step = inverse(odometry.at(begin)) @ odometry.at(end)

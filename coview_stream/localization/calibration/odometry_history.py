@@ -81,7 +81,11 @@ class OdometryHistory:
 
     def covers(self, begin: float, end: float) -> bool:
         """Return whether there is odometry from before ``begin`` until after ``end``, seconds."""
-        return bool(self._stamps) and self._stamps[0] <= begin and end <= self._stamps[-1]
+        return bool(self._stamps) and self._stamps[0] <= begin and self.reaches(end)
+
+    def reaches(self, end: float) -> bool:
+        """Return whether there is odometry after ``end``, seconds."""
+        return bool(self._stamps) and end <= self._stamps[-1]
 
     def all_at(self, stamps: Floats) -> Poses:
         """Return the poses (N, 4, 4) at stamps (N,), interpolated, and beyond the ends extrapolated."""

@@ -17,6 +17,7 @@ from coview_stream.localization.calibration.calibration import (
     LEVER_TOLERANCE,
     Calibration,
 )
+from coview_stream.localization.calibration.delay_search import DelaySearch, SeenMotion
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
 from coview_stream.localization.frame import OdometryCorrection
@@ -192,3 +193,14 @@ def test_motions_that_wait_are_forgotten_with_the_mount_that_they_saw():
             estimator.history.add(0.1 * k, pose_from(np.eye(3), [0.15 * k, 0.0, 0.0]))
         estimator.search_delay()
         assert (estimator.calibration.sigma_heading < 0.99 * before) is not widened
+
+
+def test_delay_is_searched_again_after_a_stop_that_is_longer_than_the_history():
+    """The motion that spans the stop is passed over: odometry of its begin is forgotten."""
+    search, history = DelaySearch(), OdometryHistory()
+    for k in range(401):
+        history.add(0.1 * k, pose_from(np.eye(3), [0.1 * max(0, k - 300), 0.0, 0.0]))
+    step = pose_from(np.eye(3), [1.0, 0.0, 0.0])
+    for begin, end in ((0.0, 31.0), (35.0, 36.0)):
+        search.add(SeenMotion(step, begin, end, Calibration(), 1e-4 * np.eye(3), np.zeros((3, 6))))
+    assert [seen.begin for seen, *_ in search.judge(history)] == [35.0]
