@@ -307,7 +307,7 @@ class Localizer:
             self._requests.next_epoch()  # a search may be under way
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
-        self._witness.add(stamp, cloud, frame.scan, T_odom_body)
+        self._witness.add(stamp, frame.cloud, frame.scan, frame.T_odom_raw)
         doubtful = self._frames.conventions.doubtful
         if not searching and not doubtful:
             return frame, None

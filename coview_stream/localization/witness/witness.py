@@ -46,7 +46,6 @@ _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stan
 
 class _Frame(NamedTuple):
     stamp: float
-    cloud: Points
     scan: RawScan
     on_map: Estimate | None = None
 
@@ -74,14 +73,15 @@ class Witness:
         self._reference_at = np.zeros(3)
         self._calibration = Calibration()
         self._holes = _HOLES
-        self._copied = False  # the newest cloud has the bytes of the one before
+        self._cloud: Points | None = None  # the newest
+        self._copied = False  # it has the bytes of the one before
 
     def forget_scan(self) -> None:
         """Compare the next frame with none before it: its scan is about another origin."""
-        self._reference = self._previous = self._newest = None
+        self._reference = self._previous = self._newest = self._cloud = None
 
     def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
-        """Add a frame: its cloud as it came, its scan, and its odometry (4, 4) as it came."""
+        """Add a frame: its cloud (N, 3) as it came (its array may be filled anew), scan, and odometry (4, 4)."""
         calibration = self._estimator.calibration
         pose = np.zeros(3)
         if self._odometry is not None:
@@ -92,9 +92,9 @@ class Witness:
             pose = before + rot_z(before[2]) @ [step[0], step[1], 0.0] + [0.0, 0.0, step[2]]
         self._odometry = T_odom_raw
         self._path.append((stamp, pose))
-        before_cloud = None if self._newest is None else self._newest.cloud
-        self._copied = before_cloud is not None and np.array_equal(before_cloud, cloud)
-        self._previous, self._newest = self._newest, _Frame(stamp, cloud, scan)
+        self._copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
+        self._cloud = cloud.copy()
+        self._previous, self._newest = self._newest, _Frame(stamp, scan)
         if self._reference is None:
             self._reference, self._reference_at = self._newest, pose
 

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 import small_world
 
+from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, rot_z, rotation_angle
+from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.witness.witness import Witness
 
 BEGIN, DT = 18, 0.2  # frame of the fault; seconds, at two metres per second
 
@@ -37,6 +41,16 @@ def follow(world_map, way, clouds, odometry=None):
 
 def causes(fixes):
     return {fix.evidence.cause for fix in fixes}
+
+
+def test_clouds_in_an_array_that_is_filled_anew_are_no_copies():
+    witness, array = Witness(RegistrationConfig(), CalibrationEstimator()), np.zeros((20, 3), dtype=np.float32)
+    copied = []
+    for k in range(4):
+        array[:] = min(k, 2)
+        witness.add(DT * k, array, RawScan(array.copy(), np.eye(4)), np.eye(4))
+        copied.append(witness._copied)
+    assert copied == [False, False, False, True]
 
 
 @pytest.mark.slow
