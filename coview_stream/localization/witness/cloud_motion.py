@@ -90,7 +90,7 @@ class CloudMotionMeter:
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
         if structured and max(fit for *_, fit in found) < _USUAL * self._usual:
-            starts = _starts(odometry, turned)
+            starts = _starts(odometry)
             fits = np.array([_fit(scan, target, T, _COARSE) for T in starts])
             found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
         best = max(found[1:], key=lambda each: each[2], default=found[0])
@@ -134,7 +134,7 @@ def _fit(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float) -> f
     return float((np.abs((gaps * target.normals[nearest[seen]]).sum(axis=1)) < across).sum() / len(points))
 
 
-def _starts(odometry: Pose, turned: Pose) -> Poses:
+def _starts(odometry: Pose) -> Poses:
     """Return motions (K, 4, 4) to try: parts of odometry's, backwards too, turned by all angles, and to all sides."""
     poses = [pose_from(np.eye(3), share * odometry[:3, 3]) for share in (-2.0, -1.0, -0.5, 0.5, 1.5, 2.0)]
     poses += [pose_from(rot_z(np.radians(angle)), odometry[:3, 3]) for angle in range(-175, 181, 5) if angle]
