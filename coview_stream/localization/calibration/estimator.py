@@ -57,8 +57,6 @@ class _Prior(NamedTuple):
 _TILT = _Prior(
     slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03), ("roll", "pitch"), "sigma_tilt"
 )
-TILT_SIGMA = _TILT.wide
-"""Radians: one sigma of the lean of a sensor that is not known."""
 _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4, ("scale",), "sigma_scale")
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4), ("turn",), "sigma_turn")
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))

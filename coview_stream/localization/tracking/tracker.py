@@ -13,7 +13,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, transform, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.calibration.estimator import TILT_SIGMA, CalibrationEstimator
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.calibration.ground_change import GroundChange
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
@@ -294,7 +294,5 @@ class Tracker:
             drift = self.config.tracking.height_drift
             rise = self.change.learn(self.T_map_odom, position, target, driven, drift)
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        covariance = match.covariance.copy()
-        covariance[[0, 1], [0, 1]] += self.change.probability * TILT_SIGMA**2  # ground that was dug is no lean
-        self.odometry.learn(self._of_cloud(match.T_map_body), covariance)
+        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
         return rise
