@@ -187,7 +187,7 @@ class Witness:
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
             fails=fails, apart=misfit > _APART, copied=self._copied, parts=parts,
             unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), excess=excess,
-            holes=self._holes,
+            holes=max(self._holes, 1.0 / _HOLES_OVER),  # so many steps tell no smaller share
         )  # fmt: skip
         self.faults.add(step)
         if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None:

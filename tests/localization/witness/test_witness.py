@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import small_world
 
-from coview_stream.config import RegistrationConfig
-from coview_stream.geometry.transforms import inverse, rot_z, rotation_angle
+from coview_stream.config import RegistrationConfig, TrackingConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
 from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.witness.witness import Witness
 
 BEGIN, DT = 18, 0.2  # frame of the fault; seconds, at two metres per second
@@ -43,14 +44,32 @@ def causes(fixes):
     return {fix.evidence.cause for fix in fixes}
 
 
-def test_clouds_in_an_array_that_is_filled_anew_are_no_copies():
-    witness, array = Witness(RegistrationConfig(), CalibrationEstimator()), np.zeros((20, 3), dtype=np.float32)
-    copied = []
-    for k in range(4):
-        array[:] = min(k, 2)
-        witness.add(DT * k, array, RawScan(array.copy(), np.eye(4)), np.eye(4))
-        copied.append(witness._copied)
-    assert copied == [False, False, False, True]
+def compared(monkeypatch, clouds):
+    """Return the steps that a witness compares: a cloud each metre and second, with too few points to register."""
+    witness, steps, drift = Witness(RegistrationConfig(), CalibrationEstimator()), [], Drift.of(TrackingConfig())
+    monkeypatch.setattr(witness.faults, "add", steps.append)
+    for k, cloud in enumerate(clouds):
+        T = pose_from(np.eye(3), [float(k), 0.0, 0.0])
+        witness.add(float(k), cloud, RawScan(np.zeros((1, 3), dtype=np.float32), T), T)
+        witness.while_searching(drift)
+    return steps
+
+
+def test_clouds_in_an_array_that_is_filled_anew_are_no_copies(monkeypatch):
+    def filled():
+        array = np.zeros((20, 3), dtype=np.float32)
+        for k in range(4):
+            array[:] = min(k, 2)
+            yield array
+
+    assert [step.copied for step in compared(monkeypatch, filled())] == [False, False, True]
+
+
+def test_hours_without_a_hole_in_the_stamps_make_none_impossible(monkeypatch):
+    """Else the first cloud that is dropped would prove that all others are late."""
+    steps = compared(monkeypatch, [np.zeros((1, 3), dtype=np.float32)] * 200)
+    assert len(steps) == 199
+    assert 0.005 < steps[-1].holes < 0.02
 
 
 @pytest.mark.slow
