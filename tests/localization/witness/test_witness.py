@@ -14,6 +14,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.witness.faults import FaultPosterior
 from coview_stream.localization.witness.witness import Witness
 
 BEGIN, DT = 18, 0.2  # frame of the fault; seconds, at two metres per second
@@ -44,30 +45,41 @@ def causes(fixes):
     return {fix.evidence.cause for fix in fixes}
 
 
-def compared(monkeypatch, clouds):
+class Steps(FaultPosterior):
+    """Note of the steps that a witness compares."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps = []
+
+    def add(self, step):
+        self.steps.append(step)
+
+
+def compared(clouds):
     """Return the steps that a witness compares: a cloud each metre and second, with too few points to register."""
-    witness, steps, drift = Witness(RegistrationConfig(), CalibrationEstimator()), [], Drift.of(TrackingConfig())
-    monkeypatch.setattr(witness.faults, "add", steps.append)
+    witness, drift = Witness(RegistrationConfig(), CalibrationEstimator()), Drift.of(TrackingConfig())
+    witness.faults = Steps()
     for k, cloud in enumerate(clouds):
         T = pose_from(np.eye(3), [float(k), 0.0, 0.0])
         witness.add(float(k), cloud, RawScan(np.zeros((1, 3), dtype=np.float32), T), T)
         witness.while_searching(drift)
-    return steps
+    return witness.faults.steps
 
 
-def test_clouds_in_an_array_that_is_filled_anew_are_no_copies(monkeypatch):
+def test_clouds_in_an_array_that_is_filled_anew_are_no_copies():
     def filled():
         array = np.zeros((20, 3), dtype=np.float32)
         for k in range(4):
             array[:] = min(k, 2)
             yield array
 
-    assert [step.copied for step in compared(monkeypatch, filled())] == [False, False, True]
+    assert [step.copied for step in compared(filled())] == [False, False, True]
 
 
-def test_hours_without_a_hole_in_the_stamps_make_none_impossible(monkeypatch):
+def test_hours_without_a_hole_in_the_stamps_make_none_impossible():
     """Else the first cloud that is dropped would prove that all others are late."""
-    steps = compared(monkeypatch, [np.zeros((1, 3), dtype=np.float32)] * 200)
+    steps = compared([np.zeros((1, 3), dtype=np.float32)] * 200)
     assert len(steps) == 199
     assert 0.005 < steps[-1].holes < 0.02
 
