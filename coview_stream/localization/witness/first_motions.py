@@ -208,7 +208,7 @@ class Conventions:
         right = next((odds for odds, reading in weighed if reading is AS_SENT), -math.inf)
         self.plausible = self.plausible or right - odds(AS_SENT, MIRRORED, *ODOMETRY) > 2.0 * SURE
         self.settled = right - odds(AS_SENT) > 2.0 * SURE
-        self.doubtful = not self.plausible and right < 0.0
+        self.doubtful = not self.plausible and right < odds(AS_SENT)
         (best, reading), (second, other) = weighed[:2]
         wrong = float(np.logaddexp.reduce([odds for odds, reading in weighed if reading is not AS_SENT]))
         self.finding = None
