@@ -304,7 +304,7 @@ class Localizer:
         self._tracker.add_scan(frame.scan)
         if (finding := self._frames.conventions.finding) is not None:  # nothing of this sender can be believed
             self._handle(Event.PLACE_GIVEN_UP)
-            self._requests.next_epoch()  # a search may be under way
+            self._requests.begin_anew()  # a search may be under way
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
         self._witness.add(stamp, frame.cloud, frame.scan, frame.T_odom_raw)

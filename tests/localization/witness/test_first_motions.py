@@ -83,3 +83,15 @@ def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
             assert fix.T_map_body is None
             assert fix.evidence.cause is RejectionReason.CONVENTIONS
             assert "y points forward" in fix.evidence.reason
+
+
+@pytest.mark.slow
+def test_nothing_that_was_sent_wrongly_is_searched_once_the_sender_is_mended(world_map, drive):
+    localizer, first = Localizer(world_map), None
+    for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):
+        sent = cloud if k >= 6 else (cloud @ SENT["y points forward"].T).astype(np.float32)
+        request = localizer.add_frame(sent, T, float(k))
+        first = first or request
+        if k >= 6 and request is not None:
+            break
+    assert len(request.submap) < 1.2 * len(first.submap)  # of one frame, as the first
