@@ -55,7 +55,7 @@ def test_calibration_comes_back_with_the_pose(tmp_path, known):
     "wrong",
     [
         *(5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": -0.1}, {"scale": float("nan")}),
-        *({"ground": float("nan")}, {"heading": 4.0}, {"lever_x": 200.0}, {"delay": float("inf")}),
+        *({"ground": float("nan")}, {"heading": 4.0}, {"lever_x": 200.0}, {"delay": 59.0}),
         {"sigma_delay": -1.0},
     ],
 )
