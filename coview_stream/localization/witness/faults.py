@@ -7,7 +7,7 @@ All three agree where nothing is wrong. A fault makes them disagree in a way of 
 * slip: o is wrong (wheels slip, odometry stands still or jumps), l is right, and smooth, as bodies have inertia.
 * scaled: l = s o along the way, with the heading as it was; l is right.
 * repeated: l = 0, whatever o is.
-* late: l = o at an earlier time. The lag is constant, or grows.
+* late: l = o at an earlier time. The lag is constant, or grows: by and by, or steadily.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
   body does, and from then on l = C^-1 o C.
 * mixed: clouds of several places; l is anything, and most clouds do not fit each other.
@@ -123,6 +123,39 @@ class _Scaled:
         return o * [self.scale, self.scale, 1.0], noise + np.outer(along, along)
 
 
+@dataclass
+class _Parting:
+    """Hypothesis that the clouds' clock has parted from odometry's since a step: their lag grows at a constant rate.
+
+    On a straight way at a constant speed it looks as if odometry were out of scale. Turns tell the two apart, and the
+    stamps, which are as far apart as a lidar turns where they are right.
+    """
+
+    weight: float
+    rate: float  # seconds per second
+    sigma: float
+    lag: float  # seconds
+
+    def expected(self, step: Step) -> tuple[Floats, Floats]:
+        """Return the clouds' motion (3,) over a step, and its covariance (3, 3)."""
+        o, later = step.odometry.motion, self.lag + self.rate * step.seconds
+        along = o * self.sigma
+        spread = step.odometry.covariance + np.outer(along, along)
+        if later > LAGS[-1]:  # odometry so long ago is forgotten
+            return o * [1.0 - self.rate, 1.0 - self.rate, 1.0], spread
+        before, now = (
+            np.array([np.interp(lag, LAGS, column) for column in path.T])
+            for path, lag in ((step.path_before, self.lag), (step.path_now, later))
+        )
+        return compose(inverted(before), now), spread
+
+    def after(self, step: Step, likelihood: float) -> _Parting:
+        """Return the hypothesis after a step with a likelihood of its motions."""
+        longer = self.rate * step.seconds
+        weight = self.weight * likelihood * float(_stamps_allow(step, np.array(longer)))
+        return replace(self, weight=weight, lag=self.lag + longer)
+
+
 class Accusation(NamedTuple):
     """A fault that may make poses wrong."""
 
@@ -143,6 +176,7 @@ class FaultPosterior:
     growing: Floats = field(default_factory=lambda: np.zeros(len(LAGS)))  # of each lag that grows
     moved: list[_Moved] = field(default_factory=list)
     scaled: list[_Scaled] = field(default_factory=list)
+    parting: list[_Parting] = field(default_factory=list)
     _driven: float = 0.0  # metres by odometry since the scan began to be repeated
     _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
@@ -193,7 +227,7 @@ class FaultPosterior:
         pairs = like(between, noise + _grid_spread(o, dt) + (0.0 if unsure is None else unsure))
         np.fill_diagonal(pairs, like(between.diagonal().T, steady_spread))  # it is off by as much at both ends
         pairs[0, 0], pairs[-1, -1] = like(o), 0.0
-        pairs = pairs * _stamps_allow(step)
+        pairs = pairs * _stamps_allow(step, LAGS[None] - LAGS[:, None])
         on, to_steady, to_growing = _lag_rates(dt, come)
         grown = self.growing + np.eye(1, len(LAGS))[0] * good * come
         steady: Floats = self.steady @ (on * pairs) + self.growing @ (to_steady * pairs)
@@ -219,8 +253,15 @@ class FaultPosterior:
             scaled.append(h)
         scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
 
+        # and a clock that parts from another goes on so
+        parting = [h.after(step, float(like(*h.expected(step)))) for h in self.parting]
+        if step.clouds is not None and not stands and 0.0 < 1.0 - scale < _FASTEST:
+            new = _Parting(come * (good + slip) * sigma / _FASTEST, 1.0 - scale, sigma, 0.0)
+            parting.append(new.after(step, float(like(*new.expected(step)))))
+        parting = sorted(parting, key=lambda h: -h.weight)[:_KEPT]
+
         others = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum()
-        others += sum(h.weight for h in moved) + sum(h.weight for h in scaled)
+        others += sum(h.weight for h in moved) + sum(h.weight for h in scaled) + sum(h.weight for h in parting)
         longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing: neither gains nor loses
         steady[-1] += longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         total = others + longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
@@ -230,6 +271,7 @@ class FaultPosterior:
         self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
         self.moved = [replace(h, weight=h.weight / total) for h in moved]
         self.scaled = [replace(h, weight=h.weight / total) for h in scaled]
+        self.parting = [replace(h, weight=h.weight / total) for h in parting]
         if not stands:
             self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
         self._speed = np.abs(o) / dt
@@ -244,6 +286,8 @@ class FaultPosterior:
         """
         for h in self.moved:
             h.C = compose(h.C, inverted(D))
+        for parting in self.parting:
+            parting.lag -= delay
         if delay:
             for lags in (self.steady, self.growing):
                 shares, place = lags.copy(), (LAGS - delay) / float(LAGS[1])
@@ -278,6 +322,12 @@ class FaultPosterior:
             grows = " and more and more" if self.growing[off].sum() > 0.5 * share else ""
             words = f"clouds are {lag:.1f} s older than their stamps{grows}"
             wrong.append(Accusation(RejectionReason.CLOCK, share, words, True))
+        speed, turning = float(np.linalg.norm(self._speed[:2])), float(self._speed[2])
+        parted = [h for h in self.parting if abs(h.lag) * speed > metres or abs(h.lag) * turning > radians]
+        if parted:
+            best = max(parted, key=lambda h: h.weight)
+            words = f"clouds are {best.lag:.1f} s older than their stamps and more and more"
+            wrong.append(Accusation(RejectionReason.CLOCK, sum(h.weight for h in parted), words))
         for h in self.moved:
             shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))
             if shift > metres or turn > radians:
@@ -384,13 +434,12 @@ def _grid_spread(o: Floats, dt: float) -> Floats:
     return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
 
 
-def _stamps_allow(step: Step) -> Floats:
-    """Return the likelihood of the stamps' distances for each pair (L, L) of lags, against no lag.
+def _stamps_allow(step: Step, longer: Floats) -> Floats:
+    """Return the likelihood of the stamps' distances if the lag becomes ``longer`` (...) by seconds, against no lag.
 
     A lidar turns at a constant rate. So where clouds become late by a second, their stamps have a hole of a second:
     the clock has jumped, or they are stamped where they arrive.
     """
-    longer = LAGS[None] - LAGS[:, None]
     allowed = longer <= step.excess + _SLACK
     return np.where(longer <= _SLACK, 1.0, np.where(allowed, (1.0 - _NO_HOLE) / step.holes, _NO_HOLE))
 

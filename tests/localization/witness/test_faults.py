@@ -103,6 +103,26 @@ def test_lag_that_grows_is_named_before_it_is_long():
     assert 0.1 * seconds * SPEED < 1.0  # metres that poses are off
 
 
+@pytest.mark.parametrize(("excess", "wrong"), [(0.1 * DT, "clouds"), (0.0, "odometry")])
+def test_on_a_straight_way_the_stamps_tell_a_clock_that_parts_from_odometry_out_of_scale(excess, wrong):
+    """The clouds move by 0.7 of odometry's motion: they fall behind by 0.3 s per second, or odometry is too long."""
+
+    def shorter(o, t):
+        return o, o * [0.7, 1.0, 1.0]
+
+    def straight(t):
+        return np.array([SPEED * t, 0.0, 0.0])
+
+    faults, accused, _ = drive(shorter, way=straight, excess=3.0 * excess, holes=0.05)
+    if wrong == "clouds":
+        assert accused.cause is RejectionReason.CLOCK
+        assert "more and more" in accused.sentence
+        assert faults.rescaled(RISK) is None
+    else:
+        assert accused is None
+        assert faults.rescaled(RISK)[0] == pytest.approx(0.7, abs=0.05)
+
+
 @pytest.mark.parametrize("degrees", [-10.0, 5.0, 90.0])
 def test_sensor_that_turned_on_its_mount_is_named_with_its_angle(degrees):
     C = np.array([0.0, 0.0, np.radians(degrees)])
