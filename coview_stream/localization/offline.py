@@ -60,7 +60,7 @@ class Interruption:
     first: float
     last: float
     frames: int
-    reason: str
+    reason: str  # of most of them
 
     def to_json(self) -> dict[str, Any]:
         """Plain data of ``result.json``."""
@@ -167,18 +167,16 @@ class RunResult:
     @property
     def interruptions(self) -> list[Interruption]:
         """Where poses are missing after the first fix, in order; skipped frames do not count."""
-        out: list[Interruption] = []
+        gaps: list[list[Fix]] = []
         fixed, going_on = False, False
         for fix in self.fixes:
             has = fix.T_map_body is not None
             if fixed and not has:
-                if going_on:
-                    out[-1] = replace(out[-1], last=fix.stamp, frames=out[-1].frames + 1)
-                else:
-                    reason = fix.state.reported if fix.evidence is None else fix.evidence.reason
-                    out.append(Interruption(fix.stamp, fix.stamp, 1, reason))
+                if not going_on:
+                    gaps.append([])
+                gaps[-1].append(fix)
             fixed, going_on = fixed or has, fixed and not has
-        return out
+        return [Interruption(gap[0].stamp, gap[-1].stamp, len(gap), _usual_reason(gap)) for gap in gaps]
 
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
@@ -361,6 +359,13 @@ def summary(located: RunResult) -> str:
 def _trajectory(posed: Sequence[Fix] | Sequence[SmoothedPose]) -> tuple[Floats, Poses]:
     poses = np.array([pose.T_map_body for pose in posed], dtype=np.float64).reshape(-1, 4, 4)
     return np.array([pose.stamp for pose in posed], dtype=np.float64), poses
+
+
+def _usual_reason(gap: Sequence[Fix]) -> str:
+    """Return the newest reason with the cause of most of the frames: at first the cause may not be clear."""
+    reasons = [(fix.state.reported, None) if (e := fix.evidence) is None else (e.reason, e.cause) for fix in gap]
+    cause = Counter(cause for _, cause in reasons).most_common(1)[0][0]
+    return next(reason for reason, other in reversed(reasons) if other is cause)
 
 
 def _interrupted(located: RunResult) -> list[str]:

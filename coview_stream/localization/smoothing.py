@@ -114,9 +114,8 @@ class _Chain:
     measured: dict[int, Pose]  # (4, 4) of their bodies
     driven: Floats  # (N,) metres up to each frame
     spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
-    since_cloud: Poses = field(
-        kw_only=True
-    )  # (N, 4, 4) motion of the body from the cloud's moment, which may be late, to the stamp
+    # (N, 4, 4) motion of the body from the cloud's moment, which may be late, to the stamp
+    since_cloud: Poses = field(kw_only=True)
     rates: Floats = field(kw_only=True)  # (N, 3) velocities of the body, as of a Moment
     calibration: Calibration = field(kw_only=True)
     broken: dict[int, tuple[int, int]] = field(default_factory=dict)

@@ -28,6 +28,7 @@ _LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
 """Least corrections that are reported: radians, factor, radians per metre, metres."""
 _TURNED, _SHIFTED, _LATE = math.radians(1.0), 0.1, 0.02
 """Likewise: radians of heading, metres of lever arm, seconds."""
+_TOLD = 2.0  # sigmas, below which such a correction is not reported
 _MOVED = {
     "sigma_tilt": math.radians(1.0), "sigma_scale": 0.02, "sigma_turn": math.radians(0.02),
     "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
@@ -156,7 +157,10 @@ class Calibration:
         clauses: list[str] = []
         given = mount or Mount()
         beyond = "" if given == Mount() else " beyond its mount"
-        remedy = f"set --mount={given.moved(self.T_body_cloud).option} to silence this"
+        # a remedy without the parts that may be nothing
+        sits = math.hypot(self.lever_x, self.lever_y) >= max(_SHIFTED, _TOLD * self.sigma_lever)
+        mended = self if sits else replace(self, lever_x=0.0, lever_y=0.0)
+        remedy = f"set --mount={given.moved(mended.T_body_cloud).option} to silence this"
         leans = [
             f"{math.degrees(angle):.1f} deg in {name}"
             for name, angle in (("roll", self.roll), ("pitch", self.pitch))
@@ -164,14 +168,14 @@ class Calibration:
         ]
         if leans:
             clauses.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; {remedy}")
-        if abs(self.heading) >= _TURNED:
+        if abs(self.heading) >= max(_TURNED, _TOLD * self.sigma_heading):
             side = "left" if self.heading > 0 else "right"
             angle = f"{abs(math.degrees(self.heading)):.1f} +- {math.degrees(self.sigma_heading):.1f} deg"
             clauses.append(f"sensor is turned {angle} to the {side} on the body{beyond}: corrected; {remedy}")
-        if math.hypot(self.lever_x, self.lever_y) >= _SHIFTED:
+        if sits:
             place = f"{self.lever_x:.2f} m ahead and {self.lever_y:.2f} m left of the body's origin"
             clauses.append(f"sensor sits {place}{beyond}, +- {self.sigma_lever:.2f} m: corrected; {remedy}")
-        if abs(self.delay) >= _LATE:
+        if abs(self.delay) >= max(_LATE, _TOLD * self.sigma_delay):
             late, early = ("clouds", "odometry") if self.delay > 0 else ("odometry", "clouds")
             size = f"{abs(self.delay):.3f} +- {self.sigma_delay:.3f} s"
             clauses.append(f"{late} {'are' if late == 'clouds' else 'is'} {size} later than {early}: corrected")

@@ -31,11 +31,8 @@ _MEMORY = 40.0  # metres over which measured drift is forgotten
 _OUTLIER = 16.0  # variances; a larger slip counts as this, as rates should grow step by step
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
-_TREMBLE, _TREMBLE_COUNT = (
-    float(np.radians(0.03)),
-    5.0,
-)  # of odometry's roll and pitch, before it is measured; it counts as
-_MAX_COUNT = 40.0  # registrations
+_TREMBLE = float(np.radians(0.03))  # of odometry's roll and pitch, before it is measured
+_TREMBLE_COUNT, _MAX_COUNT = 5.0, 40.0  # registrations that this counts as, and that are remembered
 _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
 
 

@@ -60,9 +60,8 @@ class Witness:
     def __init__(self, config: RegistrationConfig, estimator: CalibrationEstimator) -> None:
         """Judge with the calibration of ``estimator``, which is told to look for faults of mount and clock."""
         self._estimator = estimator
-        self._decided: RejectionReason | None = (
-            None  # of a fault more probable than a slip, which would be taken for it
-        )
+        # of a fault more probable than a slip, which would be taken for it
+        self._decided: RejectionReason | None = None
         self._meter = CloudMotionMeter(config)
         self.faults = FaultPosterior()
         self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
