@@ -390,7 +390,13 @@ class CalibrationEstimator:
                 self._apply()
 
     def measure_motion(
-        self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats, moments: Moments = (None, None)
+        self,
+        T_map_before: Pose,
+        T_map_body: Pose,
+        step: Pose,
+        noise: Floats,
+        moments: Moments = (None, None),
+        contradicts: bool = False,
     ) -> Pose:
         """Add the motion between two registrations (eq. C2); return ``step`` corrected by the new calibration.
 
@@ -402,10 +408,11 @@ class CalibrationEstimator:
                 calibration's.
             moments: of both poses; without, the motion does not tell a delay. Where the rates are not known (NaN) it is
                 not used: a robot that begins to move looks as if its clouds were late.
+            contradicts: it is off by far; a slip may be it, so it tells nothing of mount and clock.
         """
         driven = float(np.linalg.norm(step[:3, 3]))
         turned = abs(float(log_so3(step[:3, :3])[2]))
-        first, last = moments
+        first, last = (None, None) if contradicts else moments
         rates = np.zeros((2, 3)) if first is None or last is None else np.array([first.rates, last.rates])
         if (driven < _MIN_STEP and turned < _MIN_TURN) or not np.isfinite(rates).all():
             return step
@@ -413,6 +420,8 @@ class CalibrationEstimator:
             belief.walk(driven)
         motion, before = inverse(T_map_before) @ T_map_body, self.calibration
         J = motion_jacobian(step, rates, before.scale)
+        if contradicts:
+            J[:, 2:] = 0.0
         if first is not None and last is not None:
             self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
         if first is None or last is None or not _waits(before):

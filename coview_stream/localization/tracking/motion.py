@@ -234,7 +234,7 @@ class OdometryTracker:
         self._unconfirmed = None
 
     def _learn(self, now: _Registered, contradicts: bool = False) -> None:
-        """Learn from a registration; the calibration learns nothing from a slip, which is no constant of the robot."""
+        """Learn from a registration, which may contradict odometry by far."""
         before = self._registered
         if before is not None:
             driven, turned = now.mark.travelled - before.mark.travelled, now.mark.turned - before.mark.turned
@@ -249,8 +249,7 @@ class OdometryTracker:
             errors = rotate_covariance(now.covariance + propagate(before.covariance, moved), R)
             spread = _OWN_NOISE * errors[np.ix_(_FLAT, _FLAT)] + np.diag(self.drift.variances(driven, turned)[_FLAT])
             moments = before.mark.moment, now.mark.moment
-            if not contradicts:
-                step = self._calibration.measure_motion(T_before, T_now, step, spread, moments)
+            step = self._calibration.measure_motion(T_before, T_now, step, spread, moments, contradicts)
             level = inverse(self._calibration.calibration.T_body_cloud)
             T_before, T_now = before.T_map_cloud @ level, now.T_map_cloud @ level
             self._estimator.add(boxminus(T_now, T_before @ step), noise, driven, turned)
