@@ -319,4 +319,4 @@ def _as_live(frame: RecordedFrame) -> SmoothedPose:
 
 
 def _within_alert_limit(level: ProtectionLevel) -> bool:
-    return level.metres <= ALERT_METRES and level.degrees <= ALERT_DEGREES
+    return level.horizontal <= ALERT_METRES and level.degrees <= ALERT_DEGREES  # a height may be unknown by metres

@@ -264,7 +264,7 @@ def test_files_mark_each_pose_and_keep_the_live_ones(world_map, way, tmp_path):
     result = json.loads((tmp_path / "result.json").read_text())
     assert [part["kind"] for part in result["smoothed"]] == ["backward", "smoothed"]
     assert {part["kind"]: part["frames"] for part in result["smoothed"]} == kinds
-    assert all(0.0 < part["protection_m"] < 1.0 for part in result["smoothed"])
+    assert all(0.0 < part["protection_m"] < 2.0 for part in result["smoothed"])  # the ground may not be the survey's
     np.testing.assert_allclose(read_tum(tmp_path / "trajectory.tum")[0], [pose.stamp for pose in poses])
     np.testing.assert_allclose(read_tum(tmp_path / "filtered.tum")[0], [fix.stamp for fix in located.posed])
     text = csv(trajectory_of("run", *located.trajectory, None, [pose.kind for pose in poses])).splitlines()

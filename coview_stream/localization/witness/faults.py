@@ -234,12 +234,13 @@ class FaultPosterior:
         growing: Floats = grown @ (to_growing * pairs)
         steady[0] += back - begins * good * float(like(o))
 
-        # a sensor that has been moved stays so
+        # a sensor that has been moved stays so; both witnesses have to see it move, as clouds of bare ground show anything
         moved = [_Moved(h.weight * float(like(*h.expected(o, noise))), h.C, h.sigmas) for h in self.moved]
-        if step.clouds is not None:
+        if step.clouds is not None and step.on_map is not None:
             C = compose(inverted(o), step.clouds.motion)
             weight = (come + _PER_METRE * driven) * (good + slip) * 0.5 * (_density(C, _BOLT) + _density(C, _FRAME))
             weight *= float(like(step.clouds.motion, _EXACT)) / float(_normal(np.zeros(3), step.clouds.covariance))
+            weight *= _at_once(step, step.clouds.covariance + noise)
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
         moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
 
@@ -380,6 +381,16 @@ def _likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Flo
         likely = likely + (1.0 - step.fails) * _MAP_FAILS * l_right * m_wrong
         likely = likely + step.fails * ((1.0 - _MAP_FAILS) * l_wrong * m_right + _MAP_FAILS * l_wrong * m_wrong)
     return np.asarray(likely if seen is None else likely * (alone if step.apart else 1.0 - alone))
+
+
+def _at_once(step: Step, covariance: Floats) -> float:
+    """Return the likelihood that clouds have left odometry's motion at one moment of a step: in one of its parts.
+
+    A body that is carried, or whose wheels slip, leaves it by and by.
+    """
+    gaps = [compose(inverted(odometry), clouds) for _, odometry, clouds in step.parts]
+    squares = [float(gap @ np.linalg.solve(covariance, gap)) for gap in gaps]
+    return math.exp(-0.5 * min(squares, default=0.0))
 
 
 def _of_several_places(step: Step) -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
@@ -178,7 +179,9 @@ class Witness:
             seen = self._meter.measure(before.scan, now.scan, calibration, guess)
         clouds = None if seen is None else Seen(seen.motion, seen.covariance)
         misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
-        parts = self._parts(seen, before, now, calibration) if contradicted and seen is not None else ()
+        parts: tuple[tuple[float, Floats, Floats], ...] = ()
+        if seen is not None and (contradicted or _contradicts(o, noise, seen)):
+            parts = self._parts(seen, before, now, calibration)
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
         excess = self._excess(before.stamp, now.stamp)
         self._holes += (float(excess > 0.0) - self._holes) / _HOLES_OVER
@@ -247,6 +250,12 @@ class Witness:
         at = np.clip(stamp - LAGS, stamps[0], stamps[-1])
         after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
         return np.asarray(0.5 * (at - stamps[after - 1]) * (stamps[after] - at))
+
+
+def _contradicts(o: Floats, noise: Floats, seen: CloudMotion) -> bool:
+    """Return whether the clouds' motion is one that odometry's errors explain once in a thousand."""
+    gap = compose(inverted(o), seen.motion)
+    return float(gap @ np.linalg.solve(noise + seen.covariance, gap)) > float(chdtri(3, _RISK))
 
 
 def _spatial(motion: Floats) -> Pose:
