@@ -234,7 +234,7 @@ class FaultPosterior:
         growing: Floats = grown @ (to_growing * pairs)
         steady[0] += back - begins * good * float(like(o))
 
-        # a sensor that has been moved stays so; both witnesses have to see it move, as clouds of bare ground show anything
+        # a sensor that has been moved stays so; the map has to see it move, too, as clouds of bare ground show anything
         moved = [_Moved(h.weight * float(like(*h.expected(o, noise))), h.C, h.sigmas) for h in self.moved]
         if step.clouds is not None and step.on_map is not None:
             C = compose(inverted(o), step.clouds.motion)
