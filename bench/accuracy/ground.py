@@ -13,6 +13,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -111,7 +112,7 @@ def _changed(asked: Namespace) -> Iterator[Row]:
             site = BaseMap.build(Path(scratch) / "base.laz")
         for case, change in list(CASES.items())[:: 4 if asked.quick else 1]:
             way = level[:, :2, 3]
-            risen = lambda x, y, change=change, way=way: change(x, y, way)  # noqa: E731
+            risen = partial(change, way=way)
             present = replace(now, ground=scene.site.mesh(risen), built=_without(now.built, scene, gone))
             truth = level.copy()
             truth[:, 2, 3] += risen(way[:, 0], way[:, 1])
