@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|kiss-icp",
         help="odometry of the run, of a file, or made of the clouds (auto)",
     )
-    add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic")
+    add_shared(parser, "--gravity", "--mount", "--cloud-delay", "--cloud-topic", "--odometry-topic")
     parser.add_argument(
         "--export", metavar="A,B", help="also trajectory.csv, .kitti, .geojson or .gpx: csv,kitti,geojson,gpx"
     )
@@ -55,6 +56,9 @@ def run(args: argparse.Namespace) -> int:
     mount = mount_of(args)
     guess = initial_guess(args.initial, args.within)
     lidar_options = lidar_config(args.odometry, args.gravity)
+    config = LocalizerConfig(
+        acceptance=acceptance, sensor_leans=lidar_options is None, cloud_delay=args.cloud_delay or 0.0
+    )
     lidar = None if lidar_options is None else LidarOdometry(lidar_options)  # now: its library may be missing
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
@@ -70,9 +74,7 @@ def run(args: argparse.Namespace) -> int:
         recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow, mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
-    config = LocalizerConfig(
-        acceptance=acceptance, reloc=args.reloc if missing is None else "coview", sensor_leans=lidar is None
-    )
+    config = replace(config, reloc=args.reloc if missing is None else "coview")
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown) as bar:
 
         def step(done: int, total: int, fix: Fix | None) -> None:

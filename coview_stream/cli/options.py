@@ -184,6 +184,11 @@ SHARED: dict[str, dict[str, Any]] = {
         "metavar": "R,P,Y[,X,Y,Z]",
         "help": "pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down",
     },
+    "--cloud-delay": {
+        "type": float,
+        "metavar": "S",
+        "help": "seconds that clouds are stamped later than odometry, if known; negative: odometry is late (0)",
+    },
     "--verify-key": {
         "type": Path,
         "metavar": "NAME.pub",

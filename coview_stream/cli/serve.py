@@ -74,6 +74,7 @@ _DEFAULTS = {
 _TWICE = {
     "risk": ("localizer", "acceptance", "risk"),
     "reloc": ("localizer", "reloc"),
+    "cloud_delay": ("localizer", "cloud_delay"),
     "gravity": ("lidar_odometry", "gravity"),
     **{name: ("node", name) for name in _LIMITS},
 }
@@ -82,7 +83,7 @@ _TWICE = {
 _RARE = (
     *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
     *("pose_encoding", "geo", "gravity", "no_deskew", "reloc", "log_json", "around", "foxglove"),
-    *("record", "rerun", *_LIMITS),
+    *("cloud_delay", "record", "rerun", *_LIMITS),
 )
 """Options that are left to --help-all."""
 
@@ -116,7 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limits = parser.add_argument_group("rates and limits")
     add_fields(limits, NodeConfig, _LIMITS)
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
-    add_shared(parser, "--mount")
+    add_shared(parser, "--mount", "--cloud-delay")
     add_initial(parser, of_robots=True)
     add_shared(parser, "--reloc", "--risk", "--verify-key")
     add_state(parser)
@@ -214,7 +215,8 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         if key in tables[name]:
             raise ConfigError(f"{args.config}: [{name}]: {key} cannot be set here: {remedy}")
     localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
-    localizer = replace(localizer, reloc=args.reloc or localizer.reloc)
+    delay = localizer.cloud_delay if args.cloud_delay is None else args.cloud_delay
+    localizer = replace(localizer, reloc=args.reloc or localizer.reloc, cloud_delay=delay)
     if args.risk is not None:
         localizer = replace(localizer, acceptance=replace(localizer.acceptance, risk=acceptance_config(args.risk).risk))
     node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")

@@ -11,6 +11,9 @@ from coview_stream.config.checks import all_positive, check_types, counts, fract
 MIN_PAIRS = 50
 """Pairs that a registration needs, and points that a crop of the map needs."""
 
+MAX_DELAY = 1.0
+"""Seconds between the clocks of clouds and odometry, the most that are searched for."""
+
 LEAST_RISK = 1e-6
 """Smallest risk: the model of the evidence does not tell smaller errors apart."""
 
@@ -261,6 +264,8 @@ class LocalizerConfig:
             map or installation lack them.
         sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry made of the sensor's
             own clouds, whose frame leans with the sensor.
+        cloud_delay: seconds that clouds are stamped later than odometry, from -1 to 1, if known: estimated from there.
+            Negative where odometry is late.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -272,8 +277,12 @@ class LocalizerConfig:
     learned: LearnedConfig = field(default_factory=LearnedConfig)
     reloc: Reloc = "auto"
     sensor_leans: bool = True
+    cloud_delay: float = 0.0
 
     def __post_init__(self) -> None:
         check_types(self)
+        require(abs(self.cloud_delay) <= MAX_DELAY, self, "cloud_delay", "seconds, from -1 to 1")
+        own_clock = self.sensor_leans or not self.cloud_delay
+        require(own_clock, self, "cloud_delay", "0 where odometry is made of the clouds: it has their clock")
         known = get_args(Reloc)
         require(self.reloc in known, self, "reloc", f"one of {', '.join(known)}")

@@ -60,6 +60,11 @@ class Mount:
         roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
         return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), *T[:3, 3].tolist())
 
+    def to_json(self) -> dict[str, float]:
+        """Plain data, with the unit in each name."""
+        angles = {f"{name}_deg": round(math.degrees(getattr(self, name)), 6) for name in ("roll", "pitch", "yaw")}
+        return angles | {f"{name}_m": getattr(self, name) for name in ("x", "y", "z")}
+
     @property
     def option(self) -> str:
         """Text that :func:`parse_mount` reads, to a tenth of a degree and a centimetre."""

@@ -105,8 +105,7 @@ class LocalizedRun:
             roll, pitch, scale, turn, heading=heading, lever_x=lever[0], lever_y=lever[1], delay=delay
         )
         mount = _part(result, "mount")
-        axes = ("roll", "pitch", "yaw", "x", "y", "z")
-        self._run = open_it(pair.run, Mount(**{name: _number(mount, name) for name in axes}) if mount else None)
+        self._run = open_it(pair.run, _mount(mount) if mount else None)
         self._origin = base_map.origin
         self.damaged: set[int] = set()
         self._index, at = _matched(self._run.stamps, stamps)
@@ -206,6 +205,14 @@ def _check_map(pair: RunPair, result: dict[str, Any], base_map: BaseMap) -> None
 def _part(result: dict[str, Any], name: str) -> dict[str, Any]:
     value = result.get(name)
     return value if isinstance(value, dict) else {}
+
+
+def _mount(values: dict[str, Any]) -> Mount:
+    """Read :meth:`Mount.to_json`, also as earlier versions wrote it: radians, names without units."""
+    angles, metres = ("roll", "pitch", "yaw"), ("x", "y", "z")
+    read = {name: math.radians(_number(values, f"{name}_deg")) or _number(values, name) for name in angles}
+    read |= {name: _number(values, f"{name}_m") or _number(values, name) for name in metres}
+    return Mount(**read)
 
 
 def _number(values: dict[str, Any], name: str, otherwise: float = 0.0) -> float:

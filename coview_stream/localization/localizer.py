@@ -281,7 +281,11 @@ class Localizer:
         """Begin with an earlier calibration of this robot, less certain, and go on measuring it.
 
         Ignored while a place is known, and where the present calibration is more certain.
+
+        Raises:
+            InputError: a value is not finite or none of a robot.
         """
+        earlier.require_plausible()
         if self.state.has_place:
             return
         self._frames.estimator.learn(earlier.doubted())

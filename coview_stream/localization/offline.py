@@ -8,7 +8,7 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from coview_stream.geometry.transforms import Poses, pose_from, pose_from_tum
 from coview_stream.localization.backward import RecordedFrame, RecordingLocalizer
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.result import Fix, KeyframeEvidence, calibration_json, calibration_says
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.smoothing import PoseKind, SmoothedPose, smooth_run
 from coview_stream.localization.state import State
@@ -184,13 +184,14 @@ class RunResult:
         ``confidence`` is the first fix's: that of the search that accepted the place.
         """
         last = self.posed[-1] if self.posed else None
+        evidence = self.fixes[-1].evidence if self.fixes else None
         latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
         return {
             "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
-            "calibration": None if self.calibration is None else self.calibration.to_json(self.mount),
-            "mount": None if self.mount is None else asdict(self.mount),  # radians, metres
+            "calibration": calibration_json(self.calibration, evidence, self.mount),
+            "mount": None if self.mount is None else self.mount.to_json(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "confidence": None if self.first is None else self.first.confidence,
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
@@ -343,7 +344,8 @@ def summary(located: RunResult) -> str:
             counts = Counter(pose.kind for pose in located.smoothed)
             lines.append(f"{'smoothed':<18} {', '.join(f'{counts[kind]} {_KINDS[kind]}' for kind in PoseKind)}")
         if located.calibration is not None:
-            lines.extend(f"{'calibration':<18} {clause}" for clause in located.calibration.describe(located.mount))
+            says = calibration_says(located.calibration, located.fixes[-1].evidence, located.mount)
+            lines.extend(f"{'calibration':<18} {clause}" for clause in says)
     elif located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
     if located.smoothed is not None and not posed:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, one_in, protection_level
 from coview_stream.geometry.transforms import (
@@ -21,7 +22,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 from coview_stream.localization.state import State
-from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.monitor import FAULTS, RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 
 _SHARES = tuple(f.name for f in fields(Evidence))
@@ -98,6 +99,22 @@ class KeyframeEvidence:
             confidence=data.get("confidence"),
             by_chance=data.get("by_chance"),
         )
+
+
+def calibration_says(
+    calibration: Calibration, evidence: KeyframeEvidence | None, mount: Mount | None = None
+) -> list[str]:
+    """Return the clauses of a calibration; none while clouds or odometry are at fault, which may have spoilt it."""
+    return [] if evidence is not None and evidence.cause in FAULTS else calibration.describe(mount)
+
+
+def calibration_json(
+    calibration: Calibration | None, evidence: KeyframeEvidence | None, mount: Mount | None = None
+) -> dict[str, Any] | None:
+    """Plain data of a calibration, None for none; ``says`` are its clauses beside the newest ``evidence``."""
+    if calibration is None:
+        return None
+    return calibration.to_json() | {"says": calibration_says(calibration, evidence, mount)}
 
 
 def _number(value: float | None, form: str) -> float | None:
@@ -195,7 +212,7 @@ class Fix:
             "protection_level": None if self.protection is None else self.protection.to_json(),
             "T_map_odom": None if self.T_map_odom is None else self.T_map_odom.tolist(),
             "evidence": None if self.evidence is None else self.evidence.to_json(),
-            "calibration": None if self.calibration is None else self.calibration.to_json(),
+            "calibration": calibration_json(self.calibration, self.evidence),
         }
 
     def __repr__(self) -> str:

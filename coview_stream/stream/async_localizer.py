@@ -196,7 +196,7 @@ class AsyncLocalizer:
         """Begin with an earlier calibration of this robot; as ``Localizer.hint_calibration``."""
         self._check_usable()
         with self._mailbox.changed:
-            self._mailbox.earlier = earlier
+            self._mailbox.earlier = earlier.require_plausible()
 
     def close(self) -> None:
         """End the processes; a second call does nothing."""

@@ -100,8 +100,9 @@ def test_a_run_that_was_not_localized_is_refused(world_run, world_map, tmp_path)
         LocalizedRun(parse_pair(f"{world_run}:{tmp_path}"), world_map, opened)
 
 
-def test_mount_and_lean_of_the_results_are_applied(world_run, world_drive, world_map, results):
-    told = {"map_sha256": "", "mount": {"yaw": float(np.radians(90.0)), "z": 1.0}, "calibration": {"roll_deg": 180.0}}
+@pytest.mark.parametrize("mount", [{"yaw_deg": 90.0, "z_m": 1.0}, {"yaw": float(np.radians(90.0)), "z": 1.0}])
+def test_mount_and_lean_of_the_results_are_applied(world_run, world_drive, world_map, results, mount):
+    told = {"map_sha256": "", "mount": mount, "calibration": {"roll_deg": 180.0}}
     (results / "result.json").write_text(json.dumps(told))
     with pytest.warns(UserWarning, match="which map"):
         run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)

@@ -19,6 +19,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.offline import RunResult, locate, summary, write
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.recordings.open_run import open_run
 
 
@@ -96,8 +97,19 @@ def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(worl
     assert searching.to_json(world_map)["calibration"]["pitch_deg"] == 2.9
     nothing = RunResult(1, []).to_json(world_map)
     assert nothing["calibration"] is nothing["mount"] is None
-    mounted = RunResult(1, [], mount=Mount(yaw=0.5, x=1.0)).to_json(world_map)
-    assert mounted["mount"]["yaw"] == 0.5
+    mounted = RunResult(1, [], mount=Mount(yaw=np.radians(30.0), x=1.0)).to_json(world_map)["mount"]
+    assert mounted == {"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 30.0, "x_m": 1.0, "y_m": 0, "z_m": 0}
+
+
+def test_calibration_is_silent_beside_a_fault_that_may_have_spoilt_it(world_map):
+    late = Calibration(delay=0.3, sigma_delay=0.01)
+    for cause, count in ((RejectionReason.MIXED, 0), (RejectionReason.FITNESS, 1)):
+        evidence = KeyframeEvidence(1.0, State.DOUBTED, "the sentence of the cause", cause=cause)
+        posed = Fix(0.0, State.TRACKING, np.eye(4), np.eye(4), np.eye(6))
+        found = RunResult(2, [posed, Fix(1.0, State.DOUBTED, evidence=evidence, calibration=late)])
+        assert len(found.to_json(world_map)["calibration"]["says"]) == count
+        assert len(found.fixes[1].to_json()["calibration"]["says"]) == count
+        assert summary(found).count("set --cloud-delay=0.30 to silence this") == count
 
 
 def test_damaged_frames_are_skipped_and_listed(world_map, world_run, world_drive, tmp_path):

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.config.mount import Mount
+from coview_stream.config.localizer import MAX_DELAY
+from coview_stream.config.mount import MAX_LEVER, Mount
+from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import (
     Points,
@@ -36,6 +38,13 @@ _MOVED = {
 """Least sigmas of a calibration from before the node started."""
 HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
 """Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
+_RANGES = {
+    **dict.fromkeys(("roll", "pitch"), math.radians(45.0)), "heading": math.pi,
+    "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 0.5, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
+    **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "ground", "changed"), MAX_LEVER),
+    **dict.fromkeys(("delay", "stated_delay", "sigma_delay"), 2.0 * MAX_DELAY),
+}  # fmt: skip
+"""Largest values of a robot, in the units of :class:`Calibration`; sigmas are not negative."""
 _ACCELERATION, _TURN_ACCELERATION = 0.5, 0.2  # m/s2 and rad/s2 of wheeled robots, one sigma
 
 
@@ -60,6 +69,7 @@ class Calibration:
         sigma_lever: one sigma of each of lever_x and lever_y, metres.
         sigma_delay: one sigma of the delay, seconds.
         changed: metres of the ground around above the survey's, where it was dug or filled since; 0 where it was not.
+        stated_delay: the part of ``delay`` that ``LocalizerConfig.cloud_delay`` states.
     """
 
     roll: float = 0.0
@@ -78,6 +88,17 @@ class Calibration:
     sigma_lever: float = LEVER_TOLERANCE
     sigma_delay: float = CLOCK_TOLERANCE
     changed: float = 0.0
+    stated_delay: float = 0.0
+
+    def require_plausible(self) -> Calibration:
+        """Return it; InputError if a value is not finite or none of a robot."""
+        for name, largest in _RANGES.items():
+            value = getattr(self, name)
+            least = 0.0 if name.startswith("sigma") else -largest
+            if not least <= value <= largest:  # NaN is outside, too
+                allowed = f"{least:.4g} to {largest:.4g} (radians, metres, seconds)"
+                raise InputError(f"calibration: {name} is {value!r}, which is none of a robot; give {allowed}")
+        return self
 
     @cached_property
     def R_tilt(self) -> Floats:
@@ -175,10 +196,11 @@ class Calibration:
         if sits:
             place = f"{self.lever_x:.2f} m ahead and {self.lever_y:.2f} m left of the body's origin"
             clauses.append(f"sensor sits {place}{beyond}, +- {self.sigma_lever:.2f} m: corrected; {remedy}")
-        if abs(self.delay) >= max(_LATE, _TOLD * self.sigma_delay):
-            late, early = ("clouds", "odometry") if self.delay > 0 else ("odometry", "clouds")
+        if abs(self.delay - self.stated_delay) >= max(_LATE, _TOLD * self.sigma_delay):
+            late, early = ("clouds are", "odometry") if self.delay > 0 else ("odometry is", "clouds")
             size = f"{abs(self.delay):.3f} +- {self.sigma_delay:.3f} s"
-            clauses.append(f"{late} {'are' if late == 'clouds' else 'is'} {size} later than {early}: corrected")
+            stated = f"set --cloud-delay={self.delay:.2f} to silence this"
+            clauses.append(f"{late} {size} later than {early}: corrected; {stated}")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"
             clauses.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")
@@ -202,8 +224,8 @@ class Calibration:
         """Return the calibration with wider sigmas: the sensor may have been moved since."""
         return replace(self, **{name: max(getattr(self, name), least) for name, least in _MOVED.items()})
 
-    def to_json(self, mount: Mount | None = None) -> dict[str, Any]:
-        """Plain data: degrees, metres, factors, and the clauses of :meth:`describe`."""
+    def to_json(self) -> dict[str, Any]:
+        """Plain data: degrees, metres, factors."""
         deg = math.degrees
         return {
             "roll_deg": round(deg(self.roll), 2),
@@ -222,7 +244,6 @@ class Calibration:
             "clouds_late_sigma_s": round(self.sigma_delay, 4),
             "ground_offset_m": round(self.ground, 3),
             "changed_ground_m": round(self.changed, 2),
-            "says": self.describe(mount),
         }
 
 

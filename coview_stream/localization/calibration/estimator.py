@@ -123,10 +123,11 @@ class CalibrationBelief:
         P: (10, 10) covariance.
     """
 
-    def __init__(self, sensor_leans: bool) -> None:
-        self.x = np.zeros(SIZE)
+    def __init__(self, sensor_leans: bool, cloud_delay: float = 0.0) -> None:
         self.P = np.diag(_WIDE**2)
         self._centre = np.zeros(SIZE)  # of the narrow priors
+        self._centre[_CLOCK.axes] = self._stated_delay = cloud_delay
+        self.x = self._centre.copy()
         self._exact = {group.sigma: group.exact for group in _GROUPS}
         self._shares = {group.sigma: group.share for group in _GROUPS}
         self._sensor_leans = sensor_leans
@@ -250,7 +251,7 @@ class CalibrationBelief:
                 at += size
                 values |= dict(zip(group.names, (self._centre[group.axes] + mean[own]).tolist(), strict=True))
                 values[group.sigma] = math.sqrt(max(float(variance[own].mean()), 0.0))
-        return Calibration(**values)
+        return Calibration(**values, stated_delay=self._stated_delay)
 
     def _stand_straight(self) -> None:
         """Fix mount and clock at zero for odometry that is made of the clouds: then odometry's gravity leans."""
@@ -295,9 +296,9 @@ class CalibrationEstimator:
         history: odometry as it came.
     """
 
-    def __init__(self, sensor_leans: bool = True) -> None:
-        """Begin with the priors; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
-        self._known = CalibrationBelief(sensor_leans)
+    def __init__(self, sensor_leans: bool = True, cloud_delay: float = 0.0) -> None:
+        """Begin with the priors; ``sensor_leans`` and ``cloud_delay`` as of a ``LocalizerConfig``."""
+        self._known = CalibrationBelief(sensor_leans, cloud_delay)
         self.history, self._delays = OdometryHistory(), DelaySearch()
         self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
         self._probability = 0.0  # that the leading place is right

@@ -62,6 +62,12 @@ class RejectionReason(StrEnum):
     """Clouds of more than one place come in turns, or in one."""
 
 
+FAULTS = (
+    RejectionReason.REPEATED, RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED,
+    RejectionReason.CONVENTIONS,
+)  # fmt: skip
+"""Causes that are faults of clouds or odometry."""
+
 _AT_ONCE = (
     RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT, RejectionReason.REPEATED,
     RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED,

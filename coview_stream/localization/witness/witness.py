@@ -63,6 +63,7 @@ class Witness:
         self._estimator = estimator
         # of a fault more probable than a slip, which would be taken for it
         self._decided: RejectionReason | None = None
+        self._right_until: float | None = None  # stamp at which no fault of the clouds was probable yet
         self._meter = CloudMotionMeter(config)
         self.faults = FaultPosterior()
         self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
@@ -134,7 +135,9 @@ class Witness:
                 self._estimator.widen_mount()
             elif self._decided is RejectionReason.CLOCK:
                 self._estimator.widen_clock()
-        return accused
+        if accused is None or self._right_until is None:
+            return accused
+        return accused._replace(sentence=f"{accused.sentence} (since stamp {self._right_until:.1f})")
 
     def _is_due(self) -> bool:
         if self._reference is None or self._newest is None:
@@ -192,6 +195,8 @@ class Witness:
             holes=max(self._holes, 1.0 / _HOLES_OVER),  # so many steps tell no smaller share
         )  # fmt: skip
         self.faults.add(step)
+        if self.faults.good + self.faults.odometry > 0.5:
+            self._right_until = now.stamp
         if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None:
             # nothing else tells the new mount or clock: registrations to the map are not believed meanwhile
             spread = seen.covariance + np.diag(_JITTER**2 + [x, y, yaw])

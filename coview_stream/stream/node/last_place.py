@@ -23,7 +23,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from coview_stream.config.mount import MAX_LEVER
 from coview_stream.errors import ConfigError, InputError, MessageError
 from coview_stream.geometry.transforms import Pose, is_pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
@@ -38,8 +37,6 @@ VERSION = 1
 _FORMAT = "coview_stream last pose"
 _MAX_BYTES = 65_536  # of a file; ours have 500
 _MAX_NAME = 60  # characters of a robot's name in that of its file
-_MAX_LEAN = float(np.radians(45.0))  # of a sensor against its mount
-_MAX_DELAY = 2.0  # seconds between clouds and odometry: twice as long as any that is searched for
 _MAX_GUESS_BYTES = 4096
 _SIGMAS = 2.0  # of a covariance that are tried around its pose
 _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
@@ -206,21 +203,7 @@ def _read_calibration(plain: Any) -> Calibration | None:
     if not isinstance(plain, dict):
         raise ValueError("its calibration is something else")
     names = {f.name for f in fields(Calibration)}
-    calibration = Calibration(**{name: float(value) for name, value in plain.items() if name in names})
-    c = calibration
-    sigmas = all(0 <= s < 1 for s in (c.sigma_tilt, c.sigma_scale, c.sigma_turn, c.sigma_heading, c.sigma_delay))
-    if not (
-        sigmas
-        and math.hypot(calibration.roll, calibration.pitch) < _MAX_LEAN
-        and abs(calibration.scale) + abs(calibration.turn) < 1
-        and abs(calibration.ground) < 10
-        and abs(calibration.heading) <= math.pi
-        and math.hypot(calibration.lever_x, calibration.lever_y) < MAX_LEVER
-        and 0 <= calibration.sigma_lever < MAX_LEVER
-        and abs(calibration.delay) < _MAX_DELAY
-    ):
-        raise ValueError("its calibration is none of a robot")
-    return calibration
+    return Calibration(**{name: float(value) for name, value in plain.items() if name in names}).require_plausible()
 
 
 # ---- guesses of people: parameters of a query, JSON, or RViz' pose

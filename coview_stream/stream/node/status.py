@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from coview_stream.localization.result import calibration_json
 from coview_stream.localization.state import State
 from coview_stream.messages.json_messages import encode_hypotheses
 from coview_stream.messages.types import Encoded, HypothesesMessage
@@ -146,7 +147,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "uptime_s": round(uptime, 1),
         "last_frame_ns": robot.last_frame_ns,
         "evidence": None if robot.evidence is None else robot.evidence.to_json(),
-        "calibration": None if robot.calibration is None else robot.calibration.to_json(session.config.mount),
+        "calibration": calibration_json(robot.calibration, robot.evidence, session.config.mount),
         "transitions": session.history.to_json(),
         "pose": {
             "rate_hz": rate,

@@ -9,6 +9,7 @@ import pytest
 from small_world import pose_error
 
 from coview_stream.config import LocalizerConfig
+from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import exp_so3, pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, mixed
@@ -118,6 +119,8 @@ def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, wo
     localizer = Localizer(world_map)
     _, fix = follow(localizer, world_drive.clouds, world_drive.T_odom_body, world_drive.T_map_body)
     assert fix.calibration.describe() == []  # this sensor and this odometry are right
+    with pytest.raises(InputError, match="delay is 1000000000"):
+        localizer.hint_calibration(Calibration(delay=1e9))
     localizer.hint_calibration(Calibration(pitch=0.1))
     assert localizer.fix().calibration == fix.calibration
 

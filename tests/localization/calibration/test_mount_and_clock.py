@@ -10,6 +10,7 @@ import pytest
 from se3 import exp_se3
 
 from coview_stream.config.mount import Mount
+from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
 from coview_stream.localization.calibration.calibration import (
     CLOCK_TOLERANCE,
@@ -46,9 +47,10 @@ class Drive(NamedTuple):
     delay: float = 0.0
     mount: np.ndarray = np.eye(4)
 
-    def learnt(self, earlier=None):
+    def learnt(self, earlier=None, stated=0.0):
         """Return the estimator after the drive."""
-        estimator, correction, rng = CalibrationEstimator(), OdometryCorrection(), np.random.default_rng(1)
+        estimator, correction = CalibrationEstimator(cloud_delay=stated), OdometryCorrection()
+        rng = np.random.default_rng(1)
         history = estimator.history
         if earlier is not None:
             estimator.learn(earlier)
@@ -140,6 +142,30 @@ def test_earlier_mount_and_clock_are_kept_until_refuted():
     assert abs(Drive(WINDING).learnt(earlier.doubted()).calibration.delay) < 0.01
 
 
+def test_stated_delay_is_the_prior_and_is_not_remarked():
+    stated = CalibrationEstimator(cloud_delay=0.12).calibration
+    assert stated.delay == pytest.approx(0.12)
+    assert stated.sigma_delay == CalibrationEstimator().calibration.sigma_delay
+    assert stated.describe() == []
+    assert replace(stated, delay=0.2, sigma_delay=0.005).describe() == [
+        "clouds are 0.200 +- 0.005 s later than odometry: corrected; set --cloud-delay=0.20 to silence this"
+    ]
+    own = CalibrationEstimator(sensor_leans=False).calibration
+    assert own.delay == own.stated_delay == 0.0
+
+
+def test_stated_delay_that_is_wrong_is_found_out():
+    estimator = Drive(WINDING, 0.2).learnt(stated=-0.1)
+    assert estimator.calibration.delay == pytest.approx(0.2, abs=0.005)
+
+
+@pytest.mark.parametrize("values", [{"roll": np.nan}, {"lever_x": 1e9}, {"sigma_delay": -0.1}, {"delay": np.inf}])
+def test_values_of_no_robot_are_refused_by_name(values):
+    assert Calibration().doubted().require_plausible() == Calibration().doubted()
+    with pytest.raises(InputError, match=f"calibration: {next(iter(values))} is .* none of a robot; give "):
+        Calibration(**values).require_plausible()
+
+
 def test_odometry_is_read_between_and_beyond_its_samples():
     history, turn = OdometryHistory(), pose_from(rot_z(0.05), rot_z(0.025) @ [0.2, 0.0, 0.0])
     poses = [np.eye(4), turn, turn @ turn]
@@ -172,7 +198,7 @@ def test_mount_is_said_beyond_the_one_given():
     text = turned.describe(Mount(roll=np.pi))
     assert text[0].startswith("sensor is turned 3.0 +- 0.1 deg to the left on the body beyond its mount: corrected")
     assert "--mount=180,0,3 " in text[0]
-    assert text[1] == "clouds are 0.120 +- 0.004 s later than odometry: corrected"
+    assert text[1].startswith("clouds are 0.120 +- 0.004 s later than odometry: corrected; set --cloud-delay=0.12 ")
     assert "odometry is 0.300" in Calibration(delay=-0.3).describe()[0]
 
 
