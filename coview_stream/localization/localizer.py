@@ -346,6 +346,7 @@ class Localizer:
         due = self._tracker.needs_registration(patience)
         waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
+        newest_only |= self._witness.between_registrations(self._tracker)
         if due or waited or newest_only:
             return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
         self._tracker.prefetch_map(frame.T_odom_body)

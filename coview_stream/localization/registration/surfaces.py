@@ -40,23 +40,28 @@ def register_to_cloud(
 
 def surface_points(points: Points) -> tuple[Points, Floats32]:
     """Return the points (K, 3) of a cloud (N, 3) in cubic metres with a flat surface, and their normals (K, 3)."""
+    if not len(points):
+        return points, points.copy()
     cell = np.floor(points / np.float32(_CELL)).astype(np.int64)
-    cell -= cell.min(axis=0) if len(cell) else 0
-    size = cell.max(axis=0) + 1 if len(cell) else np.ones(3, dtype=np.int64)
+    cell -= cell.min(axis=0)
+    size = cell.max(axis=0) + 1
     _, cell_of, count = np.unique(
         (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True, return_counts=True
     )
+    full = count >= _CELL_POINTS
+    rows = np.flatnonzero(full[cell_of])
+    points, cell_of, count = points[rows], (np.cumsum(full) - 1)[cell_of[rows]], count[full]
     exact = points.astype(np.float64)
-    off = exact - (_sums(exact, cell_of, len(count)) / count[:, None])[cell_of]
-    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), cell_of, len(count)) / count[:, None]
-    variances, axes = np.linalg.eigh(moments.reshape(-1, 3, 3))
+    off = exact - np.stack([_means(column, cell_of, count) for column in exact.T], axis=1)[cell_of]
+    moments = np.empty((len(count), 3, 3))
+    for i, j in zip(*np.tril_indices(3), strict=True):  # eigh reads the lower half
+        moments[:, i, j] = _means(off[:, i] * off[:, j], cell_of, count)
+    variances, axes = np.linalg.eigh(moments)
     thin = np.maximum(variances[:, 0], 0.0)
-    flat = (count >= _CELL_POINTS) & (thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin)
-    chosen = flat[cell_of]
-    return points[chosen], axes[:, :, 0][cell_of[chosen]].astype(np.float32)
+    flat = ((thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin))[cell_of]
+    return points[flat], axes[:, :, 0][cell_of[flat]].astype(np.float32)
 
 
-def _sums(values: Floats, cell_of: Ints, count: int) -> Floats:
-    """Return the sums (count, K) of values (N, K) by cell number (N,)."""
-    columns = [np.bincount(cell_of, column, minlength=count) for column in values.T]
-    return np.stack(columns, axis=1) if columns else np.empty((count, 0))
+def _means(values: Floats, cell_of: Ints, count: Ints) -> Floats:
+    """Return the means (C,) of values (N,) by cell number (N,), of cells with ``count`` (C,) values."""
+    return np.asarray(np.bincount(cell_of, values, minlength=len(count)) / count)

@@ -48,7 +48,18 @@ _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stan
 class _Frame(NamedTuple):
     stamp: float
     scan: RawScan
+    path: Floats  # (3,) planar pose by odometry, corrected
+    copied: bool  # it has the bytes of the one before
     on_map: Estimate | None = None
+
+
+class _Waiting(NamedTuple):
+    """A comparison that waits for the next frame, as this one has had a registration to the map."""
+
+    middle: _Frame | None
+    now: _Frame
+    registered: Estimate | None
+    belief: Estimate
 
 
 class Witness:
@@ -71,15 +82,14 @@ class Witness:
         self._newest: _Frame | None = None
         self._previous: _Frame | None = None
         self._reference: _Frame | None = None
-        self._reference_at = np.zeros(3)
+        self._waiting: _Waiting | None = None
         self._calibration = Calibration()
         self._holes = _HOLES
         self._cloud: Points | None = None  # the newest
-        self._copied = False  # it has the bytes of the one before
 
     def forget_scan(self) -> None:
         """Compare the next frame with none before it: its scan is about another origin."""
-        self._reference = self._previous = self._newest = self._cloud = None
+        self._reference = self._previous = self._newest = self._waiting = self._cloud = None
 
     def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
         """Add a frame: its cloud (N, 3) as it came (its array may be filled anew), scan, and odometry (4, 4)."""
@@ -93,37 +103,50 @@ class Witness:
             pose = before + rot_z(before[2]) @ [step[0], step[1], 0.0] + [0.0, 0.0, step[2]]
         self._odometry = T_odom_raw
         self._path.append((stamp, pose))
-        self._copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
+        copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
         self._cloud = cloud.copy()
-        self._previous, self._newest = self._newest, _Frame(stamp, scan)
+        self._previous, self._newest = self._newest, _Frame(stamp, scan, pose, copied)
         if self._reference is None:
-            self._reference, self._reference_at = self._newest, pose
+            self._reference = self._newest
 
     def while_searching(self, drift: Drift) -> Accusation | None:
         """Compare the newest frame if that is due; return the fault that would make a place wrong, if there is one."""
-        if self._is_due():
-            self._compare(drift)
+        self._compare_waiting(drift)
+        if self._newest is not None and self._is_due():
+            self._compare(self._newest, self._previous, drift)
         return self._accusation(0.5 * ALERT_METRES, 0.5 * ALERT_DEGREES)
+
+    def between_registrations(self, tracker: Tracker) -> bool:
+        """Make the comparison that the last registration left; return whether a fault makes poses wrong."""
+        return self._compare_waiting(tracker.odometry.drift) and self._accused(tracker) is not None
 
     def while_tracking(self, match: MapMatch, belief: Estimate | None, tracker: Tracker) -> MapMatch:
         """Compare the newest frame if that is due; return its match, rejected where a fault makes poses wrong.
 
+        Where the match agrees with the pose, the comparison waits for the next frame (:meth:`between_registrations`).
         ``belief`` is of its pose without the match, if there is a pose.
         """
         fits = match.scan is not None and match.verdict.cause in (RejectionReason.VERIFIED, RejectionReason.ODOMETRY)
         registered = Estimate(match.T_map_body, match.covariance) if fits else None
         contradicted = belief is not None and (match.moves_place or not match.verdict.verified)
-        if contradicted or self._is_due():
-            self._compare(tracker.odometry.drift, registered, belief, contradicted)
-        level = tracker.protection_level()
-        decided = self._decided
-        accused = self._accusation(min(level.metres, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
-        if self._decided is not decided:
-            tracker.odometry.forget_registration()  # of another mount or clock
+        due, now = self._is_due(), self._newest
+        if now is not None and due and belief is not None and not contradicted:
+            self._waiting = _Waiting(self._previous, now, registered, belief)
+        elif now is not None and (due or contradicted):
+            self._compare(now, self._previous, tracker.odometry.drift, registered, belief, contradicted)
+        accused = self._accused(tracker)
         if accused is None:
             return match
         verdict = replace(match.verdict, cause=accused.cause, reason=accused.sentence)
         return replace(match, verdict=verdict, moves_place=False)
+
+    def _accused(self, tracker: Tracker) -> Accusation | None:
+        """Return the fault that makes the tracker's poses wrong by more than their level, if there is one."""
+        level, decided = tracker.protection_level(), self._decided
+        accused = self._accusation(min(level.metres, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
+        if self._decided is not decided:
+            tracker.odometry.forget_registration()  # of another mount or clock
+        return accused
 
     def _accusation(self, metres: float, degrees: float) -> Accusation | None:
         """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
@@ -143,28 +166,39 @@ class Witness:
         if self._reference is None or self._newest is None:
             return False
         seconds = self._newest.stamp - self._reference.stamp
-        step = self._path[-1][1] - self._reference_at
+        step = self._newest.path - self._reference.path
         far = float(np.linalg.norm(step[:2]))
         moved = far >= _METRES or abs(step[2]) >= _TURN
         return seconds >= _SECONDS or far >= _FAR or (moved and seconds >= _SHORTEST)
 
+    def _compare_waiting(self, drift: Drift) -> bool:
+        """Make the comparison that waits; return whether there was one."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            self._compare(waiting.now, waiting.middle, drift, waiting.registered, waiting.belief)
+        return waiting is not None
+
     def _compare(
         self,
+        now: _Frame,
+        middle: _Frame | None,
         drift: Drift,
         registered: Estimate | None = None,
         belief: Estimate | None = None,
         contradicted: bool = False,
     ) -> None:
-        """Compare the newest frame with the one of the last comparison.
+        """Compare a frame with the one of the last comparison.
 
         Args:
+            now: the frame.
+            middle: the one before it.
             drift: of odometry.
-            registered: the newest frame's registration to the map, the prior removed, if it fits.
-            belief: of the newest frame's pose without it, if there is a pose.
+            registered: the frame's registration to the map, the prior removed, if it fits.
+            belief: of the frame's pose without it, if there is a pose.
             contradicted: by the map, so the frame just before is compared, too: bodies do not jump.
         """
-        before, now = self._reference, self._newest
-        if before is None or now is None or now.stamp <= before.stamp:
+        before = self._reference
+        if before is None or now.stamp <= before.stamp:
             return
         now = now._replace(on_map=registered or belief)
         calibration = self._follow()
@@ -184,13 +218,13 @@ class Witness:
         misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
         parts: tuple[tuple[float, Floats, Floats], ...] = ()
         if seen is not None and (contradicted or _contradicts(o, noise, seen)):
-            parts = self._parts(seen, before, now, calibration)
+            parts = self._parts(seen, before, middle, now, calibration)
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
         excess = self._excess(before.stamp, now.stamp)
         self._holes += (float(excess > 0.0) - self._holes) / _HOLES_OVER
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
-            fails=fails, apart=misfit > _APART, copied=self._copied, parts=parts,
+            fails=fails, apart=misfit > _APART, copied=now.copied, parts=parts,
             unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), excess=excess,
             holes=max(self._holes, 1.0 / _HOLES_OVER),  # so many steps tell no smaller share
         )  # fmt: skip
@@ -204,7 +238,7 @@ class Witness:
             self._estimator.measure_motion(np.eye(4), _spatial(seen.motion), _spatial(o), spread, moments)
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
             self._estimator.rescale(*rescaled)
-        self._reference, self._reference_at = now, self._path[-1][1]
+        self._reference = now
 
     def _excess(self, begin: float, end: float) -> float:
         """Return the seconds by which stamps from ``begin`` to ``end`` are farther apart than usual; 0 within half."""
@@ -214,10 +248,9 @@ class Witness:
         return excess if excess > 0.5 * usual else 0.0
 
     def _parts(
-        self, seen: CloudMotion, before: _Frame, now: _Frame, calibration: Calibration
+        self, seen: CloudMotion, before: _Frame, middle: _Frame | None, now: _Frame, calibration: Calibration
     ) -> tuple[tuple[float, Floats, Floats], ...]:
-        """Return a step's motions before and since the last frame but one: seconds, odometry, clouds."""
-        middle = self._previous
+        """Return a step's motions before and since its last frame but one: seconds, odometry, clouds."""
         if middle is None or not before.stamp < middle.stamp < now.stamp:
             return ()
         last = self._meter.measure(middle.scan, now.scan, calibration)
