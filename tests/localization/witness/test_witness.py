@@ -85,6 +85,21 @@ def test_hours_without_a_hole_in_the_stamps_make_none_impossible():
 
 
 @pytest.mark.slow
+def test_clouds_are_compared_on_frames_without_a_registration(world_map, way):
+    """Of the frame before, which had one: a frame with both would take longest."""
+    localizer, both = Localizer(world_map), []
+    localizer._witness.faults = note = Steps()
+    for k, cloud in enumerate(way.clouds[:30]):
+        compared = len(note.steps)
+        localizer.step(cloud, way.T_odom_body[k], DT * k)
+        if k > 10 and len(note.steps) > compared:
+            both.append(localizer._registered_at == DT * k)
+    assert len(both) >= 5
+    assert not any(both)
+    assert all(step.on_map is not None for step in note.steps[-5:])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_scan_that_is_repeated_ends_the_poses(world_map, way, noise):
     rng = np.random.default_rng(1)
