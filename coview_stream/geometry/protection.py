@@ -10,6 +10,7 @@ and n, the tail's degrees of freedom, says how well the scale is known.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,19 @@ LEVELS = ("m", "deg", "horizontal_m", "vertical_m")
 """Names of a level's numbers in messages and files."""
 
 
+class OtherHeights(NamedTuple):
+    """Heights beside the registered one at which the robot may stand, where the ground may have been changed.
+
+    They are known by their probabilities, so no tail is added: the level is widened by their ``reach``.
+    """
+
+    variance: float = 0.0  # metres^2, part of the covariance
+    reach: float = 0.0  # metres that a height is off with a probability of half of RISK at most
+
+
+NO_OTHER = OtherHeights()
+
+
 @dataclass(frozen=True)
 class ProtectionLevel:
     """Error that a pose exceeds with a probability of at most 1e-3, relative to the map.
@@ -44,6 +58,7 @@ class ProtectionLevel:
         horizontal: metres in the map's x, y plane.
         vertical: metres along its z.
         doubt: times as wide as the covariance alone has them.
+        others: heights that are possible, too.
     """
 
     metres: float
@@ -51,6 +66,7 @@ class ProtectionLevel:
     horizontal: float
     vertical: float
     doubt: float = 1.0
+    others: OtherHeights = NO_OTHER
 
     def to_json(self) -> dict[str, float]:
         """Plain data for messages and ``result.json``."""
@@ -58,20 +74,26 @@ class ProtectionLevel:
         return {name: round(value, 4) for name, value in zip(LEVELS, values, strict=True)}
 
 
-def protection_level(covariance: Floats, doubt: float = 1.0, risk: float = RISK) -> ProtectionLevel:
+def protection_level(
+    covariance: Floats, doubt: float = 1.0, risk: float = RISK, others: OtherHeights = NO_OTHER
+) -> ProtectionLevel:
     """Return the level of a pose.
 
     Args:
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2.
         doubt: 1 or more: times as large as usual the errors may be.
         risk: probability with which an error may exceed the level.
+        others: heights that are possible beside the pose's; their variance is part of the covariance.
     """
+    known = np.array(covariance)
+    known[2, 2] = max(known[2, 2] - others.variance, 0.0)
     metres, horizontal, vertical = (
-        doubt * _quantile(covariance[axes, axes], *TAILS[name], risk)
+        doubt * _quantile(known[axes, axes], *TAILS[name], risk)
         for name, axes in (("metres", slice(0, 3)), ("horizontal", slice(0, 2)), ("vertical", slice(2, 3)))
     )
-    radians = doubt * _quantile(covariance[3:, 3:], *TAILS["degrees"], risk)
-    return ProtectionLevel(metres, min(180.0, float(np.degrees(radians))), horizontal, vertical, doubt)
+    radians = doubt * _quantile(known[3:, 3:], *TAILS["degrees"], risk)
+    degrees = min(180.0, float(np.degrees(radians)))
+    return ProtectionLevel(metres + others.reach, degrees, horizontal, vertical + others.reach, doubt, others)
 
 
 def axes_of(covariance: Floats) -> tuple[float, float]:

@@ -124,7 +124,9 @@ class RecordingLocalizer(Localizer):
         self._slipped |= match.moves_place
         if ruling.believed and not (match.moves_place or self._tracker.risen):
             covariance = match.covariance.copy()
-            covariance[5, 5] += self._tracker.change.variance  # heights that were possible then
+            covariance[5, 5] += (
+                self._tracker.change.others.variance + self._tracker.change.alone
+            )  # heights that were possible then
             level = self._tracker.protection_level()
             shared = swap_rotation_translation(self._tracker.reported_covariance(mount_and_clock=False))
             shared -= self._tracker.predicted_covariance()

@@ -8,7 +8,7 @@ from typing import Any
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import ProtectionLevel, one_in, protection_level
+from coview_stream.geometry.protection import NO_OTHER, ProtectionLevel, one_in, protection_level
 from coview_stream.geometry.transforms import (
     Pose,
     pose_fields,
@@ -173,7 +173,8 @@ class Fix:
         shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
         carried = swap_rotation_translation(propagate(swap_rotation_translation(self.covariance), shift))
         covariance = carried + self.drift.reported(max(0.0, driven), max(0.0, turned))
-        level = protection_level(covariance, 1.0 if self.protection is None else self.protection.doubt)
+        doubt, others = (1.0, NO_OTHER) if self.protection is None else (self.protection.doubt, self.protection.others)
+        level = protection_level(covariance, doubt, others=others)
         return replace(self, stamp=stamp, T_map_body=T_map_body, covariance=covariance, protection=level)
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coview_stream.geometry import protection
-from coview_stream.geometry.protection import ProtectionLevel, axes_of, protection_level
+from coview_stream.geometry.protection import OtherHeights, ProtectionLevel, axes_of, protection_level
 from coview_stream.geometry.transforms import exp_so3
 
 SHAPES = {"sphere": (1.0, 1.0, 1.0), "pancake": (1.0, 1.0, 1e-4), "needle": (1.0, 1e-4, 1e-4), "mixed": (1.0, 0.3, 0.1)}
@@ -76,3 +76,12 @@ def test_plane_and_height_have_levels_of_their_own_blocks():
 def test_json_has_all_levels():
     level = ProtectionLevel(0.12345, 1.5, 0.1, 0.05)
     assert level.to_json() == {"m": 0.1235, "deg": 1.5, "horizontal_m": 0.1, "vertical_m": 0.05}
+
+
+def test_other_heights_widen_space_and_height_by_their_reach_and_not_the_plane():
+    sure = protection_level(np.diag([0.01, 0.01, 0.04, 1e-4, 1e-4, 1e-4]))
+    covariance = np.diag([0.01, 0.01, 0.04 + 0.09, 1e-4, 1e-4, 1e-4])
+    level = protection_level(covariance, others=OtherHeights(0.09, 1.2))
+    assert level.vertical == pytest.approx(sure.vertical + 1.2)
+    assert level.metres == pytest.approx(sure.metres + 1.2)
+    assert (level.horizontal, level.degrees) == (pytest.approx(sure.horizontal), pytest.approx(sure.degrees))

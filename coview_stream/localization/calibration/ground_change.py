@@ -25,7 +25,8 @@ from scipy.ndimage import uniform_filter, uniform_filter1d
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
-from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.geometry.protection import NO_OTHER, RISK, OtherHeights
+from coview_stream.geometry.transforms import Pose, pose_from, transform
 from coview_stream.localization.calibration.ground_offset import structure_fits
 from coview_stream.localization.registration.clouds import STRUCTURE_HEIGHT, LocalMap, RegistrationCloud
 
@@ -80,7 +81,9 @@ class GroundChange:
         self.share = self.metres = 0.0
         self._scan: RegistrationCloud | None = None  # the newest, with all of its ground
         self._started = False
-        self._h = 0.0  # metres: odometry's frame on the map, which the heights count from
+        self._T_map_source = np.eye(4)  # of the newest lesson
+        self._h = 0.0  # metres by which registrations have raised the robot above odometry's way
+        self._origin = 0.0  # of these, from which the heights count: a multiple of their step
         self._copied = 0.0  # likewise: the height at which the patches lately fitted the survey best
         size = np.abs(_HEIGHTS) - _LEAST
         dug = np.where(size > 0.0, np.exp(-size / _DEPTH), 0.0)
@@ -118,7 +121,7 @@ class GroundChange:
             changed=self.share, dug=patches.dug,
         )  # fmt: skip
 
-    def learn(self, T_map_source: Pose, position: Floats, target: LocalMap, driven: float, drift: float) -> float:
+    def learn(self, T_map_source: Pose, position: Floats, target: LocalMap, driven: float, variance: float) -> float:
         """Learn from a believed registration of the newest scan; return metres by which the robot has to rise.
 
         Args:
@@ -126,25 +129,27 @@ class GroundChange:
             position: (3,) of the body, the scan's frame.
             target: the map around.
             driven: metres since the last lesson.
-            drift: one sigma of odometry's height, metres per square root of a metre.
+            variance: of the height that odometry has gained since then, metres^2.
         """
         if self._scan is None:
             return 0.0
-        h = float(transform(T_map_source, position[None])[0, 2] - position[2])
         if self._started:
-            self._walk(driven, drift)
+            # by the attitude of then: a frame of odometry that leans goes up or down by itself
+            before, now = (transform(T, position[None])[0, 2] for T in (self._T_map_source, T_map_source))
+            self._h += float(now - before)
+            self._walk(driven, variance)
         else:
-            self._started, self._h, driven = True, h, 0.0
-            self._copied = h
-        self._count_from(h)
+            self._started, driven = True, 0.0
+        self._T_map_source = T_map_source
+        self._count_on()
         patches = _Patches(self._scan, T_map_source, position, self._field, target)
         same = patches.likelihoods(_HEIGHTS)
         changed = np.full(len(_HEIGHTS), patches.other_shape())
         fits = float(_HEIGHTS[same.argmax()])
-        moved = abs(h + fits - self._copied) > 2.0 * _STEP  # a pit that ends is no copy that goes on
+        moved = abs(self._h + fits - self._copied) > 2.0 * _STEP  # a pit that ends is no copy that goes on
         copied = np.abs(_HEIGHTS - fits) > _LEAST
         changed[copied] = np.maximum(changed[copied], same.max() - _COPY * driven - _BROKEN * moved)
-        self._copied = h + fits
+        self._copied = self._h + fits
         logs = np.stack([same, changed])
         self._kinds *= np.exp(logs - logs.max())
         self._kinds /= self._kinds.sum()
@@ -152,7 +157,7 @@ class GroundChange:
         structure = structure_fits(self._scan, T_map_source, target, _SHIFTS)
         if structure is not None:
             self._structure += _STRUCTURE * np.interp(_HEIGHTS, _SHIFTS, uniform_filter1d(structure, _BLUR))
-        return self._rise(h)
+        return self._rise()
 
     @property
     def probability(self) -> float:
@@ -160,19 +165,29 @@ class GroundChange:
         return float(self._belief()[1].sum()) if self._started else 0.0
 
     @property
-    def variance(self) -> float:
-        """Variance of the height, metres^2: other heights that are possible, and the error of structure alone."""
-        alone = self.share**3 * _VIEWED**2  # see RegistrationCloud.groundless
+    def others(self) -> OtherHeights:
+        """Heights that are possible beside the registered one."""
         if not self._started:
-            return alone
-        return float((self._belief() * _ELSEWHERE).sum(axis=0) @ _HEIGHTS**2) + alone
+            return NO_OTHER
+        off = (self._belief() * _ELSEWHERE).sum(axis=0)
+        beyond = np.cumsum(
+            (off + off[::-1])[: len(off) // 2]
+        )  # probability of each distance or more, the farthest first
+        rare = int((beyond <= 0.5 * RISK).sum())
+        reach = abs(_HEIGHTS[rare]) if rare < len(beyond) else 0.0
+        return OtherHeights(float(off @ _HEIGHTS**2), float(reach))
+
+    @property
+    def alone(self) -> float:
+        """Variance of the height where it stands on structure alone, metres^2; see RegistrationCloud.groundless."""
+        return self.share**3 * _VIEWED**2
 
     def _belief(self) -> Floats:
         """Probabilities (2, H) of both kinds and all heights, by patches and structure."""
         belief = self._kinds * np.exp(self._structure - self._structure.max())
         return np.asarray(belief / belief.sum())
 
-    def _rise(self, h: float) -> float:
+    def _rise(self) -> float:
         """Return metres to the probable height, if it is another than the registered one, and count from there."""
         belief = self._belief()
         heights, elsewhere = belief.sum(axis=0), (belief * _ELSEWHERE).sum(axis=0)
@@ -181,12 +196,14 @@ class GroundChange:
         if elsewhere[mode].sum() <= _SURE:
             return 0.0
         rise = float(heights[mode] @ _HEIGHTS[mode] / heights[mode].sum())
-        self._count_from(h + rise)
+        self._h += rise
+        self._T_map_source = pose_from(np.eye(3), [0.0, 0.0, rise]) @ self._T_map_source
+        self._count_on()
         return rise
 
-    def _walk(self, driven: float, drift: float) -> None:
-        """Let the height drift, and the ground change its kind, over ``driven`` metres."""
-        out = min(0.3, 0.5 * drift**2 * driven / _STEP**2)
+    def _walk(self, driven: float, variance: float) -> None:
+        """Let the height drift by a variance, and the ground change its kind, over ``driven`` metres."""
+        out = min(0.3, 0.5 * variance / _STEP**2)
         known = (1.0 - 2.0 * out) * self._kinds
         known[:, 1:] += out * self._kinds[:, :-1]
         known[:, :-1] += out * self._kinds[:, 1:]
@@ -195,16 +212,16 @@ class GroundChange:
         known = np.stack([(1.0 - becomes) * same + ends * changed, becomes * same + (1.0 - ends) * changed])
         self._kinds = (1.0 - anew) * known + anew * self._prior
 
-    def _count_from(self, h: float) -> None:
-        """Let the heights count from another one; those beyond the ends are forgotten."""
-        steps = round((h - self._h) / _STEP)
+    def _count_on(self) -> None:
+        """Let the heights count from the present one; those beyond the ends are forgotten."""
+        steps = round((self._h - self._origin) / _STEP)
         if steps:
             rows = np.arange(len(_HEIGHTS)) + steps
             inside = (rows >= 0) & (rows < len(_HEIGHTS))
             rows = np.clip(rows, 0, len(_HEIGHTS) - 1)
             self._kinds = np.where(inside, self._kinds[:, rows], 0.0) + 1e-12
             self._structure = self._structure[rows]
-            self._h += steps * _STEP
+            self._origin += steps * _STEP
 
 
 class _Patches:

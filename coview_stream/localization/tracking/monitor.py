@@ -27,6 +27,7 @@ PER_METRE = 1e-5  # once in 100 km odometry jumps, or the robot is displaced
 _PER_SECOND = 1e-4  # in doubt: a blind robot may be on its way elsewhere
 _UNSEEN = 5e-4  # while the robot was out of contact
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
+_NO_SCORE = 1e-6  # a share of nothing: levels of kilometres
 _OFF_MAP = 0.3  # share of the scan on the map below which the reason says so; decides nothing
 _NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: about the last five registrations
 
@@ -115,10 +116,8 @@ class EvidenceBaseline:
         self.usual = Evidence(**{n: before[n] + _NEWEST_SHARE * (now[n] - before[n]) for n in now})
 
     def fallen(self, evidence: Evidence) -> float:
-        """Return the ratio of the usual score to that of ``evidence``, 1 or more."""
-        if self.usual is None:
-            return 1.0
-        return max(1.0, self.usual.score / evidence.score) if evidence.score > 0 else math.inf
+        """Return the ratio of the usual score to that of ``evidence``, 1 or more; finite, as messages carry it."""
+        return 1.0 if self.usual is None else max(1.0, self.usual.score / max(evidence.score, _NO_SCORE))
 
     def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
         """Return the cause of poor evidence, the share that has fallen furthest below the usual one, and a clause."""

@@ -13,7 +13,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, transform, yaw_of
 from coview_stream.localization.calibration.calibration import RawScan
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, tilt_variance
 from coview_stream.localization.calibration.ground_change import GroundChange
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.evidence.observation import ObservedScan
@@ -225,7 +225,7 @@ class Tracker:
         trembles, the ground's, and, unless they are left out, errors of mount and clock.
         """
         total = self.predicted_covariance() + self._shared_error.covariance + self.odometry.tremble
-        total[5, 5] += self.change.variance + self.ground.sigma**2
+        total[5, 5] += self.change.others.variance + self.change.alone + self.ground.sigma**2
         if mount_and_clock:
             R = (self.T_map_odom if self.odometry.pose is None else self.T_map_odom @ self.odometry.pose)[:3, :3]
             total += self._calibration.calibration.pose_covariance(R, self.odometry.rates)
@@ -233,7 +233,7 @@ class Tracker:
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
-        return protection_level(self.reported_covariance(), self._doubt)
+        return protection_level(self.reported_covariance(), self._doubt, others=self.change.others)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
@@ -291,8 +291,8 @@ class Tracker:
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
             self._shared_error.learn(scan.cloud, self.T_map_odom, target, position, self.odometry.travelled)
-            drift = self.config.tracking.height_drift
-            rise = self.change.learn(self.T_map_odom, position, target, driven, drift)
+            climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(match.covariance) * driven**2
+            rise = self.change.learn(self.T_map_odom, position, target, driven, float(climb))
         self._displacement.learn(newest, position, self.T_map_odom, target)
         self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
         return rise

@@ -26,7 +26,7 @@ from coview_stream.localization.registration.surfaces import motion_prior, regis
 _ON_SURFACE = 0.1  # metres from an earlier surface, across it: its thickness, one sigma, is no more than 0.15
 _REACH = 1.0  # metres to the nearest point of the surface, along it: sparse lidars have rings so far apart
 _SAMPLE = 300  # points of which the fit is counted
-_FEWEST = 40  # points of structure; with fewer, the clouds do not show which motion fits
+_FEWEST = 40  # points of structure; with fewer, the clouds do not show how they moved
 _COARSE = 0.4  # metres, of the fit of starts that are not registered yet
 _USUAL = 0.7  # times the usual fit, below which other starts are tried
 _LEARNS = 0.1  # weight of a new fit in the usual one
@@ -71,8 +71,8 @@ class CloudMotionMeter:
         here = np.zeros(3)
         target = LocalMap(*surface_points(before.levelled(calibration) - before.position.astype(np.float32)))
         scan = prepare_scan(now.levelled(calibration) - now.position.astype(np.float32), here, self._config)
-        if len(target.points) < MIN_PAIRS or len(scan.points) < MIN_PAIRS:
-            return None
+        if len(target.points) < MIN_PAIRS or int(scan.above.sum()) < _FEWEST:
+            return None  # bare ground looks alike everywhere
         target.prepare()
         # in odometry's axes, about the body: a motion that is odometry's turns nothing
         odometry = pose_from(np.eye(3), now.position - before.position)
@@ -83,13 +83,12 @@ class CloudMotionMeter:
             turn = guess[2] - planar(before.T_odom_body, now.T_odom_body)[2]
             shift = rot_z(yaw_of(before.T_odom_body)) @ [guess[0], guess[1], odometry[2, 3]]
             found.append(self._registered(scan, target, pose_from(rot_z(turn), shift)))
-        structured = int(scan.above.sum()) >= _FEWEST
         if _fit(scan, target, none, _ON_SURFACE) > max(fit for *_, fit in found):
             still = self._registered(scan, target, none)
             # rings lie on each other where nothing moves, too; but a copy stays where it began
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
-        if structured and max(fit for *_, fit in found) < _USUAL * self._usual:
+        if max(fit for *_, fit in found) < _USUAL * self._usual:
             starts = _starts(odometry)
             fits = np.array([_fit(scan, target, T, _COARSE) for T in starts])
             found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
@@ -97,12 +96,9 @@ class CloudMotionMeter:
         if best[2] <= found[0][2] + 2.0 * _ALIKE:
             best = found[0]
         usual = self._usual or best[2]
-        if not structured:
-            usual = best[2]
         if best[0] is None:
             return CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), 0.0, usual)
-        if structured:
-            self._usual = usual + _LEARNS * (best[2] - usual)
+        self._usual = usual + _LEARNS * (best[2] - usual)
         return CloudMotion(*_in_plane(best[0], best[1], before.T_odom_body, now.T_odom_body), best[2], usual)
 
     def _registered(
@@ -123,10 +119,8 @@ class CloudMotionMeter:
 
 
 def _fit(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float) -> float:
-    """Return the share of the scan's structure that lies on the target's surfaces at a pose; 0 of too little."""
+    """Return the share of the scan's structure that lies on the target's surfaces at a pose."""
     rows = np.flatnonzero(scan.above)
-    if len(rows) < _FEWEST:
-        return 0.0
     points = transform(T, scan.points[rows[:: max(1, len(rows) // _SAMPLE)]])
     distance, nearest = kernels.nearest(target.grid, points, _REACH)
     seen = distance < _REACH

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import coview_kernels as kernels
 from coview_stream.basemap.likelihood_field import field_arrays, field_of
-from coview_stream.geometry.transforms import pose_from
+from coview_stream.geometry.protection import NO_OTHER
+from coview_stream.geometry.transforms import exp_so3, pose_from, transform
 from coview_stream.localization.calibration.ground_change import GroundChange
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
@@ -53,7 +56,7 @@ def view(change, site, scan, registered=0.0, driven=1.0):
     """One view at a registered height that is ``registered`` metres off; the scan without changed ground, the rise."""
     T = pose_from(np.eye(3), [0.0, 0.0, registered])
     left = change.without_changed(scan, T, HERE, site.target)
-    return left, change.learn(T, HERE, site.target, driven, 0.004)
+    return left, change.learn(T, HERE, site.target, driven, 0.004**2 * driven)
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +68,11 @@ def test_ground_as_surveyed_is_kept_and_other_heights_become_improbable(site):
     change, sigmas = GroundChange(site.field), []
     for _ in range(12):
         left, rise = view(change, site, site.now())
-        sigmas.append(change.variance**0.5)
+        sigmas.append(change.others.variance**0.5)
         assert rise == 0.0
     assert len(left.points) == pytest.approx(len(site.now().points), rel=0.01)
     assert left.changed < 0.02
+    assert change.others.reach < 0.5
     assert sigmas[-1] < 0.02 < sigmas[0]
     assert change.probability < 0.01
     assert change.metres == 0.0
@@ -91,7 +95,7 @@ def test_ground_that_is_dug_beside_the_robot_is_left_out_and_the_height_stays(si
     kept = left.points[~left.above]
     assert np.mean(kept[:, 0] < 4.0) > 0.95
     assert left.dug == pytest.approx(2.5, abs=0.3)
-    assert change.variance < 0.1**2
+    assert change.others.variance < 0.1**2
 
 
 def test_height_goes_on_into_a_pit_of_which_nothing_else_is_seen(site):
@@ -116,7 +120,7 @@ def test_robot_that_starts_on_changed_ground_is_put_where_structure_has_it(site,
     for k in range(10):
         _, rise = view(change, site, site.now(lambda xy: np.full(len(xy), depth)), off)
         if k == 0:
-            assert change.variance**0.5 > 0.1 * abs(depth)
+            assert change.others.variance**0.5 > 0.1 * abs(depth)
         rises.append(rise)
         off += rise
     assert abs(off) < 0.3
@@ -129,9 +133,10 @@ def test_without_structure_both_heights_stay_possible():
     for _ in range(5):
         _, rise = view(change, bare, bare.now(lambda xy: np.full(len(xy), -2.0)), 2.0)
         assert rise == 0.0
-    assert change.variance**0.5 > 0.15
+    assert change.others.variance**0.5 > 0.15
     change.clear()
-    assert change.variance == change.probability == 0.0
+    assert change.others == NO_OTHER
+    assert change.probability == 0.0
 
 
 def test_ground_that_comes_back_is_stood_on_again(site):
@@ -143,7 +148,7 @@ def test_ground_that_comes_back_is_stood_on_again(site):
         scan.points[:, 2] += drift
         T, position = pose_from(np.eye(3), [0.0, 0.0, height]), np.array([0.0, 0.0, 1.5 + drift])
         change.without_changed(scan, T, position, site.target)
-        height += change.learn(T, position, site.target, 1.0, 0.004)
+        height += change.learn(T, position, site.target, 1.0, 0.004**2)
     assert height == pytest.approx(-0.3, abs=0.15)
 
 
@@ -152,3 +157,18 @@ def test_heights_of_the_field_are_those_of_the_ground(site):
     heights = kernels.ground_heights(site.field, at)
     np.testing.assert_allclose(heights[:2], site.level(at[:2, :2]), atol=0.15)
     assert np.isnan(heights[2])
+
+
+def test_odometry_frame_that_leans_is_no_changed_ground(site):
+    """A degree of lean raises the way by odometry by 0.7 m in 40 m; the height above the ground stays."""
+    lean = pose_from(exp_so3(np.array([0.0, np.radians(1.0), 0.0])), np.zeros(3))
+    change = GroundChange(site.field)
+    scan = site.now()
+    for x in np.arange(0.0, 40.0, 2.0):
+        here = transform(lean, (HERE + np.array([x, 0.0, 0.0]))[None])[0]  # odometry has driven on
+        back = pose_from(np.eye(3), [-x, 0.0, 0.0]) @ np.linalg.inv(lean)  # and the site repeats itself
+        moved = replace(scan, points=transform(np.linalg.inv(back), scan.points).astype(np.float32))
+        change.without_changed(moved, back, here, site.target)
+        assert change.learn(back, here, site.target, 2.0, 2 * 0.004**2) == 0.0
+    assert change.probability < 0.01
+    assert change.others.reach < 0.5

@@ -282,3 +282,4 @@ def test_evidence_has_fallen_by_as_much_as_the_usual_is_better(used):
     assert used.fallen(GOOD) == 1.0
     assert used.fallen(replace(GOOD, ground=1.0)) == 1.0  # better than usual
     assert EvidenceBaseline().fallen(half) == 1.0
+    assert math.isfinite(used.fallen(replace(GOOD, near=0.0)))

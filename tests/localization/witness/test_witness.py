@@ -7,13 +7,14 @@ import pytest
 import small_world
 
 from coview_stream.config import RegistrationConfig, TrackingConfig
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
-from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.witness.cloud_motion import CloudMotionMeter
 from coview_stream.localization.witness.faults import FaultPosterior
 from coview_stream.localization.witness.witness import Witness
 
@@ -43,6 +44,21 @@ def follow(world_map, way, clouds, odometry=None):
 
 def causes(fixes):
     return {fix.evidence.cause for fix in fixes}
+
+
+@pytest.mark.slow
+def test_bare_ground_shows_no_motion(scene):
+    """Its noise looks like motions of decimetres, which no robot has made."""
+    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-2.0, 2.0)]
+    near = small_world.record_along(scene, way, 2.0)
+    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (100.0, 104.0)]
+    far = small_world.record_along(scene, way, 2.0)
+    meter = CloudMotionMeter(RegistrationConfig())
+    for drive, seen in ((near, True), (far, False)):
+        before, now = (
+            RawScan(transform(T, cloud), T) for cloud, T in zip(drive.clouds[:2], drive.T_odom_body, strict=False)
+        )
+        assert (meter.measure(before, now, Calibration()) is not None) is seen
 
 
 class Steps(FaultPosterior):
