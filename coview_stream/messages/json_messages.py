@@ -211,7 +211,8 @@ def _protection(value: object) -> ProtectionLevel | None:
         return None
     if not isinstance(value, dict):
         raise MessageError(f"protection_level: write {', '.join(LEVELS)}")
-    return ProtectionLevel(*(number(value.get(name), f"protection_level.{name}") for name in LEVELS))
+    metres, degrees, horizontal, vertical = (number(value.get(name), f"protection_level.{name}") for name in LEVELS)
+    return ProtectionLevel(metres, degrees, horizontal, vertical)
 
 
 def _refuse_constant(name: str) -> NoReturn:
