@@ -17,7 +17,8 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, Poses, pose_from, rot_z, transform, wrap_angle, yaw_of
+from coview_stream.geometry.planar import planar_motion
+from coview_stream.geometry.transforms import Pose, Poses, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import registration_covariance, remove_prior
@@ -47,13 +48,6 @@ class CloudMotion(NamedTuple):
     usual: float  # the same, of the motions before
 
 
-def planar(T_before: Pose, T_now: Pose) -> Floats:
-    """Return the motion (3,) between two poses (4, 4) in the level axes of the first one."""
-    turn = yaw_of(T_before)
-    x, y, _ = rot_z(-turn) @ (T_now[:3, 3] - T_before[:3, 3])
-    return np.array([x, y, wrap_angle(yaw_of(T_now) - turn)])
-
-
 class CloudMotionMeter:
     """Meter of the motion between clouds, which remembers how well they fit usually."""
 
@@ -80,7 +74,7 @@ class CloudMotionMeter:
         none = pose_from(turned, here)
         found = [self._registered(scan, target, odometry)]
         if guess is not None:
-            turn = guess[2] - planar(before.T_odom_body, now.T_odom_body)[2]
+            turn = guess[2] - planar_motion(before.T_odom_body, now.T_odom_body)[2]
             shift = rot_z(yaw_of(before.T_odom_body)) @ [guess[0], guess[1], odometry[2, 3]]
             found.append(self._registered(scan, target, pose_from(rot_z(turn), shift)))
         if _fit(scan, target, none, _ON_SURFACE) > max(fit for *_, fit in found):
@@ -143,7 +137,7 @@ def _in_plane(T: Pose, covariance: Floats, T_before: Pose, T_now: Pose) -> tuple
     """Return a registered pose (4, 4) in odometry's axes and its covariance as a planar motion and its (3, 3)."""
     turn = yaw_of(T_before)
     seen = pose_from(T[:3, :3] @ T_now[:3, :3], T_before[:3, 3] + T[:3, 3])
-    motion = planar(T_before, seen)
+    motion = planar_motion(T_before, seen)
     axes = [3, 4, 2]
     R = rot_z(-turn)
     noise = _NOISE + _NOISE_METRE * float(np.linalg.norm(motion[:2]))

@@ -9,6 +9,7 @@ now and then, no single pair decides. The doctor and the localizer share all of 
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.planar import planar_motion
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
@@ -166,18 +168,20 @@ def _mixed(ratio: float) -> float:
 def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
     """Compare the clouds' motions with odometry's, both as a reading has them."""
     change = reading.change or (lambda T: T)
+    odometry = np.array([(change(pair.before), change(pair.after)) for pair in pairs]).reshape(-1, 2, 4, 4)
+    # all at once, which is quicker
+    turns = log_so3(np.swapaxes(odometry[:, 0, :3, :3], -1, -2) @ odometry[:, 1, :3, :3])
+    seen = log_so3(np.array([pair.motion[:3, :3] for pair in pairs]).reshape(-1, 3, 3))
     misfits, ratios, odds, sways = [], [], 0.0, np.zeros(2)
-    for pair in pairs:
-        before, after = change(pair.before), change(pair.after)
-        moved = rot_z(-yaw_of(before)) @ (after[:3, 3] - before[:3, 3])
-        step, turned = complex(moved[0], moved[1]), log_so3(before[:3, :3].T @ after[:3, :3])
-        driven, sway, turn = _as_read(pair.motion, reading)
+    for pair, (before, after), turned, rotation in zip(pairs, odometry, turns, seen, strict=True):
+        moved = planar_motion(before, after)
+        step, swayed = complex(moved[0], moved[1]), complex(turned[0], turned[1])
+        driven, sway, turn = _as_read(pair.motion, rotation, reading)
         if max(abs(step), abs(driven)) < STILL:  # read so, the robot stood
             continue
-        misfits.append(abs(step - driven) + METRES_PER_RADIAN * abs(wrap_angle(yaw_of(after) - yaw_of(before) - turn)))
+        misfits.append(abs(step - driven) + METRES_PER_RADIAN * abs(wrap_angle(moved[2] - turn)))
         far = max(abs(driven), BASELINE)
         odds += _log_odds(misfits[-1], far, max(far, abs(step)), pair.sigma)
-        swayed = complex(turned[0], turned[1])
         sways += [_sways_odds(each, swayed) for each in (sway, _other_hand(sway))]
         if min(abs(step), abs(driven)) > STILL:
             ratios.append(driven / step)
@@ -202,10 +206,12 @@ def _other_hand(sway: complex) -> complex:
     return complex(-sway.real, sway.imag)
 
 
-def _as_read(motion: Pose, reading: Reading) -> tuple[complex, complex, float]:
-    """Return the clouds' motion (4, 4) in the body's axes: x and y, the turn about x and about y, and about z."""
-    turned = np.exp(-1j * reading.heading)
-    rotation = log_so3(motion[:3, :3])
+def _as_read(motion: Pose, rotation: Floats, reading: Reading) -> tuple[complex, complex, float]:
+    """Return the clouds' motion (4, 4) in the body's axes: x and y, the turn about x and about y, and about z.
+
+    ``rotation`` (3,) is its rotation vector.
+    """
+    turned = cmath.exp(-1j * reading.heading)
     driven, sway = complex(motion[0, 3], motion[1, 3]) * turned, complex(rotation[0], rotation[1]) * turned
     if reading.mirrored:
         return driven.conjugate(), _other_hand(sway), -yaw_of(motion)

@@ -11,8 +11,9 @@ from scipy.special import chdtri
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.planar import between, compose, inverted, planar_motion, planar_pose, spatial
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, rot_z, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.tracking.map_matching import MapMatch
@@ -20,17 +21,8 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.tracker import Tracker
-from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter, planar
-from coview_stream.localization.witness.faults import (
-    FAILS,
-    LAGS,
-    Accusation,
-    FaultPosterior,
-    Seen,
-    Step,
-    compose,
-    inverted,
-)
+from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter
+from coview_stream.localization.witness.faults import FAILS, LAGS, Accusation, FaultPosterior, Seen, Step
 
 _METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # of a step, whichever comes first
 _SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
@@ -96,11 +88,12 @@ class Witness:
         calibration = self._estimator.calibration
         pose = np.zeros(3)
         if self._odometry is not None:
-            step = planar(self._odometry, T_odom_raw)
+            step = planar_motion(self._odometry, T_odom_raw)
             step[:2] *= 1.0 + calibration.scale
             step[2] += calibration.turn * float(np.linalg.norm(step[:2]))
             before = self._path[-1][1]
-            pose = before + rot_z(before[2]) @ [step[0], step[1], 0.0] + [0.0, 0.0, step[2]]
+            pose = compose(before, step)
+            pose[2] = before[2] + step[2]  # not wrapped: it is interpolated
         self._odometry = T_odom_raw
         self._path.append((stamp, pose))
         copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
@@ -204,7 +197,7 @@ class Witness:
         calibration = self._follow()
         delay = calibration.delay
         past, present = self._by_lags(before.stamp - delay), self._by_lags(now.stamp - delay)
-        o = _motion(past[0], present[0])
+        o = between(past[0], present[0])
         driven, turned = float(np.linalg.norm(o[:2])), abs(float(o[2]))
         x, y, yaw = drift.variances(driven, turned)[[3, 4, 2]]
         along, across = calibration.sigma_scale * driven, max(calibration.sigma_heading, _HEADING) * driven
@@ -235,7 +228,7 @@ class Witness:
             # nothing else tells the new mount or clock: registrations to the map are not believed meanwhile
             spread = seen.covariance + np.diag(_JITTER**2 + [x, y, yaw])
             moments = before.scan.moment, now.scan.moment
-            self._estimator.measure_motion(np.eye(4), _spatial(seen.motion), _spatial(o), spread, moments)
+            self._estimator.measure_motion(np.eye(4), spatial(seen.motion), spatial(o), spread, moments)
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
             self._estimator.rescale(*rescaled)
         self._reference = now
@@ -258,15 +251,15 @@ class Witness:
             return ()
         poses = [self._by_lags(frame.stamp - calibration.delay)[0] for frame in (before, middle, now)]
         return (
-            (middle.stamp - before.stamp, _motion(*poses[:2]), compose(seen.motion, inverted(last.motion))),
-            (now.stamp - middle.stamp, _motion(*poses[1:]), last.motion),
+            (middle.stamp - before.stamp, between(*poses[:2]), compose(seen.motion, inverted(last.motion))),
+            (now.stamp - middle.stamp, between(*poses[1:]), last.motion),
         )
 
     def _follow(self) -> Calibration:
         """Take over a changed calibration; return it."""
         calibration = self._estimator.calibration
         moved = calibration.T_body_cloud @ inverse(self._calibration.T_body_cloud)
-        self.faults.corrected(planar(np.eye(4), moved), calibration.delay - self._calibration.delay)
+        self.faults.corrected(planar_pose(moved), calibration.delay - self._calibration.delay)
         self._calibration = calibration
         return calibration
 
@@ -292,25 +285,15 @@ class Witness:
 
 def _contradicts(o: Floats, noise: Floats, seen: CloudMotion) -> bool:
     """Return whether the clouds' motion is one that odometry's errors explain once in a thousand."""
-    gap = compose(inverted(o), seen.motion)
+    gap = between(o, seen.motion)
     return float(gap @ np.linalg.solve(noise + seen.covariance, gap)) > float(chdtri(3, _RISK))
-
-
-def _spatial(motion: Floats) -> Pose:
-    """Return a planar motion (3,) as a pose (4, 4)."""
-    return pose_from(rot_z(float(motion[2])), [motion[0], motion[1], 0.0])
-
-
-def _motion(before: Floats, now: Floats) -> Floats:
-    step = rot_z(-before[2]) @ np.array([*(now - before)[:2], 0.0])
-    return np.array([step[0], step[1], now[2] - before[2]])
 
 
 def _on_map(before: Estimate | None, now: Estimate | None) -> Seen | None:
     """Return the motion between two poses on the map; None without either."""
     if before is None or now is None:
         return None
-    motion = planar(before.T_map_body, now.T_map_body)
+    motion = planar_motion(before.T_map_body, now.T_map_body)
     R, axes = rot_z(-yaw_of(before.T_map_body)), np.ix_([3, 4, 2], [3, 4, 2])
     lever = np.array([0.0, float(np.linalg.norm(motion[:2])), 0.0]) * np.sqrt(before.covariance[2, 2])
     return Seen(motion, R @ (before.covariance[axes] + now.covariance[axes]) @ R.T + np.diag(lever**2 + 1e-6))

@@ -1,0 +1,54 @@
+"""Planar motions (..., 3): x and y in metres along the level axes of the earlier pose, and the turn in radians.
+
+A planar pose is the motion from the origin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose, pose_from, rot_z, yaw_of
+
+
+def planar_motion(T_before: Pose, T_now: Pose) -> Floats:
+    """Return the motion (3,) between two poses (4, 4)."""
+    return between(planar_pose(T_before), planar_pose(T_now))
+
+
+def planar_pose(T: Pose) -> Floats:
+    """Return position and heading (3,) of a pose (4, 4)."""
+    return np.array([T[0, 3], T[1, 3], yaw_of(T)])
+
+
+def spatial(motion: Floats) -> Pose:
+    """Return a motion (3,) as a pose (4, 4)."""
+    return pose_from(rot_z(float(motion[2])), [motion[0], motion[1], 0.0])
+
+
+def compose(a: Floats, b: Floats) -> Floats:
+    """Return motions ``a`` (..., 3), each followed by ``b`` (..., 3); turns in [-pi, pi)."""
+    x, y = _turned(a[..., 2], b)
+    return np.stack([a[..., 0] + x, a[..., 1] + y, _wrapped(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def inverted(a: Floats) -> Floats:
+    """Return the motions (..., 3) back."""
+    x, y = _turned(-a[..., 2], a)
+    return np.stack([-x, -y, -a[..., 2]], axis=-1)
+
+
+def between(before: Floats, now: Floats) -> Floats:
+    """Return the motions (..., 3) from poses (..., 3) to others (..., 3); turns in [-pi, pi)."""
+    gap = now - before
+    x, y = _turned(-before[..., 2], gap)
+    return np.stack([x, y, _wrapped(gap[..., 2])], axis=-1)
+
+
+def _turned(angle: Floats, v: Floats) -> tuple[Floats, Floats]:
+    c, s = np.cos(angle), np.sin(angle)
+    return c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]
+
+
+def _wrapped(angle: Floats) -> Floats:
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

@@ -1,0 +1,32 @@
+"""Planar motions are those of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.geometry.planar import between, compose, inverted, planar_motion, planar_pose, spatial
+from coview_stream.geometry.transforms import inverse
+
+
+@pytest.fixture
+def motions():
+    return np.random.default_rng(3).normal(0.0, [5.0, 5.0, 1.5], (2, 40, 3))
+
+
+def test_motions_compose_as_poses_do(motions):
+    a, b = motions
+    for k in range(len(a)):
+        expected = spatial(a[k]) @ spatial(b[k])
+        assert spatial(compose(a, b)[k]) == pytest.approx(expected)
+        assert spatial(inverted(a)[k]) == pytest.approx(inverse(spatial(a[k])))
+        assert between(a[k], b[k]) == pytest.approx(planar_motion(spatial(a[k]), spatial(b[k])))
+        assert planar_pose(expected) == pytest.approx(compose(a[k], b[k]))
+
+
+def test_motions_between_every_two_poses(motions):
+    a, b = motions
+    every = between(a[:, None], b[None, :7])
+    assert every.shape == (40, 7, 3)
+    assert every[11, 5] == pytest.approx(between(a[11], b[5]))
+    assert compose(a[11], every[11, 5])[:2] == pytest.approx(b[5][:2])
