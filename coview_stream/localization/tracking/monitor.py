@@ -55,6 +55,8 @@ class RejectionReason(StrEnum):
     """Clouds or odometry come in other units or axes."""
     REPEATED = "repeated"
     """The lidar repeats itself: its clouds show no motion while odometry moves."""
+    STOPPED = "stopped"
+    """Odometry stands still while the lidar moves."""
     CLOCK = "clock"
     """Clouds are older than their stamps."""
     MOUNT = "mount"
@@ -65,13 +67,13 @@ class RejectionReason(StrEnum):
 
 FAULTS = (
     RejectionReason.REPEATED, RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED,
-    RejectionReason.CONVENTIONS,
+    RejectionReason.STOPPED, RejectionReason.CONVENTIONS,
 )  # fmt: skip
 """Causes that are faults of clouds or odometry."""
 
 _AT_ONCE = (
     RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT, RejectionReason.REPEATED,
-    RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED,
+    RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED, RejectionReason.STOPPED,
 )  # fmt: skip
 """Causes that stop the poses at once, though they are no evidence of a wrong place."""
 

@@ -4,7 +4,8 @@ Over a step the odometry moves by o, the clouds, registered to each other, by l,
 All three agree where nothing is wrong. A fault makes them disagree in a way of its own:
 
 * good: l = o; m = l in all cases, as the map sees the same clouds.
-* slip: o is wrong (wheels slip, odometry stands still or jumps), l is right, and smooth, as bodies have inertia.
+* slip: o is wrong (wheels slip, odometry jumps), l is right, and smooth, as bodies have inertia.
+* stopped: o = 0, whatever l is, which is smooth.
 * scaled: l = s o along the way, with the heading as it was; l is right.
 * repeated: l = 0, whatever o is.
 * late: l = o at an earlier time. The lag is constant, or grows: by and by, or steadily.
@@ -172,12 +173,14 @@ class FaultPosterior:
     slip: float = 0.0
     repeated: float = 0.0
     mixed: float = 0.0
+    stopped: float = 0.0
     steady: Floats = field(default_factory=lambda: np.eye(1, len(LAGS))[0])  # of each constant lag; the first: good
     growing: Floats = field(default_factory=lambda: np.zeros(len(LAGS)))  # of each lag that grows
     moved: list[_Moved] = field(default_factory=list)
     scaled: list[_Scaled] = field(default_factory=list)
     parting: list[_Parting] = field(default_factory=list)
     _driven: float = 0.0  # metres by odometry since the scan began to be repeated
+    _moved_on: float = 0.0  # metres by the clouds since odometry began to stand still
     _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
 
@@ -216,8 +219,12 @@ class FaultPosterior:
         begins = 1.0 - math.exp(-_SLIPS * farther)
         new_slip = (begins * good + _SLIPS_ON * slip) * slips
         new_repeated = (come * (good + slip) + (1.0 - ends) * self.repeated) * float(copy)
+        new_stopped = 0.0
+        if stands:
+            new_stopped = (come * (good + slip) + (1.0 - ends) * self.stopped) * float(like(*self._going_on(step)))
         new_mixed = (come * (good + slip) + (1.0 - ends) * self.mixed) * anything
         back = (1.0 - _SLIPS_ON) * slip * float(like(o)) + ends * (self.repeated + self.mixed) * anything
+        back += ends * self.stopped * float(like(o))
 
         # lags: every pair of a lag before and one now
         between = _between(step.path_before, step.path_now)
@@ -261,7 +268,7 @@ class FaultPosterior:
             parting.append(new.after(step, float(like(*new.expected(step)))))
         parting = sorted(parting, key=lambda h: -h.weight)[:_KEPT]
 
-        others = new_slip + new_repeated + new_mixed + steady.sum() + growing.sum()
+        others = new_slip + new_repeated + new_mixed + new_stopped + steady.sum() + growing.sum()
         others += sum(h.weight for h in moved) + sum(h.weight for h in scaled) + sum(h.weight for h in parting)
         longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing: neither gains nor loses
         steady[-1] += longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
@@ -269,12 +276,16 @@ class FaultPosterior:
         if not (math.isfinite(total) and total > 0.0):
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
+        self.stopped = new_stopped / total
         self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
         self.moved = [replace(h, weight=h.weight / total) for h in moved]
         self.scaled = [replace(h, weight=h.weight / total) for h in scaled]
         self.parting = [replace(h, weight=h.weight / total) for h in parting]
         if not stands:
             self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
+        if step.clouds is not None:
+            further = self._moved_on + float(np.linalg.norm(step.clouds.motion[:2]))
+            self._moved_on = further if self.stopped > _NEGLIGIBLE else 0.0
         self._speed = np.abs(o) / dt
         self._before = None
         if step.clouds is not None:
@@ -313,6 +324,9 @@ class FaultPosterior:
         if self._driven > metres:
             words = f"the lidar repeats itself: no motion between clouds while odometry drives {self._driven:.1f} m"
             wrong.append(Accusation(RejectionReason.REPEATED, self.repeated, words))
+        if self._moved_on > metres:
+            words = f"odometry stands still while the lidar moves by {self._moved_on:.1f} m"
+            wrong.append(Accusation(RejectionReason.STOPPED, self.stopped, words))
         words = "clouds do not fit each other: they are of more than one place"
         wrong.append(Accusation(RejectionReason.MIXED, self.mixed, words))
         late = self.steady + self.growing
@@ -340,6 +354,15 @@ class FaultPosterior:
         if total < risk:
             return None
         return max(wrong, key=lambda each: each.probability)._replace(probability=total)
+
+    def _going_on(self, step: Step) -> tuple[Floats, Floats]:
+        """Return the motion (3,) of a body that goes on as its clouds have moved, and its covariance (3, 3)."""
+        if self._before is None:
+            return step.odometry.motion, np.diag(_ANYWHERE**2)
+        seconds, _, seen = self._before
+        inertia, share = _INERTIA * 0.5 * (seconds + step.seconds) * step.seconds, step.seconds / seconds
+        covariance = np.zeros((3, 3)) if step.clouds is None else step.clouds.covariance
+        return seen * share, np.diag(inertia**2) + covariance * share**2
 
     def _smoother(self, step: Step) -> float:
         """Return how much better the clouds' motion goes on from the step before than odometry's, as a ratio."""

@@ -184,9 +184,20 @@ def test_odometry_that_goes_out_of_scale_is_no_fault_of_the_lidar(factor):
 
 
 def test_odometry_that_stands_still_is_no_fault_of_the_lidar():
-    faults, accused, _ = drive(lambda o, t: (0.0 * o, o), until=15.0)
-    assert accused is None
-    assert faults.slip > 0.9
+    _, accused, seconds = drive(lambda o, t: (0.0 * o, o), until=15.0, excess=0.0, holes=0.02)
+    assert accused.cause is RejectionReason.STOPPED
+    assert "odometry stands still while the lidar moves" in accused.sentence
+    assert seconds <= 2.0 * DT
+
+
+def test_odometry_that_goes_on_after_it_stood_is_believed_again():
+    """For three seconds clouds that are late by as much would move on as well."""
+    faults, odometry, o = FaultPosterior(), Odometry(5.0), np.array([SPEED * DT, 0.0, 0.0])
+    for k in range(20):
+        shown, seen = (o if k < 5 or k >= 15 else 0.0 * o), Seen(o, NOISE)
+        faults.add(Step(DT, Seen(shown, NOISE), seen, seen, *odometry.move(shown), excess=0.0, holes=0.02))
+        assert k not in (12, 13, 14) or faults.stopped > 0.99
+        assert 5 <= k < 15 or (faults.good > 0.99 and faults.accusation(*LEVEL, RISK) is None)
 
 
 def test_lag_without_a_hole_in_the_stamps_is_a_slip():
