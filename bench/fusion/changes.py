@@ -20,7 +20,6 @@ import numpy as np
 from bench.harness.files import folder
 from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.filters import open3d
 from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, Fused, fuse
 from coview_stream.fusion.localized_run import LocalizedRun, RunPair
 from coview_stream.fusion.sightings import REACH
@@ -28,6 +27,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.localization.offline import locate, write
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig, parse_dirt, simulate
+from coview_stream.sim.casting import open3d
 from coview_stream.sim.scenes import SceneState
 from coview_stream.sim.simulate import scene_of
 

@@ -29,7 +29,6 @@ from bench.harness.files import folder, isolated
 from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import WORLDS, Place, map_of, places
 from coview_stream import BaseMap
-from coview_stream.clouds.filters import open3d
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CoViewError, require_library
 from coview_stream.geometry.arrays import Floats
@@ -39,6 +38,7 @@ from coview_stream.localization.registration.clouds import LocalMaps, prepare_sc
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
+from coview_stream.sim.casting import open3d
 
 OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking starts, metres and radians
 

@@ -164,11 +164,11 @@ def codecs_finding(result: dict[str, Any]) -> Finding:
 
 
 def open3d_finding(result: dict[str, Any]) -> Finding:
-    """Judge Open3D: normals and outliers of new maps, and ray casting in simulated worlds."""
+    """Judge Open3D: ray casting in simulated worlds."""
     if "error" not in result:
-        return Finding("ok", "open3d", str(result["version"]))
+        return Finding("ok", "open3d", f"{result['version']}, for rays of simulate and demo")
     text, _, remedy = str(result["error"]).removeprefix("DependencyError: ").partition("; ")
-    return Finding("warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy)
+    return Finding("ok", "open3d", f"{text}: simulate and demo cast their rays by a kernel, slower", remedy)
 
 
 def matplotlib_finding(result: dict[str, Any]) -> Finding:
@@ -270,7 +270,7 @@ def _close(one: Any, other: Any) -> bool:
 
 
 def _probe_open3d() -> dict[str, Any]:
-    from coview_stream.clouds.filters import open3d
+    from coview_stream.sim.casting import open3d
 
     return {"version": str(open3d().__version__)}
 

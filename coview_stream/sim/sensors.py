@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.clouds.filters import open3d
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Reals
 from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.sim.casting import caster_of
 from coview_stream.sim.mesh import Mesh
 from coview_stream.sim.scenes import SceneState
 
@@ -43,7 +43,6 @@ class MeshCaster:
 
     ``foliage`` maps the index of a mesh to the probability that a ray passes one of its surfaces, None for the
     ``porosity`` of :meth:`trace`; leaves are hit ``leaf_depth`` metres on average below the surface.
-    Raises DependencyError if Open3D cannot be loaded.
     """
 
     def __init__(
@@ -53,17 +52,8 @@ class MeshCaster:
         threads: int = _THREADS,
         leaf_depth: float = _LEAF_DEPTH,
     ) -> None:
-        self._o3d: Any = open3d()
-        self._threads, self._leaf_depth = threads, leaf_depth
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
+        self._cast, self._leaf_depth = caster_of(meshes, threads), leaf_depth
         self._foliage = dict(foliage)
-        self._added: list[int] = []  # Open3D's number of a mesh -> ours
-        for index, mesh in enumerate(meshes):
-            if len(mesh.triangles):
-                vertices = self._o3d.core.Tensor(mesh.vertices.astype(np.float32))
-                triangles = self._o3d.core.Tensor(mesh.triangles.astype(np.uint32))
-                self._scene.add_triangles(vertices, triangles)
-                self._added.append(index)
 
     def trace(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
         """Return the first hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres."""
@@ -83,17 +73,10 @@ class MeshCaster:
         passing = np.full(max(self._foliage, default=-1) + 2, np.nan)  # by mesh; the last place is the sky's
         for index, share in self._foliage.items():
             passing[index] = porosity if share is None else share
-        added = np.array([*self._added, -1], dtype=np.intp)
         alive: Indices = np.arange(count, dtype=np.intp)
         start = np.zeros(count, np.float32)
         for layer in range(_MAX_LAYERS):
-            from_here = origins[alive] + rays[alive] * start[alive, None]
-            packed = np.ascontiguousarray(np.concatenate([from_here, rays[alive]], axis=1), dtype=np.float32)
-            answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
-            # a ray without a hit has a number beyond all
-            mesh = added[np.minimum(answer["geometry_ids"].numpy(), len(added) - 1)]
-            # copies: the arrays belong to the tensors of the answer
-            t, normal = answer["t_hit"].numpy().copy(), answer["primitive_normals"].numpy().copy()
+            t, mesh, normal = self._cast(origins[alive] + rays[alive] * start[alive, None], rays[alive])
             through = passing[np.where(mesh < len(passing), mesh, -1)]
             leaf = np.isfinite(through)
             t += start[alive]

@@ -122,7 +122,6 @@ def simulate(
 
     Raises:
         InputError: ``out`` exists and is not empty, or cannot be written.
-        DependencyError: Open3D cannot be loaded.
     """
     config = config or SimulationConfig()
     out = Path(out)

@@ -102,7 +102,7 @@ def train_session(
     Raises:
         ConfigError: a number is out of range. InputError: something cannot be written, or the directory holds
             worlds of another recipe or the state of another training.
-        DependencyError: PyTorch, ONNX or Open3D is not installed.
+        DependencyError: PyTorch or ONNX is not installed.
     """
     torch = require_library("torch", "torch==2.13.0", "training (extra learn-train)")
     require_library("onnx", "onnx>=1.16", "training (extra learn-train)")

@@ -168,7 +168,7 @@ def write_world(path: str | os.PathLike[str], seed: int, recipe: Recipe) -> None
     """Write the world of a seed; the file is complete or not there.
 
     Raises:
-        InputError: the file cannot be written. DependencyError: Open3D cannot be loaded.
+        InputError: the file cannot be written.
     """
     views = world_views(seed, recipe)
     fields = {name: getattr(views, name) for name in _KEYS} | {"recipe": json.dumps(views.recipe)}
@@ -206,7 +206,7 @@ def write_dataset(
     ``progress`` is called with the seed and the seconds it took, when one of the processes has written a file.
 
     Raises:
-        InputError: the directory or a file cannot be written. DependencyError: Open3D cannot be loaded.
+        InputError: the directory or a file cannot be written.
     """
     directory = Path(directory)
     try:

@@ -25,6 +25,7 @@ from coview_kernels.icp import SCATTER, Prior, Registration, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.polar import polar_bin, station_bins
+from coview_kernels.rays import TriangleTree, cast_rays, triangle_tree
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
 from coview_kernels.station_codes import CodedQuery, StationCodes
@@ -49,11 +50,13 @@ __all__ = [
     "Registration",
     "Scale",
     "StationCodes",
+    "TriangleTree",
     "WindowImages",
     "WindowRaster",
     "align_planes",
     "all_shift_distance",
     "backend",
+    "cast_rays",
     "column_spectra",
     "coview",
     "crop_points",
@@ -71,6 +74,7 @@ __all__ = [
     "station_bins",
     "submit",
     "transform_unique",
+    "triangle_tree",
     "unexplained",
     "unit_columns",
     "warm_up",

@@ -56,7 +56,7 @@ def test_healthy_machine_has_no_failures(monkeypatch):
         (machine.zenoh_finding({"error": "ModuleNotFoundError"}), "FAIL", "eclipse-zenoh"),
         (machine.zenoh_finding({"version": "1.9.0"}), "warn", "upgrade"),
         (machine.codecs_finding({"missing": ["rosbags"]}), "warn", "coview-stream[messages]"),
-        (machine.open3d_finding({"error": "DependencyError: no libX11; install it"}), "warn", "install it"),
+        (machine.open3d_finding({"error": "DependencyError: no libX11; install it"}), "ok", "install it"),
         (machine.matplotlib_finding({"error": "ImportError"}), "warn", "coview-stream[plot]"),
     ],
 )

@@ -7,7 +7,7 @@ import numpy as np
 
 def distance_to_surfaces(scene, points):
     """(N,) metres to the nearest triangle of the scene as it is now."""
-    from coview_stream.clouds.filters import open3d
+    from coview_stream.sim.casting import open3d
 
     o3d = open3d()
     surfaces = o3d.t.geometry.RaycastingScene(nthreads=1)

@@ -14,6 +14,7 @@ from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.reference.polar import polar_bin, station_bins
+from coview_kernels.reference.rays import cast_rays
 from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
 from coview_kernels.reference.voxel_filter import transform_unique
 from coview_kernels.reference.windows import window_products
@@ -21,6 +22,7 @@ from coview_kernels.reference.windows import window_products
 __all__ = [
     "align_planes",
     "best_codes",
+    "cast_rays",
     "code_products",
     "codes_at",
     "coview",
