@@ -92,7 +92,7 @@ def check_stamps(stamps: Floats, lines: Sequence[int], path: Path) -> None:
         verb = "repeats" if stamps[at] == stamps[at - 1] else "comes before"
         raise RunError(
             f"{path}:{lines[at]}: stamp {stamps[at]:.6f} {verb} the one of the line before; "
-            "sort the lines and remove repetitions"
+            "give each frame the time at which it was measured, in order"
         )
 
 

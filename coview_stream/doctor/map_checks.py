@@ -1,22 +1,27 @@
-"""Checks of a map, and of a recorded run on it: stamps, clouds against odometry, and a place on the map."""
+"""Checks of a map, and of a recorded run on it: stamps, clouds against odometry, a place, and sensors that lie."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.machine_checks import GB, MIN_MEMORY
-from coview_stream.errors import CloudError, CoViewError, MapError
+from coview_stream.errors import CloudError, CoViewError, MapError, RunError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.recordings.run import Run
+    from coview_stream.localization.calibration.calibration import Calibration
+    from coview_stream.recordings.run import Frame, Run
+
+    Judge = Callable[[Frame], tuple[str, str] | None]
 
 # of onnxruntime, the network and other imports, in two processes
 _NETWORK_MEMORY = 0.2 * GB
@@ -81,22 +86,30 @@ _STANDING_STRIDE = 5  # frames, where odometry does not move
 _MIN_RATE, _MAX_RATE = 0.2, 100.0  # Hz; frames of lidars come 1 to 30 times a second
 _SEARCHED = 60  # frames
 _ENOUGH = 20.0  # metres: most robots are found within ten
+_BETWEEN = 0.21  # seconds, at most, between frames that are watched: odometry in between does not hide accelerations
+_WATCHED = 1500  # frames: five minutes
 
 
-def run_findings(run: Run, base_map: BaseMap | None = None) -> Iterator[Finding]:
+def run_findings(run: Run, base_map: BaseMap | None = None, config: LocalizerConfig | None = None) -> Iterator[Finding]:
     """Judge a run of several frames and, with a map, whether it is localized there."""
+    config = config or LocalizerConfig()
     yield stamps_finding(run)
     try:
         frames = seen_frames(run)
     except CoViewError as error:
         yield from_error("run", error)
         return
-    wrong = False
-    for finding in frame_findings(frames):
-        wrong |= finding.verdict == "FAIL"
-        yield finding
-    if base_map is not None and not wrong:
-        yield place_finding(run, base_map)
+    found = list(frame_findings(frames))
+    wrong = [finding.what for finding in found if finding.verdict == "FAIL"]
+    sensors = []
+    if len(run) > 1 and wrong in ([], ["motion"]):
+        sensors = list(sensor_findings(run, None if wrong else base_map, config))
+    lies = any(finding.verdict == "FAIL" for finding in sensors)
+    yield from (finding for finding in found if not (lies and finding.what == "motion"))  # named better below
+    if lies or not wrong:
+        yield from sensors
+    if base_map is not None and not wrong and not lies:
+        yield place_finding(run, base_map, config)
 
 
 def stamps_finding(run: Run) -> Finding:
@@ -135,7 +148,7 @@ def seen_frames(run: Run) -> list[SeenFrame]:
     return frames
 
 
-def place_finding(run: Run, base_map: BaseMap) -> Finding:
+def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Finding:
     """Search the map for the beginning of the run; FAIL where no place stands out after enough metres."""
     try:
         from coview_stream.localization.localizer import Localizer
@@ -143,7 +156,7 @@ def place_finding(run: Run, base_map: BaseMap) -> Finding:
     except ImportError as error:
         remedy = "pip install 'coview-stream[all]'"
         return Finding("warn", "place", f"not searched for: {error.name} is missing", remedy)
-    localizer = Localizer(base_map)
+    localizer = Localizer(base_map, config)
     reason, driven = "", 0.0
     step = max(1, len(run) // _SEARCHED)
     indices = range(0, len(run), step) if len(run) <= 4 * _SEARCHED else range(0, 4 * _SEARCHED, 4)
@@ -168,3 +181,65 @@ def place_finding(run: Run, base_map: BaseMap) -> Finding:
     )
     sure = driven >= _ENOUGH and localizer.state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
     return Finding("FAIL" if sure else "warn", "place", found, remedy)
+
+
+def sensor_findings(run: Run, base_map: BaseMap | None, config: LocalizerConfig) -> Iterator[Finding]:
+    """Hold clouds, odometry and, with a map, registrations to it against each other over the run.
+
+    Yields the fault of most of the frames that speak for one, and the calibration at the end, both as while tracking.
+    """
+    try:
+        judge, calibration = _judge(base_map, config)
+    except ImportError:
+        return  # the motion is not compared either, which has been said
+    stride = max(1, int(_BETWEEN / max(float(np.median(np.diff(run.stamps))), 1e-6)))
+    stride -= stride % 2 == 0  # two drivers may take turns
+    indices = range(0, len(run), stride)[:_WATCHED]
+    told = list[tuple[str, str]]()
+    for index in indices:
+        try:
+            fault = judge(run.read(index))
+        except (CloudError, RunError):
+            continue
+        if fault is not None:
+            told.append(fault)
+    seconds = float(run.stamps[indices[-1]] - run.stamps[0])
+    of = "clouds and odometry" if base_map is None else "clouds, odometry and map"
+    if told:
+        cause = Counter(cause for cause, _ in told).most_common(1)[0][0]
+        reason = next(reason for other, reason in reversed(told) if other == cause)
+        found = f"{reason}; so in {len(told)} of {len(indices)} frames"
+        yield Finding("FAIL", "sensors", found, f"cause {cause}: docs/reasons.md says what to do")
+    else:
+        yield Finding("ok", "sensors", f"{of} tell the same motion over {seconds:.0f} s")
+        for clause in calibration().describe(run.mount):
+            found, _, remedy = clause.partition("; ")
+            yield Finding("ok", "calibration", found, remedy)
+
+
+def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Callable[[], Calibration]]:
+    """Return a function that takes a frame and returns cause and reason of a fault, and one for the calibration."""
+    from coview_stream.localization.frame import FramePreparation
+    from coview_stream.localization.localizer import Localizer
+    from coview_stream.localization.tracking.monitor import FAULTS
+    from coview_stream.localization.tracking.motion import Drift
+    from coview_stream.localization.witness.witness import Witness
+
+    if base_map is not None:
+        localizer = Localizer(base_map, config)
+
+        def localized(frame: Frame) -> tuple[str, str] | None:
+            said = localizer.step(frame.points, frame.T_odom_body, frame.stamp).evidence
+            return (said.cause.value, said.reason) if said is not None and said.cause in FAULTS else None
+
+        return localized, lambda: localizer.calibration
+    frames, drift = FramePreparation(config), Drift.of(TrackingConfig())
+    witness = Witness(config.registration, frames.estimator)
+
+    def watched(frame: Frame) -> tuple[str, str] | None:
+        prepared = frames.prepare(frame.points, frame.T_odom_body, frame.stamp, drift.variances)
+        witness.add(prepared.stamp, prepared.cloud, prepared.scan, prepared.T_odom_raw)
+        accused = witness.while_searching(drift)
+        return None if accused is None else (accused.cause.value, accused.sentence)
+
+    return watched, lambda: frames.calibration

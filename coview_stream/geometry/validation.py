@@ -93,7 +93,7 @@ def check_stamp(stamp: float, newest: float | None = None) -> None:
         what = "is that" if stamp == newest else "is before that"
         raise RunError(
             f"stamp {stamp:.3f} {what} of the frame before ({newest:.3f}); frames go forward in time: "
-            "sort them, or call reset() before another run"
+            "give each the time at which it was measured, or call reset() before another run"
         )
 
 

@@ -11,7 +11,7 @@ All three agree where nothing is wrong. A fault makes them disagree in a way of 
 * late: l = o at an earlier time. The lag is constant, or grows: by and by, or steadily.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
   body does, and from then on l = C^-1 o C.
-* mixed: clouds of several places; l is anything, and most clouds do not fit each other.
+* mixed: clouds of two places; half of the time l is anything, and most such clouds do not fit each other.
 
 Each registration fails with a small probability and then says anything. The probabilities are those of a hidden Markov
 model: those before the step, moved by the rates at which faults come and go, times the likelihood of l and m (forward
@@ -222,7 +222,8 @@ class FaultPosterior:
         new_stopped = 0.0
         if stands:
             new_stopped = (come * (good + slip) + (1.0 - ends) * self.stopped) * float(like(*self._going_on(step)))
-        new_mixed = (come * (good + slip) + (1.0 - ends) * self.mixed) * anything
+        both = 0.5 * (anything + float(like(o)))  # of the same place half of the time
+        new_mixed = (come * (good + slip) + (1.0 - ends) * self.mixed) * both
         back = (1.0 - _SLIPS_ON) * slip * float(like(o)) + ends * (self.repeated + self.mixed) * anything
         back += ends * self.stopped * float(like(o))
 
@@ -327,7 +328,7 @@ class FaultPosterior:
         if self._moved_on > metres:
             words = f"odometry stands still while the lidar moves by {self._moved_on:.1f} m"
             wrong.append(Accusation(RejectionReason.STOPPED, self.stopped, words))
-        words = "clouds do not fit each other: they are of more than one place"
+        words = "clouds do not fit each other: they are of more than one place, as of two drivers on one key"
         wrong.append(Accusation(RejectionReason.MIXED, self.mixed, words))
         late = self.steady + self.growing
         off = LAGS * float(np.linalg.norm(self._speed[:2])) > metres
@@ -346,7 +347,7 @@ class FaultPosterior:
         for h in self.moved:
             shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))
             if shift > metres or turn > radians:
-                words = f"clouds jumped by {shift:.1f} m as no body moves"
+                words = f"clouds jumped by {shift:.1f} m as no body moves: of another driver on their key?"
                 if turn > _TURNED:
                     words = f"the sensor was turned by {math.degrees(turn):.0f} degrees on its mount"
                 wrong.append(Accusation(RejectionReason.MOUNT, h.weight, words, shift < _ON_BODY))

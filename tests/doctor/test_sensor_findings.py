@@ -1,0 +1,57 @@
+"""A run whose clouds or odometry lie: the doctor names the sensor, without a map, and contradicts itself nowhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.doctor.map_checks import run_findings
+from coview_stream.recordings.run import Run
+
+BEGIN = 18  # frame of the fault
+DT = 0.2  # seconds between frames, at two metres per second
+
+pytestmark = pytest.mark.slow
+
+
+class Clouds(list):
+    def read(self, index, correction=None):
+        return Cloud(self[index], np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def way(scene):
+    return small_world.record_along(scene, small_world.drive(12), 0.4)
+
+
+def findings(clouds, odometry):
+    stamps = DT * np.arange(len(clouds))
+    run = Run(Path("run"), (Path("run"),) * len(clouds), stamps, np.array(odometry), Clouds(clouds))
+    return {finding.what: finding for finding in run_findings(run)}
+
+
+def test_undisturbed_run_is_told_to_agree(way):
+    found = findings(way.clouds, way.T_odom_body)
+    assert found["sensors"].verdict == found["motion"].verdict == "ok"
+    assert "calibration" not in found
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        (lambda way, k: (way.clouds[BEGIN], way.T_odom_body[k]), "the lidar repeats itself"),
+        (lambda way, k: (way.clouds[k], way.T_odom_body[BEGIN]), "odometry stands still while the lidar moves"),
+        (lambda way, k: (way.clouds[(k * (1 + 20 * (k % 2))) % len(way.clouds)], way.T_odom_body[k]), "two drivers"),
+    ],
+    ids=["repeated", "stopped", "alternating"],
+)
+def test_sensor_that_lies_is_named_once_with_its_cause(way, fault, says):
+    lies = [fault(way, k) if k >= BEGIN else (way.clouds[k], way.T_odom_body[k]) for k in range(len(way.clouds))]
+    found = findings(*zip(*lies, strict=True))
+    assert found["sensors"].verdict == "FAIL"
+    assert says in found["sensors"].found
+    assert [what for what, finding in found.items() if finding.verdict == "FAIL"] == ["sensors"]
