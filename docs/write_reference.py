@@ -1,8 +1,8 @@
-"""Write the pages that come from the code: docs/options.md, and the table of public names in docs/python.md.
+"""Write what comes from code and results: docs/options.md, names in docs/python.md, figures in docs/limits.md.
 
     python docs/write_reference.py
 
-A test compares both with the code.
+A test compares them.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 
 HERE = Path(__file__).resolve().parent
+_FIGURE = re.compile(r"(<!-- (\w+), ([^>]+?) -->).*?(?=<!-- end -->)")
 _NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
@@ -147,8 +148,22 @@ def python_page(text: str) -> str:
     return _NAMES.sub(lambda _: names_table(), text)
 
 
+def limits_page(text: str, results: str) -> str:
+    """Return docs/limits.md with its figures, ``<!-- table, row -->``, as docs/results.md has them."""
+
+    def figure(found: re.Match[str]) -> str:
+        part = results.split(f"\n## {found[2]}\n")[1].split("<!-- end -->")[0]
+        row = next(line for line in part.splitlines() if line.startswith(f"|{found[3]}|"))
+        return found[1] + row.split("|")[2]
+
+    return _FIGURE.sub(figure, text)
+
+
 def main() -> None:
-    """Write both pages."""
+    """Write the pages."""
+    page = HERE / "limits.md"
+    results = (HERE / "results.md").read_text(encoding="utf-8")
+    page.write_text(limits_page(page.read_text(encoding="utf-8"), results), encoding="utf-8")
     (HERE / "options.md").write_text(options_page(), encoding="utf-8")
     page = HERE / "python.md"
     page.write_text(python_page(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -213,6 +213,9 @@ def test_site_shows_links_out_of_docs_as_text_and_the_reference_in_full():
 def test_generated_pages_are_those_of_the_code():
     reference = script(DOCS / "write_reference.py")
     assert text_of("options.md") == reference.options_page(), "run python docs/write_reference.py"
+    limits = reference.limits_page(text_of("limits.md"), text_of("results.md"))
+    assert text_of("limits.md") == limits, "run python docs/write_reference.py"
+    assert limits.count("<!-- faults, ") == 3
     assert text_of("python.md") == reference.python_page(text_of("python.md")), "run python docs/write_reference.py"
     fields = text_of("options.md").partition("## Configuration in Python")[2]
     assert re.findall(r"^\|`(\w+)`\|.*\|\|$", fields, re.MULTILINE) == []  # each says its meaning

@@ -28,7 +28,7 @@ from bench.harness.worlds import prepared_run, world_name
 from coview_stream import BaseMap, Localizer
 from coview_stream.clouds import read_tum
 from coview_stream.errors import CloudError, InputError, RunError
-from coview_stream.localization.result import Fix
+from coview_stream.localization.result import Fix, calibration_says
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
@@ -156,7 +156,7 @@ def _without_numbers(clause: str) -> str:
 def _said(fix: Fix) -> list[str]:
     """Return the clauses that status, ``watch`` and ``locate`` print of a fix."""
     reason = [fix.evidence.reason] if fix.evidence is not None and fix.T_map_body is None else []
-    return reason + ([] if fix.calibration is None else fix.calibration.describe())
+    return reason + ([] if fix.calibration is None else calibration_says(fix.calibration, fix.evidence))
 
 
 def verdicts(found: Sequence[dict[str, Any]]) -> Iterator[Row]:

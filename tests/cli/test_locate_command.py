@@ -86,6 +86,17 @@ def test_odometry_from_another_file(world_file, world_run, world_drive, tmp_path
         assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.1
 
 
+@pytest.mark.slow
+def test_clouds_of_identical_bytes_are_named_in_the_summary(world_file, world_run, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(world_run, run)
+    first, *others = sorted((run / "frames").iterdir())
+    for path in others:
+        shutil.copy(first, path)
+    main(["locate", str(world_file), str(run), "-o", str(tmp_path / "out"), "--no-pictures"])
+    assert "the lidar repeats itself" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("kind", "damage"),
     [
@@ -93,6 +104,9 @@ def test_odometry_from_another_file(world_file, world_run, world_drive, tmp_path
         ("unsorted", lambda lines: [lines[0], lines[2], lines[1], *lines[3:]]),
         ("nan", lambda lines: [*lines[:2], lines[2].replace(lines[2].split()[1], "nan"), *lines[3:]]),
         ("text", lambda lines: ["no numbers here", *lines[1:]]),
+        ("constant", lambda lines: [" ".join(["100.0", *line.split()[1:]]) for line in lines]),
+        ("zero", lambda lines: [" ".join(["0", *line.split()[1:]]) for line in lines]),
+        ("repeated", lambda lines: [lines[0], " ".join([lines[0].split()[0], *lines[1].split()[1:]]), *lines[2:]]),
         ("missing", None),
         ("frames", None),
     ],
@@ -109,6 +123,8 @@ def test_damaged_run_is_one_line(world_file, world_run, tmp_path, refused, kind,
     else:
         odometry.write_text("\n".join(damage(odometry.read_text().splitlines())) + "\n")
     message = "000000.ply" if kind == "frames" else "odometry"
+    if kind in ("constant", "zero", "repeated"):
+        message = "repeats the one of the line before; give each frame the time at which it was measured"
     assert message in refused("locate", world_file, run, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

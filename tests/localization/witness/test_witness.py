@@ -128,6 +128,17 @@ def test_a_scan_that_is_repeated_ends_the_poses(world_map, way, noise):
 
 
 @pytest.mark.slow
+def test_identical_clouds_from_the_first_frame_are_named_within_five_seconds(world_map, way):
+    localizer = Localizer(world_map)
+    for k in range(round(5.0 / DT)):
+        fix = localizer.step(way.clouds[0], way.T_odom_body[k], DT * k)
+        off = 0.0 if fix.T_map_body is None else np.linalg.norm((fix.T_map_body - way.T_map_body[k])[:3, 3])
+        assert off < 1.5
+    assert fix.T_map_body is None
+    assert fix.evidence.reason.startswith("the lidar repeats itself")
+
+
+@pytest.mark.slow
 def test_a_robot_that_stands_is_served(world_map, way):
     stands = [way.clouds[BEGIN]] * 25
     odometry = [*way.T_odom_body[:BEGIN], *[way.T_odom_body[BEGIN]] * 25]
