@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import small_world
 
 from coview_stream.config import RegistrationConfig, TrackingConfig
+from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
-from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.tracking.map_matching import MapMatch
+from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.witness.cloud_motion import CloudMotionMeter
 from coview_stream.localization.witness.faults import FaultPosterior
 from coview_stream.localization.witness.witness import Witness
@@ -100,20 +105,23 @@ def test_hours_without_a_hole_in_the_stamps_make_none_impossible():
     assert 0.005 < steps[-1].holes < 0.02
 
 
-@pytest.mark.slow
-def test_clouds_are_compared_on_frames_without_a_registration(world_map, way, monkeypatch):
-    """Of the frame before, which had one: a frame with both would take longest."""
-    note, both = Steps(), []
-    monkeypatch.setattr("coview_stream.localization.witness.witness.FaultPosterior", lambda: note)
-    localizer = Localizer(world_map)
-    for k, cloud in enumerate(way.clouds[:30]):
-        compared = len(note.steps)
-        fix = localizer.step(cloud, way.T_odom_body[k], DT * k)
-        if k > 10 and len(note.steps) > compared:
-            both.append(fix.evidence.stamp == DT * k)
-    assert len(both) >= 5
-    assert not any(both)
-    assert all(step.on_map is not None for step in note.steps[-5:])
+@pytest.mark.parametrize(("cause", "waits"), [(RejectionReason.VERIFIED, True), (RejectionReason.FITNESS, False)])
+def test_a_comparison_waits_for_the_frame_after_a_registration_unless_the_map_contradicts(cause, waits):
+    """A frame with both would take longest."""
+    witness, T = Witness(RegistrationConfig(), CalibrationEstimator()), np.eye(4)
+    odometry = SimpleNamespace(drift=Drift.of(TrackingConfig()))
+    tracker = SimpleNamespace(odometry=odometry, protection_level=lambda: protection_level(0.01 * np.eye(6), 1.0))
+    belief = Estimate(T, 1e-4 * np.eye(6))
+    match = MapMatch.without_registration(MatchVerdict(cause, ""), belief)
+    witness.faults = note = Steps()
+    counts = []
+    for k in range(4):
+        witness.add(float(k), np.zeros((1, 3), np.float32), RawScan(np.zeros((1, 3), np.float32), T), T)
+        assert not witness.between_registrations(tracker)
+        counts.append(len(note.steps))
+        witness.while_tracking(match, belief, tracker)
+        counts.append(len(note.steps))
+    assert counts == ([0, 0, 0, 0, 1, 1, 2, 2] if waits else [0, 0, 0, 1, 1, 2, 2, 3])
 
 
 @pytest.mark.slow
