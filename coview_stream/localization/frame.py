@@ -104,7 +104,7 @@ class FramePreparation:
         T = self._odometry.correct(history.at(stamp - delay), self.calibration, before)
         moment = Moment(stamp, history.rates(stamp - delay))
         self._newest = stamp
-        if drift is not None or not self.conventions.plausible:
+        if not self.conventions.plausible or self.conventions.finding is not None:
             self.conventions.add(self.calibration.level(raw), T_raw)
         if self.anchor is None:
             self.anchor = T[:3, 3].copy()

@@ -315,7 +315,7 @@ class Localizer:
         doubtful = self._frames.conventions.doubtful
         if not searching and not doubtful:
             return frame, None
-        accused = self._witness.while_searching(self._tracker.odometry.drift)
+        accused = self._witness.while_searching(self._tracker.odometry.drift, self._frames.conventions)
         if not searching:
             self.require_verification()
             reason, cause = DOUBT, RejectionReason.CONVENTIONS

@@ -28,7 +28,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
-from coview_stream.localization.registration.surfaces import motion_prior, register_to_cloud, surface_points
+from coview_stream.localization.registration.surfaces import LONGEST, motion_prior, register_to_cloud, surface_points
 
 # set by hand
 _POSITION = 0.02  # sigma of a registered motion, metres
@@ -38,7 +38,6 @@ _POORER = 3.0  # times the configured drift that odometry may have
 _FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
 _FAILED_ANGLE = math.radians(3.0)
 _FAILED = 0.15
-_LONGEST = 12.0  # metres between two keyframes
 
 Variances = Callable[[float, float], Floats]
 """Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, of metres driven and radians turned."""
@@ -99,7 +98,7 @@ class FrameMotion:
     ) -> Pose | None:
         """Return the registered pose (4, 4), odometry <- body; None if the frames cannot be registered."""
         far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
-        if len(reference.points) < MIN_PAIRS or far > _LONGEST:
+        if len(reference.points) < MIN_PAIRS or far > LONGEST:
             return None
         level = estimator.calibration.T_body_cloud
         then = reference.T_odom_body @ level

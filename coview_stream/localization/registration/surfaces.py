@@ -14,7 +14,10 @@ from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import register
 
+LONGEST = 12.0
+"""Metres between two clouds that still show the same."""
 _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
+_FARTHER = 3.0  # metres, of a start that nothing is known about
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
 _FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of it
 
@@ -32,10 +35,15 @@ def motion_prior(T_start: Pose, far: float) -> kernels.Prior:
 
 
 def register_to_cloud(
-    scan: RegistrationCloud, target: LocalMap, prior: kernels.Prior, config: RegistrationConfig, centre: Floats
+    scan: RegistrationCloud, target: LocalMap, start: kernels.Prior | Pose, config: RegistrationConfig, centre: Floats
 ) -> Registration | None:
-    """Register a scan to the surfaces of an earlier one from a prior's mean, which turns about ``centre`` (3,)."""
-    return register(scan, prior.T_map_source, target, config, _SCALES, prior, centre)
+    """Register a scan to the surfaces of an earlier one from a prior's mean, or from any pose (4, 4).
+
+    The motion turns about ``centre`` (3,).
+    """
+    if isinstance(start, kernels.Prior):
+        return register(scan, start.T_map_source, target, config, _SCALES, start, centre)
+    return register(scan, start, target, config, (_FARTHER, *_SCALES), centre=centre)
 
 
 def surface_points(points: Points) -> tuple[Points, Floats32]:

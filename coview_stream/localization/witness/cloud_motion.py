@@ -18,7 +18,7 @@ from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.planar import planar_motion
-from coview_stream.geometry.transforms import Pose, Poses, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import Pose, Poses, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import registration_covariance, remove_prior
@@ -46,6 +46,7 @@ class CloudMotion(NamedTuple):
     covariance: Floats  # (3, 3), wide along a tunnel
     fit: float  # share of the structure that lies on the earlier surfaces
     usual: float  # the same, of the motions before
+    T: Pose | None  # (4, 4) in the axes of the earlier body; None where none can be registered
 
 
 class CloudMotionMeter:
@@ -91,9 +92,11 @@ class CloudMotionMeter:
             best = found[0]
         usual = self._usual or best[2]
         if best[0] is None:
-            return CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), 0.0, usual)
+            return CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), 0.0, usual, None)
         self._usual = usual + _LEARNS * (best[2] - usual)
-        return CloudMotion(*_in_plane(best[0], best[1], before.T_odom_body, now.T_odom_body), best[2], usual)
+        T_now = pose_from(best[0][:3, :3] @ now.T_odom_body[:3, :3], before.position + best[0][:3, 3])
+        motion, covariance = _in_plane(T_now, best[1], before.T_odom_body)
+        return CloudMotion(motion, covariance, best[2], usual, inverse(before.T_odom_body) @ T_now)
 
     def _registered(
         self, scan: RegistrationCloud, target: LocalMap, T_start: Pose
@@ -133,12 +136,8 @@ def _starts(odometry: Pose) -> Poses:
     return np.stack(poses)
 
 
-def _in_plane(T: Pose, covariance: Floats, T_before: Pose, T_now: Pose) -> tuple[Floats, Floats]:
-    """Return a registered pose (4, 4) in odometry's axes and its covariance as a planar motion and its (3, 3)."""
-    turn = yaw_of(T_before)
-    seen = pose_from(T[:3, :3] @ T_now[:3, :3], T_before[:3, 3] + T[:3, 3])
-    motion = planar_motion(T_before, seen)
-    axes = [3, 4, 2]
-    R = rot_z(-turn)
+def _in_plane(T_now: Pose, covariance: Floats, T_before: Pose) -> tuple[Floats, Floats]:
+    """Return a pose (4, 4) after another and its covariance (6, 6) as a planar motion and its (3, 3)."""
+    motion, R, axes = planar_motion(T_before, T_now), rot_z(-yaw_of(T_before)), np.ix_([3, 4, 2], [3, 4, 2])
     noise = _NOISE + _NOISE_METRE * float(np.linalg.norm(motion[:2]))
-    return motion, R @ covariance[np.ix_(axes, axes)] @ R.T + np.diag(noise**2)
+    return motion, R @ covariance[axes] @ R.T + np.diag(noise**2)

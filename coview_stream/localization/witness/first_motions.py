@@ -6,7 +6,6 @@ a motion that it does not have.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -17,8 +16,8 @@ from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, wrap_angle, yaw_of
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan, voxelized
-from coview_stream.localization.registration.register import register, registration_covariance
-from coview_stream.localization.registration.surfaces import surface_points
+from coview_stream.localization.registration.register import registration_covariance
+from coview_stream.localization.registration.surfaces import register_to_cloud, surface_points
 from coview_stream.localization.witness.conventions import (
     AS_SENT,
     AXES,
@@ -49,8 +48,7 @@ DOUBT = "odometry does not follow the first clouds: do both come in metres, x fo
 
 _LONGEST_CHAIN = 8  # clouds, where the robot hardly moves
 _STUCK = 0.05  # metres, that clouds of one place seem to have moved at most
-_SCALES = (3.0, 1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
-_NEW_START = 1.0  # metres from all other starts; the coarsest scale reaches three times as far
+_NEW_START = 1.0  # metres from all other starts; a registration reaches three times as far
 _POINTS = 4000  # of a cloud, registered
 _ENOUGH, _SAME = 3, 0.2  # starts that reach the same motion, and metres between two that are the same
 _PAIRS = 6  # the newest, by which the localizer judges
@@ -70,27 +68,35 @@ class CloudPairs:
         self._config = RegistrationConfig()
         self._level = pose_from(turning(up, UP), np.zeros(3))
         self._target: LocalMap | None = None
-        self._newest = np.eye(4)  # odometry of the newest cloud
         self._begin(np.eye(4))
         self._step = np.eye(4)  # the newest motion
 
     def _begin(self, T_odom_body: Pose) -> None:
-        self._first, self._clouds, self._motion, self._variance = T_odom_body, 0, np.eye(4), 0.0
+        self._first = self._newest = T_odom_body  # odometry of the first cloud and of the newest
+        self._clouds, self._motion, self._variance = 0, np.eye(4), 0.0
 
-    def add(self, points: Points, T_odom_body: Pose, anywhere: bool = True) -> Pair | None:
+    def add(self, points: Points, T_odom_body: Pose) -> Pair | None:
         """Add a cloud (N, 3), metres, and its odometry (4, 4); return the motion since the pair's first, if far enough.
 
-        Shorter ones are added up. Unless it may be ``anywhere``, a registration begins at odometry's motion alone.
+        Shorter ones are added up.
         """
-        cloud = voxelized(points, self._level, KeyframeConfig())
-        found = [] if self._target is None else self._registered(cloud, T_odom_body, anywhere)
-        self._target, self._newest = LocalMap(*surface_points(cloud)), T_odom_body
-        if not found:
+        cloud, pair = voxelized(points, self._level, KeyframeConfig()), None
+        found = [] if self._target is None else self._registered(cloud, T_odom_body)
+        if found:
+            variance, self._step = min(found, key=lambda each: each[0])
+            pair = self.add_step(self._step, variance, self._newest, T_odom_body)
+        else:
             self._begin(T_odom_body)
             self._step = np.eye(4)
-            return None
-        best, self._step = min(found, key=lambda each: each[0])
-        self._motion, self._variance = self._motion @ self._step, self._variance + best
+        self._target = LocalMap(*surface_points(cloud))
+        return pair
+
+    def add_step(self, step: Pose, variance: float, T_before: Pose, T_odom_body: Pose) -> Pair | None:
+        """Add a motion (4, 4) between two clouds, its variance in m2, and odometry (4, 4) at both; return as above."""
+        if T_before is not self._newest:
+            self._begin(T_before)
+        self._target, self._newest = None, T_odom_body
+        self._motion, self._variance = self._motion @ step, self._variance + variance
         self._clouds += 1
         moved, odometry = (float(np.linalg.norm(T[:3, 3])) for T in (self._motion, inverse(self._first) @ T_odom_body))
         stuck = moved < _STUCK and odometry > BASELINE
@@ -100,15 +106,14 @@ class CloudPairs:
         self._begin(T_odom_body)
         return pair
 
-    def _registered(self, cloud: Points, T_odom_body: Pose, anywhere: bool) -> list[tuple[float, Pose]]:
+    def _registered(self, cloud: Points, T_odom_body: Pose) -> list[tuple[float, Pose]]:
         """Return the motions (4, 4) that are reached, each after its variance, m2; enough starts that agree suffice."""
         here, target = np.zeros(3), self._target
         assert target is not None
         scan = prepare_scan(cloud[:: 1 + len(cloud) // _POINTS], here, self._config)
         motions = list[tuple[float, Pose]]()
-        guesses = starts(self._newest, T_odom_body, self._step)
-        for start in guesses if anywhere else itertools.islice(guesses, 1):
-            match = register(scan, start, target, self._config, _SCALES, centre=here)
+        for start in starts(self._newest, T_odom_body, self._step):
+            match = register_to_cloud(scan, target, start, self._config, here)
             if match is None or not match.converged:
                 continue
             covariance = registration_covariance(match.information, self._config)  # wide along a corridor
@@ -182,8 +187,7 @@ class Conventions:
             self._pairs_in_feet.clear()
             self.doubtful = False
             self._motions_in_feet = CloudPairs(AXES[axis])
-        anywhere = not self.plausible or (len(self._pairs) > 0 and fit([self._pairs[-1]]).odds < 0.0)
-        found = [(self._pairs, self._motions.add(points, T_odom_body, anywhere))]
+        found = [(self._pairs, self._motions.add(points, T_odom_body))]
         if not self.plausible:
             in_feet = self._motions_in_feet.add(points * np.float32(FOOT), T_odom_body)
             found.append((self._pairs_in_feet, in_feet))
@@ -191,6 +195,18 @@ class Conventions:
             if pair is not None:
                 pairs.append(pair)
         if any(pair is not None for _, pair in found):
+            self._judge()
+
+    def add_motion(self, motion: Pose, variance: float, T_before: Pose, T_odom_body: Pose) -> None:
+        """Judge a motion (4, 4) of clouds, its variance in m2, and odometry (4, 4) before and after it.
+
+        It was registered from odometry's, so it tells nothing before the two are plausible.
+        """
+        if not self.plausible or self.settled or self._motions is None:
+            return
+        pair = self._motions.add_step(motion, variance, T_before, T_odom_body)
+        if pair is not None:
+            self._pairs.append(pair)
             self._judge()
 
     def _judge(self) -> None:

@@ -17,6 +17,7 @@ from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
 from coview_stream.geometry.transforms import Points, Pose, inverse, rot_z, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.registration.surfaces import LONGEST
 from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
@@ -24,11 +25,11 @@ from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.tracker import Tracker
 from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter
 from coview_stream.localization.witness.faults import FAILS, LAGS, Accusation, FaultPosterior, Seen, Step
+from coview_stream.localization.witness.first_motions import Conventions
 
 _METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # of a step, whichever comes first
 _SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
 _FAR = 5.0  # metres
-_LONGEST = 12.0  # metres of a step of which the clouds still show the same
 _MANY = 5  # frames of a step, which one more makes hardly longer
 _RECENT = 3  # frames of odometry of which the velocity is taken
 _HISTORY = 600  # frames of odometry
@@ -42,6 +43,7 @@ _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stan
 class _Frame(NamedTuple):
     stamp: float
     scan: RawScan
+    T_odom_raw: Pose
     path: Floats  # (3,) planar pose by odometry, corrected
     copied: bool  # it has the bytes of the one before
     number: int
@@ -102,15 +104,23 @@ class Witness:
         self._path.append((stamp, pose))
         copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
         self._cloud = cloud.copy()
-        self._previous, self._newest = self._newest, _Frame(stamp, scan, pose, copied, next(self._numbers))
+        newest = _Frame(stamp, scan, T_odom_raw, pose, copied, next(self._numbers))
+        self._previous, self._newest = self._newest, newest
         if self._reference is None:
             self._reference = self._newest
 
-    def while_searching(self, drift: Drift) -> Accusation | None:
-        """Compare the newest frame if that is due; return the fault that would make a place wrong, if there is one."""
+    def while_searching(self, drift: Drift, conventions: Conventions | None = None) -> Accusation | None:
+        """Compare the newest frame if that is due; return the fault that would make a place wrong, if there is one.
+
+        ``conventions`` learn the motion too.
+        """
         self._compare_waiting(drift)
-        if self._newest is not None and self._is_due() and not self._may_hide_turns():
-            self._compare(self._newest, self._previous, drift)
+        before, now = self._reference, self._newest
+        if before is not None and now is not None and self._is_due() and not self._may_hide_turns():
+            seen = self._compare(now, self._previous, drift)
+            if conventions is not None and seen is not None and seen.T is not None:
+                variance = float(seen.covariance.diagonal()[:2].max())
+                conventions.add_motion(seen.T, variance, before.T_odom_raw, now.T_odom_raw)
         return self._accusation(0.5 * ALERT_METRES, 0.5 * ALERT_DEGREES)
 
     def between_registrations(self, tracker: Tracker) -> bool:
@@ -190,8 +200,8 @@ class Witness:
         registered: Estimate | None = None,
         belief: Estimate | None = None,
         contradicted: bool = False,
-    ) -> None:
-        """Compare a frame with the one of the last comparison.
+    ) -> CloudMotion | None:
+        """Compare a frame with the one of the last comparison; return the clouds' motion, if they show one.
 
         Args:
             now: the frame.
@@ -203,7 +213,7 @@ class Witness:
         """
         before = self._reference
         if before is None or now.stamp <= before.stamp:
-            return
+            return None
         now = now._replace(on_map=registered or belief)
         calibration = self._follow()
         delay = calibration.delay
@@ -215,7 +225,7 @@ class Witness:
         noise = np.diag(_JITTER**2 + [x + along**2, y + across**2, yaw + (calibration.sigma_turn * driven) ** 2])
         on_map = None if registered is None else _on_map(before.on_map, registered)
         seen: CloudMotion | None = None
-        if driven <= _LONGEST:
+        if driven <= LONGEST:
             guess = on_map.motion if contradicted and on_map is not None else None
             seen = self._meter.measure(before.scan, now.scan, calibration, guess)
         clouds = None if seen is None else Seen(seen.motion, seen.covariance)
@@ -243,6 +253,7 @@ class Witness:
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
             self._estimator.rescale(*rescaled)
         self._reference = now
+        return seen
 
     def _excess(self, begin: float, end: float) -> float:
         """Return the seconds by which stamps from ``begin`` to ``end`` are farther apart than usual; 0 within half."""
