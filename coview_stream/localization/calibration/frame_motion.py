@@ -28,12 +28,15 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
-from coview_stream.localization.registration.surfaces import LONGEST, motion_prior, register_to_cloud, surface_points
+from coview_stream.localization.registration.surfaces import (
+    LONGEST,
+    motion_prior,
+    motion_sigmas,
+    register_to_cloud,
+    surface_points,
+)
 
 # set by hand
-_POSITION = 0.02  # sigma of a registered motion, metres
-_POSITION_METRE = 0.01  # and per metre driven: as in three real runs at two to eight metres a step
-_ANGLE = math.radians(0.2)  # sigma of a registered motion
 _POORER = 3.0  # times the configured drift that odometry may have
 _FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
 _FAILED_ANGLE = math.radians(3.0)
@@ -123,16 +126,16 @@ def _corrected(
     motion, step = inverse(before) @ T_registered, inverse(before) @ T_odom_body
     far = float(np.linalg.norm(step[:3, 3]))
     variances = drift(far, abs(yaw_of(step)))
-    position = math.hypot(_POSITION, _POSITION_METRE * far)
-    right = _probability_right(motion, step, variances, estimator.calibration, position)
-    sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
+    position, angle = motion_sigmas(far)
+    right = _probability_right(motion, step, variances, estimator.calibration)
+    sigmas = position / math.sqrt(right), angle / math.sqrt(right)
     step = estimator.measure_frames(motion, step, variances, *sigmas, moments)
     turn = estimator.calibration.T_body_cloud @ inverse(level)
     motion = turn @ motion @ inverse(turn)
     return _fused(before @ step, before @ motion, variances, *sigmas)
 
 
-def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration, position: float) -> float:
+def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration) -> float:
     """Return the probability that a registration succeeded, by its difference from odometry's ``step``.
 
     A failed one (a street looks alike along its length, a lorry drives away) may end anywhere within its reach.
@@ -141,7 +144,8 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration:
     gap = np.concatenate([log_so3(motion[:3, :3] @ step[:3, :3].T), motion[:3, 3] - step[:3, 3]])
     tilt, sigma = calibration.sigma_tilt * far, calibration.sigma_heading
     constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, sigma * far, tilt])
-    noise = np.array([_ANGLE] * 3 + [position] * 3)
+    position, angle = motion_sigmas(far)
+    noise = np.array([angle] * 3 + [position] * 3)
     right = _POORER**2 * variances + constant**2 + noise**2
     turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that shows in rotation
     right[:2] += (calibration.sigma_tilt * turn) ** 2

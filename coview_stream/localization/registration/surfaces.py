@@ -21,6 +21,11 @@ _FARTHER = 3.0  # metres, of a start that nothing is known about
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
 _FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of it
 
+# sigmas of a registered motion, set by hand
+_POSITION = 0.02  # metres
+_POSITION_METRE = 0.01  # and per metre: as in three real runs at two to eight metres a step
+_ANGLE = math.radians(0.2)
+
 # surface patches
 _CELL = 1.0  # metres
 _CELL_POINTS = 5
@@ -32,6 +37,11 @@ def motion_prior(T_start: Pose, far: float) -> kernels.Prior:
     """Return the prior of a motion by ``far`` metres about its start (4, 4)."""
     free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
     return kernels.Prior(T_start, np.diag(free**-2.0))
+
+
+def motion_sigmas(far: float) -> tuple[float, float]:
+    """Return the sigmas of a registered motion by ``far`` metres, in metres and in radians."""
+    return math.hypot(_POSITION, _POSITION_METRE * far), _ANGLE
 
 
 def register_to_cloud(

@@ -22,7 +22,12 @@ from coview_stream.geometry.transforms import Pose, Poses, inverse, pose_from, r
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import registration_covariance, remove_prior
-from coview_stream.localization.registration.surfaces import motion_prior, register_to_cloud, surface_points
+from coview_stream.localization.registration.surfaces import (
+    motion_prior,
+    motion_sigmas,
+    register_to_cloud,
+    surface_points,
+)
 
 _ON_SURFACE = 0.1  # metres from an earlier surface, across it: its thickness, one sigma, is no more than 0.15
 _REACH = 1.0  # metres to the nearest point of the surface, along it: sparse lidars have rings so far apart
@@ -35,8 +40,6 @@ _STARTS = 2  # registered of those, the best
 _ALIKE = 0.03  # difference of fits that counting so many points does not resolve (one sigma)
 _STAYS = 0.06  # metres: three sigmas of a motion
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
-_NOISE = np.array([0.02, 0.02, np.radians(0.2)])  # sigma of a motion, as of `frame_motion`
-_NOISE_METRE = np.array([0.01, 0.01, 0.0])  # and per metre of it
 
 
 class CloudMotion(NamedTuple):
@@ -139,5 +142,5 @@ def _starts(odometry: Pose) -> Poses:
 def _in_plane(T_now: Pose, covariance: Floats, T_before: Pose) -> tuple[Floats, Floats]:
     """Return a pose (4, 4) after another and its covariance (6, 6) as a planar motion and its (3, 3)."""
     motion, R, axes = planar_motion(T_before, T_now), rot_z(-yaw_of(T_before)), np.ix_([3, 4, 2], [3, 4, 2])
-    noise = _NOISE + _NOISE_METRE * float(np.linalg.norm(motion[:2]))
-    return motion, R @ covariance[axes] @ R.T + np.diag(noise**2)
+    position, angle = motion_sigmas(float(np.linalg.norm(motion[:2])))
+    return motion, R @ covariance[axes] @ R.T + np.diag([position, position, angle]) ** 2
