@@ -37,7 +37,8 @@ _COARSE = 0.4  # metres, of the fit of starts that are not registered yet
 _USUAL = 0.7  # times the usual fit, below which other starts are tried
 _LEARNS = 0.1  # weight of a new fit in the usual one
 _STARTS = 2  # registered of those, the best
-_ALIKE = 0.03  # difference of fits that counting so many points does not resolve (one sigma)
+ALIKE = 0.03
+"""Difference of fits that counting so many points does not resolve (one sigma)."""
 _STAYS = 0.06  # metres: three sigmas of a motion
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
 
@@ -81,17 +82,17 @@ class CloudMotionMeter:
             turn = guess[2] - planar_motion(before.T_odom_body, now.T_odom_body)[2]
             shift = rot_z(yaw_of(before.T_odom_body)) @ [guess[0], guess[1], odometry[2, 3]]
             found.append(self._registered(scan, target, pose_from(rot_z(turn), shift)))
-        if _fit(scan, target, none, _ON_SURFACE) > max(fit for *_, fit in found):
+        if fit_of(scan, target, none) > max(fit for *_, fit in found):
             still = self._registered(scan, target, none)
             # rings lie on each other where nothing moves, too; but a copy stays where it began
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
         if max(fit for *_, fit in found) < _USUAL * self._usual:
             starts = _starts(odometry)
-            fits = np.array([_fit(scan, target, T, _COARSE) for T in starts])
+            fits = np.array([fit_of(scan, target, T, _COARSE) for T in starts])
             found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
         best = max(found[1:], key=lambda each: each[2], default=found[0])
-        if best[2] <= found[0][2] + 2.0 * _ALIKE:
+        if best[2] <= found[0][2] + 2.0 * ALIKE:
             best = found[0]
         usual = self._usual or best[2]
         if best[0] is None:
@@ -115,12 +116,14 @@ class CloudMotionMeter:
         except InputError:
             return None, np.eye(6), 0.0
         # along a tunnel the clouds know nothing, and stay where they began
-        return T, covariance, _fit(scan, target, T, _ON_SURFACE)
+        return T, covariance, fit_of(scan, target, T)
 
 
-def _fit(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float) -> float:
-    """Return the share of the scan's structure that lies on the target's surfaces at a pose."""
+def fit_of(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float = _ON_SURFACE) -> float:
+    """Return the share of the scan's structure that lies on the target's surfaces at a pose; 0 of none."""
     rows = np.flatnonzero(scan.above)
+    if not len(rows):
+        return 0.0
     points = transform(T, scan.points[rows[:: max(1, len(rows) // _SAMPLE)]])
     distance, nearest = kernels.nearest(target.grid, points, _REACH)
     seen = distance < _REACH

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, 
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan, voxelized
 from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.registration.surfaces import register_to_cloud, surface_points
+from coview_stream.localization.witness.cloud_motion import ALIKE, fit_of
 from coview_stream.localization.witness.conventions import (
     AS_SENT,
     AXES,
@@ -56,11 +58,34 @@ _ODD = math.log(1e-2)  # prior of a reading: of a hundred first set-ups one is w
 _ANY_HEADING = math.log(HEADING / math.pi)  # of one that is fitted: as one among all
 
 
+class _Reached(NamedTuple):
+    """A motion (4, 4), its variance in m2, and the share of structure that fits."""
+
+    variance: float
+    motion: Pose
+    fit: float
+
+    def apart(self, other: _Reached) -> float:
+        """Return the metres to another motion."""
+        return float(np.linalg.norm(self.motion[:3, 3] - other.motion[:3, 3]))
+
+
+def _likeliest(found: list[_Reached], odometry: _Reached) -> tuple[float, Pose]:
+    """Return the variance of the best determined motion, m2, and the motion (4, 4).
+
+    Other motions, odometry's too, widen it where the clouds fit as well, as far as counting tells.
+    """
+    chosen = min(found, key=lambda each: each.variance)
+    weights = ((each, math.exp(-0.5 * (max(chosen.fit - each.fit, 0.0) / ALIKE) ** 2)) for each in (*found, odometry))
+    return chosen.variance + max(weight * each.apart(chosen) ** 2 for each, weight in weights), chosen.motion
+
+
 class CloudPairs:
     """Motions of clouds, registered one to the next from many starts.
 
     Of the motions that a registration reaches from all starts, the one that the clouds determine best counts: in 34 of
-    35 steps of riverside_a, kitti04 and handheld_livox it is the true one, with odometry's start and without.
+    35 steps of riverside_a, kitti04 and handheld_livox it is the true one, with odometry's start and without. Others
+    that fit as well, as along a corridor, widen its sigma.
     """
 
     def __init__(self, up: Floats) -> None:
@@ -81,9 +106,9 @@ class CloudPairs:
         Shorter ones are added up.
         """
         cloud, pair = voxelized(points, self._level, KeyframeConfig()), None
-        found = [] if self._target is None else self._registered(cloud, T_odom_body)
-        if found:
-            variance, self._step = min(found, key=lambda each: each[0])
+        found = None if self._target is None else self._registered(cloud, T_odom_body, self._target)
+        if found is not None:
+            variance, self._step = found
             pair = self.add_step(self._step, variance, self._newest, T_odom_body)
         else:
             self._begin(T_odom_body)
@@ -106,22 +131,24 @@ class CloudPairs:
         self._begin(T_odom_body)
         return pair
 
-    def _registered(self, cloud: Points, T_odom_body: Pose) -> list[tuple[float, Pose]]:
-        """Return the motions (4, 4) that are reached, each after its variance, m2; enough starts that agree suffice."""
-        here, target = np.zeros(3), self._target
-        assert target is not None
+    def _registered(self, cloud: Points, T_odom_body: Pose, target: LocalMap) -> tuple[float, Pose] | None:
+        """Return a motion's variance, m2, and the motion (4, 4); None if none is reached."""
+        here = np.zeros(3)
         scan = prepare_scan(cloud[:: 1 + len(cloud) // _POINTS], here, self._config)
-        motions = list[tuple[float, Pose]]()
+        motions = list[_Reached]()
         for start in starts(self._newest, T_odom_body, self._step):
             match = register_to_cloud(scan, target, start, self._config, here)
             if match is None or not match.converged:
                 continue
             covariance = registration_covariance(match.information, self._config)  # wide along a corridor
-            motions.append((float(np.diag(covariance)[3:5].max()), match.T_map_source))
-            at = match.T_map_source[:3, 3]
-            if sum(float(np.linalg.norm(T[:3, 3] - at)) < _SAME for _, T in motions) == _ENOUGH:
-                break
-        return motions
+            fit = fit_of(scan, target, match.T_map_source)
+            motions.append(_Reached(float(np.diag(covariance)[3:5].max()), match.T_map_source, fit))
+            if sum(motions[-1].apart(other) < _SAME for other in motions) == _ENOUGH:
+                break  # enough starts agree
+        if not motions:
+            return None
+        odometry = inverse(self._newest) @ T_odom_body
+        return _likeliest(motions, _Reached(math.inf, odometry, fit_of(scan, target, odometry)))
 
 
 def starts(before: Pose, after: Pose, step: Pose) -> Iterator[Pose]:

@@ -75,6 +75,26 @@ def test_a_corridor_without_ends_shows_no_motion_along_it():
 
 
 @pytest.mark.slow
+def test_rings_on_the_walls_of_a_corridor_raise_no_doubt():
+    """They move with the sensor, so clouds seem to stand; but odometry's motion fits as well."""
+    azimuth, up = (
+        each.ravel() for each in np.meshgrid(np.radians(np.arange(0.2, 360.0, 0.4)), np.radians(range(-15, 16, 2)))
+    )
+    rays = np.column_stack([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
+    rng, conventions = np.random.default_rng(0), Conventions()
+    for k in range(12):
+        to_wall = (1.5 - 0.2 * np.sin(k) * np.sign(rays[:, 1])) / np.abs(rays[:, 1])
+        to_floor = np.where(rays[:, 2] < 0.0, 0.8, 1.7) / np.abs(rays[:, 2])
+        reach = np.minimum(to_wall, to_floor)
+        cloud = rays * (reach + rng.normal(0.0, 0.015, len(rays)))[:, None]
+        T = np.eye(4)
+        T[:2, 3] = k, 0.2 * np.sin(k)
+        conventions.add(cloud[reach < 60.0].astype(np.float32), T)
+        assert not conventions.doubtful
+    assert conventions.finding is None
+
+
+@pytest.mark.slow
 def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
     localizer = Localizer(world_map)
     for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):
