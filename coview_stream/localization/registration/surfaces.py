@@ -21,7 +21,7 @@ _FARTHER = 3.0  # metres, of a start that nothing is known about
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
 _FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of it
 
-# sigmas of a registered motion, set by hand
+# sigmas of a registered motion
 _POSITION = 0.02  # metres
 _POSITION_METRE = 0.01  # and per metre: as in three real runs at two to eight metres a step
 _ANGLE = math.radians(0.2)
