@@ -115,6 +115,11 @@ class FramePreparation:
         points = self._voxels(raw, T @ self.calibration.T_body_cloud)
         return PreparedFrame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration, moment))
 
+    def knows_moment(self, stamp: float) -> bool:
+        """Return whether odometry goes back to when the cloud of a stamp was measured, but for the delay's sigmas."""
+        late = self.calibration.delay - 2.0 * self.calibration.sigma_delay
+        return late <= 0.0 or self.estimator.history.covers(stamp - late, stamp)
+
     def since_cloud(self, stamp: float) -> Pose:
         """Return the body's motion (4, 4) from the moment of a cloud, which may be late, to its stamp, corrected.
 

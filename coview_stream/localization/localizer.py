@@ -327,6 +327,9 @@ class Localizer:
             self._requests.begin_anew()
             self._evidence = KeyframeEvidence(stamp, self.state, accused.sentence, cause=accused.cause)
             return frame, None
+        if not self._frames.knows_moment(stamp):
+            self._evidence = KeyframeEvidence(stamp, self.state, "odometry does not go back to this cloud's moment yet")
+            return frame, None
         request = self._requests.add(frame, self._tracker.odometry.travelled)
         if not isinstance(request, NoSearch):
             return frame, request

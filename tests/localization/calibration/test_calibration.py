@@ -125,6 +125,13 @@ def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, wo
     assert localizer.fix().calibration == fix.calibration
 
 
+def test_late_cloud_has_no_pose_before_odometry_goes_back_to_its_moment(world_map, world_drive):
+    localizer = Localizer(world_map, LocalizerConfig(cloud_delay=0.3))
+    fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[0], stamp) for stamp in (0.0, 0.2, 0.4)]
+    assert [fix.state for fix in fixes] == [State.SEARCHING, State.SEARCHING, State.TRACKING]
+    assert "does not go back to this cloud's moment" in fixes[1].evidence.reason
+
+
 def test_ground_offset_of_the_site_is_restored_and_outlives_the_place(world_map):
     localizer = Localizer(world_map)
     localizer.hint_calibration(Calibration(ground=0.35))
