@@ -53,7 +53,7 @@ class SearchRequests:
         """Add a frame after ``travelled`` metres; return the request of the keyframe that it completes, if any."""
         anchor, calibration = self._frames.anchor, self._frames.calibration
         assert anchor is not None  # a frame has been prepared
-        keyframe = self._buffer.add(frame.scan, frame.stamp)
+        keyframe = self._buffer.add(frame.scan, frame.stamp, rays := RangeImage.rays(frame.cloud))
         if keyframe is not None and keyframe.begins_anew:
             self.next_epoch()
             self.hints.search_begins_anew()
@@ -71,11 +71,16 @@ class SearchRequests:
         if area is not None and not area.holds(self._base_map.stations).any():
             return NoSearch("nothing is searched: the map has no ground in the circle that the robot is said to be in")
         request = SearchRequest.of(
-            self._buffer, keyframe, cloud=RangeImage.rays(calibration.level(frame.cloud)), spec=self._spec,
+            self._buffer, keyframe, cloud=calibration.level(rays), spec=self._spec,
             travelled=travelled, epoch=self.epoch, hints=hints, guesses=guesses, area=area,
         )  # fmt: skip
         # the search would thin it too: a tenth of the points remains, and requests travel through pipes
-        return replace(request, submap=thinned(request.submap, request.position, self._config.registration))
+        config = self._config.registration
+        earlier = (
+            each._replace(submap=thinned(each.submap, each.T_odom_body[:3, 3], config)) for each in request.earlier
+        )
+        submap = thinned(request.submap, request.position, config)
+        return replace(request, submap=submap, earlier=tuple(earlier))
 
     def guess(self, guess: PlaceGuess) -> None:
         """Try a guess of the place; a circle that comes, goes or changes begins an epoch."""

@@ -19,7 +19,7 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import find_modes, register_place
-from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
+from coview_stream.localization.search.request import EarlierKeyframe, Epoch, RequestSpec, SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
@@ -105,11 +105,8 @@ class GlobalSearch:
     def update(self, request: SearchRequest) -> SearchResult:
         """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
         if request.epoch != self._epoch:
-            starts = self._scorer.starts + bool(self._scorer.scans)
-            self.clear()
-            self._epoch, self._scorer.starts = request.epoch, starts
-        cloud = prepare_scan(request.submap, request.position, self.config.registration)
-        scan = ObservedScan.of(cloud, request.cloud, request.T_odom_body)
+            self._begin(request)
+        scan = self._observed(request)
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request, scan)
@@ -129,6 +126,18 @@ class GlobalSearch:
         if result.accepted is not None:
             self.clear()
         return replace(result, considered=Considered.of(scored, request, self.base_map.origin))
+
+    def _begin(self, request: SearchRequest) -> None:
+        """Begin anew with a request, or go on with its earlier keyframes: then it is no other start."""
+        starts = self._scorer.starts + (bool(self._scorer.scans) and not request.earlier)
+        self.clear()
+        self._epoch, self._scorer.starts = request.epoch, starts
+        self._scorer.go_on_with([self._observed(each) for each in request.earlier])
+
+    def _observed(self, keyframe: SearchRequest | EarlierKeyframe) -> ObservedScan:
+        """Return a keyframe's scan."""
+        cloud = prepare_scan(keyframe.submap, keyframe.T_odom_body[:3, 3], self.config.registration)
+        return ObservedScan.of(cloud, keyframe.cloud, keyframe.T_odom_body)
 
     def _vote(self, request: SearchRequest) -> None:
         """Let every recognizer compare the keyframe with the map."""

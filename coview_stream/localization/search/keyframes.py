@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,6 +29,10 @@ _MIN_SHARE = 0.22
 _PATIENCE = 3  # frames in a row: one may be dust
 
 
+def _no_points() -> Points:
+    return np.empty((0, 3), dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Keyframe:
     """All frames since the previous keyframe.
@@ -36,11 +41,13 @@ class Keyframe:
         stamp: of the newest frame, seconds.
         scan: one point per voxel, with the newest frame's odometry.
         begins_anew: the calibration has changed so much that earlier keyframes have been levelled again.
+        frame: (N, 3) float32 the newest frame itself, in the sensor's axes, for its rays; none by default.
     """
 
     stamp: float
     scan: RawScan
     begins_anew: bool = False
+    frame: Points = field(default_factory=_no_points)
 
     @property
     def T_odom_body(self) -> Pose:
@@ -82,8 +89,8 @@ class KeyframeBuffer:
         self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)  # one per voxel and part
         self._in_part = 0  # keyframes in the newest part
 
-    def add(self, scan: RawScan, stamp: float) -> Keyframe | None:
-        """Add a frame; return the keyframe that it completes, if any."""
+    def add(self, scan: RawScan, stamp: float, frame: Points | None = None) -> Keyframe | None:
+        """Add a frame; return the keyframe that it completes, if any, which holds ``frame``."""
         self.calibration = scan.calibration
         leans = any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
         at = self._levelled_at
@@ -99,7 +106,7 @@ class KeyframeBuffer:
             moved = float(np.linalg.norm(scan.position - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None
-        keyframe = Keyframe(stamp, self._merged(scan), anew)
+        keyframe = Keyframe(stamp, self._merged(scan), anew, _no_points() if frame is None else frame)
         self._pending = []
         self._gather(keyframe)
         return keyframe
@@ -121,9 +128,17 @@ class KeyframeBuffer:
 
         The newest come first: thinning keeps the first point of a voxel, and old ones are off by odometry's drift.
         """
-        scans = [*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending]
+        return self._levelled([*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending])
+
+    def at_earlier(self, count: int) -> list[tuple[Keyframe, Points]]:
+        """Return the keyframes before the newest, oldest first, and :meth:`recent` as it was at each of them."""
+        held = list(self.keyframes)
+        upto = [held[max(0, k - count) : k] for k in range(1, len(held))]
+        return [(some[-1], self._levelled([keyframe.scan for keyframe in some])) for some in upto]
+
+    def _levelled(self, scans: Sequence[RawScan]) -> Points:
         parts = [scan.levelled(self.calibration) for scan in reversed(scans)]
-        return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
+        return np.concatenate(parts) if parts else _no_points()
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
         """Make a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel.

@@ -49,6 +49,14 @@ class RequestSpec:
     reach: float | None = None
 
 
+class EarlierKeyframe(NamedTuple):
+    """A keyframe that has been searched for, levelled by the present calibration; as of :class:`SearchRequest`."""
+
+    T_odom_body: Pose
+    submap: Points
+    cloud: Points
+
+
 @dataclass(frozen=True)
 class SearchRequest:
     """One keyframe to search the map for.
@@ -66,6 +74,8 @@ class SearchRequest:
         surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if not needed.
         calibration: has levelled ``cloud``.
         area: the only part of the map to search, metres from its zero; None for all of it.
+        earlier: keyframes that the search goes on with, oldest first: an epoch that begins because clouds were levelled
+            anew still knows what they show.
     """
 
     stamp: float
@@ -80,6 +90,7 @@ class SearchRequest:
     surroundings: Points = field(default_factory=_no_points)
     calibration: Calibration = field(default_factory=Calibration)
     area: Circle | None = None
+    earlier: tuple[EarlierKeyframe, ...] = ()
 
     @property
     def position(self) -> Floats:
@@ -105,10 +116,13 @@ class SearchRequest:
             scan = buffer.virtual_scan(keyframe.position, spec.descriptor.radius, spec.descriptor.voxel)
         if spec.reach is not None:
             surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
+        held = buffer.at_earlier(_SUBMAP_KEYFRAMES) if keyframe.begins_anew else []
+        level = buffer.calibration.level
+        earlier = tuple(EarlierKeyframe(each.T_odom_body, submap, level(each.frame)) for each, submap in held)
         return cls(
             keyframe.stamp, keyframe.T_odom_body, scan=scan, submap=buffer.recent(_SUBMAP_KEYFRAMES), cloud=cloud,
             travelled=travelled, epoch=epoch, hints=hints, guesses=guesses, surroundings=surroundings,
-            calibration=buffer.calibration, area=area,
+            calibration=buffer.calibration, area=area, earlier=earlier,
         )  # fmt: skip
 
 

@@ -161,6 +161,12 @@ class PlaceScorer:
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
 
+    def go_on_with(self, scans: list[ObservedScan]) -> None:
+        """Begin with earlier keyframes, oldest first: places are compared by what they show, too."""
+        self._scans = scans
+        self._scatter = [np.full(4, np.nan)] * len(scans)
+        self._followed = replace(_Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
+
     def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the followed places.
 
@@ -236,8 +242,8 @@ class PlaceScorer:
         coarse = _Observed(poses, shares, scores, [])
         # a few points rule out most hypotheses; more points rank the rest
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
-        closer = scan.many.look_up(layers, poses[promising], Move.NONE)
-        shares[promising], scores[promising] = closer.shares, closer.scores
+        closer = scan.many.look_up(layers, poses[promising], Move.NEAR)
+        poses[promising], shares[promising], scores[promising] = closer.poses, closer.shares, closer.scores
         return replace(coarse, groups=_places(poses, scores * coarse.inside))
 
     def _follow(
