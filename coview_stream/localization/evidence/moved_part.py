@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points
+from coview_stream.geometry.transforms import Points, rot_z, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand
@@ -53,7 +53,7 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
     Args:
         field: the map's likelihood field.
         scans: of the newest keyframes, the newest last.
-        T_map_odom: (4, 4) the place, level, at the newest keyframe.
+        T_map_odom: (4, 4) the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
     """
     place = scans[-1].poses(T_map_odom[None])[0]
     place[3] = 0.0  # points are relative to the body and along the map's axes from here on
@@ -84,16 +84,19 @@ def _structure(
 ) -> tuple[Points, Points]:
     """Return the scans' structure at a place, and a sample of its unexplained points, both (N, 3)."""
     shown, unexplained = [], []
-    T = T_map_odom[None]
+    T, newest = T_map_odom[None], scans[-1].T_odom_body[:3, :3]
+    lean = newest.T @ rot_z(-yaw_of(T_map_odom)) @ T_map_odom[:3, :3] @ newest  # in the body's axes
     for scan in reversed(scans):
-        pose, points_of_scan = scan.poses(T), scan.many.points.structure
+        R = scan.T_odom_body[:3, :3]
+        upright = (scan.many.points.structure @ (R @ lean @ R.T).T).astype(np.float32)
+        pose = scan.poses(T)
         if scan is not scans[-1]:  # undo odometry's drift since then
             pose = scan.few.look_up(field, pose, kernels.Move.NEAR).poses
-            T = scan.transforms(pose)
+        T = scan.transforms(pose)
         cos, sin = math.cos(pose[0, 3]), math.sin(pose[0, 3])
-        turned = points_of_scan @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        turned = upright @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         shown.append((turned + (pose[0, :3] - place[:3])).astype(np.float32))
-        unexplained.append(shown[-1][kernels.unexplained(field, points_of_scan, pose[0])])
+        unexplained.append(shown[-1][kernels.unexplained(field, upright, pose[0])])
     points = np.concatenate(unexplained)
     _, first = np.unique(np.floor(points / np.float32(_VOXEL)).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(first)]

@@ -1,9 +1,9 @@
 """Scoring of hypotheses: hundreds per keyframe, and the evidence of the best ones over all keyframes.
 
 A hypothesis moves to the best pose within three metres and seven degrees by the map's likelihood field
-(:mod:`coview_stream.localization.evidence.observation`). The best places are followed: later keyframes observe the map
-there too, and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of
-a place is the log-likelihood ratio of its mean observation against the background of all others
+(:mod:`coview_stream.localization.evidence.observation`), and a hundred of them once more, by other points, so that the
+leader is compared with rivals at their best. The best places are followed: later keyframes observe the map there too,
+and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of a place is the log-likelihood ratio of its mean observation against the background of all others
 (:mod:`coview_stream.localization.evidence.likelihood`).
 """
 
@@ -240,7 +240,7 @@ class PlaceScorer:
             np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "shares", "scores")
         )
         coarse = _Observed(poses, shares, scores, [])
-        # a few points rule out most hypotheses; more points rank the rest
+        # a few points rule out most hypotheses; more points move the rest on, decimetres as a rule, and rank them
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
         closer = scan.many.look_up(layers, poses[promising], Move.NEAR)
         poses[promising], shares[promising], scores[promising] = closer.poses, closer.shares, closer.scores

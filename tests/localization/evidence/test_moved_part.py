@@ -9,8 +9,8 @@ import pytest
 from trackers import observed
 
 import coview_kernels as kernels
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, find_moved_part
+from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
+from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, _structure, find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
@@ -67,6 +67,22 @@ def test_evidence_of_several_keyframes_is_that_of_one_shift(world_map, world_dri
     assert part.probability > 0.9
     assert part.metres == pytest.approx(4.0, abs=0.8)
     assert found(world_map, *scans, seen).probability < RISK
+
+
+def test_lean_of_the_sensor_leaves_nothing_unexplained(world_map, world_drive):
+    """It turns with the body, and is the registered pose's against odometry's vertical."""
+
+    def left(T_map_odom, *scans):
+        place = scans[-1].poses(T_map_odom[None])[0] * [1.0, 1.0, 1.0, 0.0]
+        return len(_structure(world_map.field, scans, T_map_odom, place)[1])
+
+    lean, clouds = pose_from(exp_so3([np.radians(4.0), 0.0, 0.0]), np.zeros(3)), world_drive.clouds
+    T = [inverse(ODOM) @ world_drive.T_map_body[frame] for frame in (9, 5, 0)]
+    leaning = [observed(transform(lean, clouds[k]), at, voxels=False) for k, at in zip((9, 5, 0), T, strict=True)]
+    registered = ODOM @ T[-1] @ inverse(lean) @ inverse(T[-1])
+    straight = left(ODOM, *(scan_of(world_drive, k) for k in (9, 5, 0)))
+    assert left(registered, *leaning) < 1.5 * straight + 20
+    assert left(ODOM, *leaning) > 3 * straight + 60
 
 
 def test_what_the_scan_has_explained_at_the_place_is_no_second_time(world_map, seen):

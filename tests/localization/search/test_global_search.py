@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from coview_stream.localization.search import global_search
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import KeyframeBuffer
-from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, RequestSpec, SearchRequest
+from coview_stream.localization.search.request import FIRST_EPOCH, EarlierKeyframe, Epoch, RequestSpec, SearchRequest
 from coview_stream.localization.state import State
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])  # of the runs through the small world
@@ -165,6 +166,22 @@ def test_every_start_of_a_search_is_another_chance_until_a_place_is_accepted(sea
     never = [none(never_sure, restart) for restart in (1, 2, 3)]
     np.testing.assert_allclose(np.divide(never, never[0]), [1.0, 4.0, 9.0], rtol=1e-6)
     assert none(search, 1) == pytest.approx(none(search, 2)) == pytest.approx(never[0])
+
+
+def test_search_whose_clouds_are_levelled_anew_goes_on_with_its_earlier_keyframes(world_map, world_drive):
+    """It is no other start, and places are compared by what all keyframes show."""
+    *before, newest = run_of(world_drive, 4)
+    anew = replace(newest, epoch=Epoch(0, 1))
+    earlier = tuple(EarlierKeyframe(each.T_odom_body, each.submap, each.cloud) for each in before)
+    none = []
+    for last in (newest, replace(anew, earlier=earlier), anew):
+        search = searching(world_map, NEVER)
+        for request in before:
+            search.update(request)
+        none.append(search.update(last).considered.none)
+    whole, goes_on, forgets = np.log(none)
+    assert goes_on == pytest.approx(whole, abs=0.3 * abs(whole))
+    assert forgets - goes_on > math.log(4.0)  # a second start is dearer, and knows less
 
 
 def test_request_of_another_epoch_or_an_acceptance_starts_anew(search, never_sure, world_drive):

@@ -150,6 +150,25 @@ def test_keyframes_are_levelled_by_the_newest_calibration():
     assert len(leaning.recent(1)) == pytest.approx(len(straight.recent(1)), rel=0.1)
 
 
+def test_earlier_keyframes_are_read_as_they_were_by_the_newest_calibration():
+    """Their submaps reach no further than they did then, and all are levelled as if the lean had been known."""
+    known = [Calibration(pitch=np.radians(pitch)) for pitch in (0.0, 0.0, 2.6)]
+    leaning, straight = (KeyframeBuffer(KeyframeConfig(distance=1.0)) for _ in range(2))
+    then = []
+    for k, present in enumerate(known):
+        for buffer, level in ((leaning, present), (straight, known[-1])):
+            points = transform(at(1.5 * k), level.level(cloud(k, 300)))
+            keyframe = buffer.add(RawScan(points, at(1.5 * k), level), float(k), cloud(k))
+        then.append(straight.recent(2))
+    assert keyframe.begins_anew is False
+    earlier = leaning.at_earlier(2)
+    assert [each.stamp for each, _ in earlier] == [0.0, 1.0]
+    for (each, submap), expected, k in zip(earlier, then, range(2), strict=False):
+        np.testing.assert_array_equal(each.frame, cloud(k))
+        assert len(submap) == pytest.approx(len(expected), rel=0.1)
+        assert np.median(cKDTree(expected).query(submap)[0]) < 0.01
+
+
 T_LOCAL = pose_from(ODOM_FAR[:3, :3], np.zeros(3))
 
 

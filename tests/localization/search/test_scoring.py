@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from trackers import observed
 
+from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
 from coview_stream.localization.evidence.observation import ObservedScan
@@ -76,6 +77,19 @@ def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan)
     assert result.second is other
     np.testing.assert_array_equal(result.rivals.T_map_odom[0], best.T_map_odom)
     assert result.rivals.scores.tolist() == pytest.approx([best.score, other.score])
+
+
+def test_best_places_are_moved_once_more_with_many_points(world_map, world_drive):
+    """What a few points find is decimetres off, and its evidence too small."""
+    once, more = [], []
+    for k in range(4):
+        scan = scan_of(world_drive, k)
+        for start in (off(1.5, -1.1, 4.0, scan), off(-1.2, 1.7, -3.0, scan)):
+            far = scan.few.look_up(world_map.field, scan.poses(start[None]), Move.FAR).poses
+            place = scored(PlaceScorer(world_map), [hypothesis(start), *some_places(scan, 12)[1:]], scan).places[0]
+            for gaps, T in (once, scan.transforms(far)[0]), (more, place.T_map_odom):
+                gaps.append(np.linalg.norm(((T - ODOM) @ scan.T_odom_body)[:2, 3]))
+    assert np.mean(more) < 0.8 * np.mean(once)
 
 
 def test_probabilities_of_places_and_none_of_these_sum_to_one(scorer, scan):
