@@ -3,7 +3,8 @@
 A hypothesis moves to the best pose within three metres and seven degrees by the map's likelihood field
 (:mod:`coview_stream.localization.evidence.observation`), and a hundred of them once more, by other points, so that the
 leader is compared with rivals at their best. The best places are followed: later keyframes observe the map there too,
-and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of a place is the log-likelihood ratio of its mean observation against the background of all others
+and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of a place is
+the log-likelihood ratio of its mean observation against the background of all others
 (:mod:`coview_stream.localization.evidence.likelihood`).
 """
 
