@@ -74,8 +74,7 @@ class SearchRequest:
         surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if not needed.
         calibration: has levelled ``cloud``.
         area: the only part of the map to search, metres from its zero; None for all of it.
-        earlier: keyframes that the search goes on with, oldest first: an epoch that begins because clouds were levelled
-            anew still knows what they show.
+        earlier: keyframes that the search goes on with, oldest first, where clouds were levelled anew.
     """
 
     stamp: float

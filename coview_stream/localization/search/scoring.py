@@ -163,7 +163,7 @@ class PlaceScorer:
         self._scatter: list[Floats] = []
 
     def go_on_with(self, scans: list[ObservedScan]) -> None:
-        """Begin with earlier keyframes, oldest first: places are compared by what they show, too."""
+        """Begin with earlier keyframes, oldest first: places are compared by them as well."""
         self._scans = scans
         self._scatter = [np.full(4, np.nan)] * len(scans)
         self._followed = replace(_Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
