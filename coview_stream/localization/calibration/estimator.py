@@ -284,6 +284,7 @@ def heavier(distance: float, size: int) -> float:
 
 _ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch, added to its covariance
 _LEAN = 3.0  # ratio of the roll and pitch errors of a frame-to-frame motion to its heading error
+_HEIGHT = 2.0  # metres of a lidar above the ground that holds it, at most: a wrong attitude shifts it
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the motion's errors
 _MIN_TURN = math.radians(5.0)  # likewise
 
@@ -434,10 +435,13 @@ class CalibrationEstimator:
 
     def _learn_motion(self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration) -> None:
         """Add a motion to the beliefs; ``applied`` has corrected it and ``step``."""
-        gap = np.append(motion[:2, 3] - step[:2, 3], log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
+        turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
+        gap = np.append(motion[:2, 3] - step[:2, 3], turned[2])
         H = np.zeros((3, SIZE))
         H[:, _MOTION] = J
-        self._update(gap + J @ _motion_part(applied), H, noise)
+        # clouds that were levelled by the attitude of another time are bent, and their registration is off by as much
+        bent = np.diag([turned[1], turned[0], 0.0]) * _HEIGHT
+        self._update(gap + J @ _motion_part(applied), H, noise + bent**2)
 
     def measure_frames(
         self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float,

@@ -27,8 +27,20 @@ from typing import NamedTuple
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import wrap_angle
+from coview_stream.geometry.planar import between, compose, inverted
 from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.localization.witness.agreement import (
+    ALONE,
+    ANYWHERE,
+    Step,
+    at_once,
+    density,
+    hidden_by,
+    likelihood,
+    normal,
+    of_several_places,
+    unsure,
+)
 
 # how often faults come
 _PER_SECOND = 1e-6  # a driver hangs, a clock parts, a second driver starts: once in twelve days of driving
@@ -36,64 +48,35 @@ _PAUSE = 60.0  # seconds that count of a pause: drivers and clocks fail while th
 _PER_METRE = 1e-6  # a bolt gives way: once in 1000 km
 _FAST = 40.0  # metres per second: no robot is faster, clouds that cannot be registered may be
 _SLIPS = 0.01  # per metre: wheels slip once in 100 m
-_SLIPS_ON = 0.5  # probability that a slip lasts to the next step
-_ENDS = 0.01  # per second, that a fault of a driver or a clock ends
-_GROWS_ON = 0.95  # probability that a lag that grows does so in the next step
+_SLIPS_ON = 0.5  # probability that a slip lasts to the next step: wheels grip again within metres
+_STALLS = 1e-4  # share of holes in the stamps after which clouds are as late: mostly, clouds were dropped
+_ENDS = 0.01  # per second, that a fault of a driver or a clock ends: watchdogs start it anew within minutes
+_GROWS_ON = 0.95  # probability that a lag that grows does so in the next step: queues fill within some twenty seconds
 
 LAGS = np.arange(0.0, 3.01, 0.05)
 """Lags of clouds, seconds; the first is none, the last is "as long or longer"."""
-_FASTEST = 0.5  # seconds per second by which a lag grows
-_SLACK = 0.05  # seconds that lags may grow in a step without a hole in the stamps: half a turn of a lidar
-_NO_HOLE = 0.05  # probability that they grow by more without one: clouds were dropped before
-FAILS = 0.05
-"""Probability that clouds are registered wrongly, where they fit each other as usual."""
-_MAP_FAILS = 0.02  # likewise a verified registration to the map
-_ALONE = 0.05  # probability that clouds of one place do not fit each other, and those of several
-_APART = 0.7
-_ANYWHERE = np.array([2.0, 2.0, math.radians(20.0)])  # sigmas of a wrong registration about odometry's motion
+_FASTEST = 0.5  # seconds per second by which a lag grows: a driver of half the speed
+_ALONG, _SIDEWAYS = 0.3, 0.1  # of the way: wheels that spin or lock, and that skid
+_SKID = np.array([0.1, 0.1, math.radians(3.0)])  # besides, within a step
+_JUMPS = ((0.08, 1.0), (0.015, 10.0), (0.005, 100.0))  # odometry may jump by anything: an estimator that starts anew
 _SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
-    (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([0.3, 0.0, 0.0])),  # all wheels, along the way
-    (0.4, np.array([0.1, 0.1, math.radians(3.0)]), np.array([0.2, 0.1, 0.0])),  # some of the wheels, to a side
-    (0.1, _ANYWHERE, np.zeros(3)),  # odometry jumps
+    (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([_ALONG, 0.0, 0.0])),  # all wheels, along the way
+    (0.4, _SKID, np.array([0.2, _SIDEWAYS, 0.0])),  # some of the wheels, to a side
+    *((share, np.minimum(times * ANYWHERE, [math.inf, math.inf, 1.8]), np.zeros(3)) for share, times in _JUMPS),
 )
-_ACCELERATIONS = np.array([1.0, 1.0, 0.5])  # m/s^2 and rad/s^2 of wheeled robots, that holes in odometry hide
-_WHOLE = 0.01  # seconds^2: odometry of five frames per second has no holes
 _INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleration of a body, metres and radians per s^2
 _COPY = 1e-6  # probability that another cloud has the same bytes
-_BOLT = np.array([0.1, 0.1, math.radians(10.0)])  # sigmas of C where a mount gives way, and of another frame
-_FRAME = np.array([3.0, 3.0, math.radians(3.0)])
-_SCALES = 1.0  # range of scales of odometry that are out by a fault
+_CHANGES = (  # sigmas of C: a mount gives way, a frame of another origin, one of other axes
+    np.array([0.1, 0.1, math.radians(10.0)]),
+    np.array([3.0, 3.0, math.radians(3.0)]),
+    np.array([0.1, 0.1, math.radians(100.0)]),
+)
+_SCALES = 0.5  # sigma of scales of odometry that are out by a fault: tyres, gears, units of half the size
 _KEPT = 5  # hypotheses about C, and about a scale
 _EXACT = np.zeros((3, 3))
 _ON_BODY = 2.0  # metres: no mount shifts a sensor farther
 _TURNED = math.radians(2.0)  # of C, from which it is said to be a turn
 _NEGLIGIBLE = 1e-6  # probability below which a fault has not begun
-
-
-class Seen(NamedTuple):
-    """Motion (3,) as seen by one witness, with its covariance (3, 3)."""
-
-    motion: Floats
-    covariance: Floats
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of a robot by its witnesses; motions are planar: (x, y, heading) in the earlier body's axes."""
-
-    seconds: float
-    odometry: Seen
-    clouds: Seen | None  # None where there is too little to see
-    on_map: Seen | None  # None without a verified registration at both ends
-    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the begin of the step
-    path_now: Floats  # and before its end
-    fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
-    apart: bool = False  # the clouds fit each other much less than usual
-    copied: bool = False  # the clouds are the same bytes
-    unsure: Floats | None = None  # (2, L) seconds^2 by which odometry at these poses misses accelerations in holes
-    excess: float = 3.0  # seconds by which the clouds' stamps are farther apart than usual
-    holes: float = 1.0  # share of steps with such an excess
-    parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
 
 
 @dataclass
@@ -148,13 +131,16 @@ class _Parting:
             np.array([np.interp(lag, LAGS, column) for column in path.T])
             for path, lag in ((step.path_before, self.lag), (step.path_now, later))
         )
-        return compose(inverted(before), now), spread
+        if step.unsure is not None:
+            ends = zip((self.lag, later), step.unsure, strict=True)
+            spread = spread + hidden_by(np.asarray(np.linalg.norm([np.interp(lag, LAGS, row) for lag, row in ends])))
+        return between(before, now), spread
 
     def after(self, step: Step, likelihood: float) -> _Parting:
         """Return the hypothesis after a step with a likelihood of its motions."""
-        longer = self.rate * step.seconds
-        weight = self.weight * likelihood * float(_stamps_allow(step, np.array(longer)))
-        return replace(self, weight=weight, lag=self.lag + longer)
+        longer, sigma = self.rate * step.seconds, self.sigma * step.seconds
+        allowed = 1.0 if step.stamps is None else float(step.stamps.allow(np.array(longer), sigma))
+        return replace(self, weight=self.weight * likelihood * allowed, lag=self.lag + longer)
 
 
 class Accusation(NamedTuple):
@@ -181,7 +167,7 @@ class FaultPosterior:
     parting: list[_Parting] = field(default_factory=list)
     _driven: float = 0.0  # metres by odometry since the scan began to be repeated
     _moved_on: float = 0.0  # metres by the clouds since odometry began to stand still
-    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step
+    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; the body's tilting turns it, too
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
 
     @property
@@ -204,11 +190,12 @@ class FaultPosterior:
 
         def like(motion: Floats, spread: Floats = noise) -> Floats:
             """Return the likelihood of the clouds' and the map's motion where this one is expected."""
-            return _likelihood(step, motion, spread, _ALONE)
+            return likelihood(step, motion, spread, ALONE)
 
-        anything = _of_several_places(step)
+        anything = of_several_places(step)
         kinds = [(share, np.diag((sigmas + metre * driven) ** 2)) for share, sigmas, metre in _SLIP_KINDS]
-        slips = self._smoother(step) * sum(share * float(like(o, noise + spread)) for share, spread in kinds)
+        smoother = self._smoother(step)
+        slips = smoother * sum(share * float(like(o, noise + spread)) for share, spread in kinds)
         stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
         copy = like(o) if stands else like(np.zeros(3)) / (_COPY if step.copied else 1.0)
 
@@ -216,7 +203,8 @@ class FaultPosterior:
         farther = (
             driven if step.clouds is None else max(driven, min(dt * _FAST, float(np.hypot(*step.clouds.motion[:2]))))
         )
-        begins = 1.0 - math.exp(-_SLIPS * farther)
+        grips = math.exp(-_SLIPS * farther)  # whatever else is wrong
+        begins = 1.0 - grips
         new_slip = (begins * good + _SLIPS_ON * slip) * slips
         new_repeated = (come * (good + slip) + (1.0 - ends) * self.repeated) * float(copy)
         new_stopped = 0.0
@@ -228,42 +216,47 @@ class FaultPosterior:
         back += ends * self.stopped * float(like(o))
 
         # lags: every pair of a lag before and one now
-        between = _between(step.path_before, step.path_now)
-        steady_spread, unsure = noise, _unsure(step)
-        if unsure is not None:
-            steady_spread = noise + unsure[np.arange(len(LAGS)), np.arange(len(LAGS))]
-        pairs = like(between, noise + _grid_spread(o, dt) + (0.0 if unsure is None else unsure))
-        np.fill_diagonal(pairs, like(between.diagonal().T, steady_spread))  # it is off by as much at both ends
+        motions = between(step.path_before[:, None], step.path_now)
+        steady_spread, hidden = noise, unsure(step)
+        if hidden is not None:
+            steady_spread = noise + hidden[np.arange(len(LAGS)), np.arange(len(LAGS))]
+        pairs = like(motions, noise + _grid_spread(o, dt) + (0.0 if hidden is None else hidden))
+        np.fill_diagonal(pairs, like(motions.diagonal().T, steady_spread))  # it is off by as much at both ends
         pairs[0, 0], pairs[-1, -1] = like(o), 0.0
-        pairs = pairs * _stamps_allow(step, LAGS[None] - LAGS[:, None])
+        if step.stamps is not None:
+            pairs = pairs * step.stamps.allow(_LONGER)[_LONGER_OF]
         on, to_steady, to_growing = _lag_rates(dt, come)
+        if step.stamps is not None:
+            on[0, :-1] += _STALLS * step.stamps.holes * step.stamps.stalled(LAGS)[:-1]
         grown = self.growing + np.eye(1, len(LAGS))[0] * good * come
-        steady: Floats = self.steady @ (on * pairs) + self.growing @ (to_steady * pairs)
-        growing: Floats = grown @ (to_growing * pairs)
-        steady[0] += back - begins * good * float(like(o))
+        steady: Floats = grips * (self.steady @ (on * pairs) + self.growing @ (to_steady * pairs))
+        growing: Floats = grips * (grown @ (to_growing * pairs))
+        steady[0] += back
 
         # a sensor that has been moved stays so; the map has to see it move, too, as clouds of bare ground show anything
-        moved = [_Moved(h.weight * float(like(*h.expected(o, noise))), h.C, h.sigmas) for h in self.moved]
+        stays = grips * (1.0 - ends)
+        moved = [replace(h, weight=stays * h.weight * float(like(*h.expected(o, noise)))) for h in self.moved]
+        steady[0] += ends * sum(h.weight * float(like(compose(inverted(h.C), o))) for h in self.moved)
         if step.clouds is not None and step.on_map is not None:
-            C = compose(inverted(o), step.clouds.motion)
-            weight = (come + _PER_METRE * driven) * (good + slip) * 0.5 * (_density(C, _BOLT) + _density(C, _FRAME))
-            weight *= float(like(step.clouds.motion, _EXACT)) / float(_normal(np.zeros(3), step.clouds.covariance))
-            weight *= _at_once(step, step.clouds.covariance + noise)
+            C = between(o, step.clouds.motion)
+            weight = (come + _PER_METRE * driven) * (good + slip) * float(np.mean([density(C, s) for s in _CHANGES]))
+            weight *= float(like(step.clouds.motion, _EXACT)) / float(normal(np.zeros(3), step.clouds.covariance))
+            weight *= at_once(step, step.clouds.covariance + noise)
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
         moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
 
         # nor does odometry mend its scale
-        scaled = [_Scaled(h.weight * float(like(*h.expected(o, noise))), h.scale, h.sigma) for h in self.scaled]
+        scaled = [replace(h, weight=grips * h.weight * float(like(*h.expected(o, noise)))) for h in self.scaled]
         if step.clouds is not None and not stands:
             scale = float(step.clouds.motion[:2] @ o[:2]) / driven**2
             sigma = math.sqrt(float(step.clouds.covariance[0, 0] + noise[0, 0])) / driven
-            h = _Scaled(_PER_METRE * driven * (good + slip) * sigma / _SCALES, scale, sigma)
-            h.weight *= float(like(*h.expected(o, noise)))
+            h = _Scaled(_PER_METRE * driven * (good + slip) * smoother, scale, sigma)
+            h.weight *= min(1.0, sigma * _scale_density(scale)) * float(like(*h.expected(o, noise)))
             scaled.append(h)
         scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
 
         # and a clock that parts from another goes on so
-        parting = [h.after(step, float(like(*h.expected(step)))) for h in self.parting]
+        parting = [h.after(step, grips * float(like(*h.expected(step)))) for h in self.parting]
         if step.clouds is not None and not stands and 0.0 < 1.0 - scale < _FASTEST:
             new = _Parting(come * (good + slip) * sigma / _FASTEST, 1.0 - scale, sigma, 0.0)
             parting.append(new.after(step, float(like(*new.expected(step)))))
@@ -287,7 +280,7 @@ class FaultPosterior:
         if step.clouds is not None:
             further = self._moved_on + float(np.linalg.norm(step.clouds.motion[:2]))
             self._moved_on = further if self.stopped > _NEGLIGIBLE else 0.0
-        self._speed = np.abs(o) / dt
+        self._speed = np.abs(o) / dt + [0.0, 0.0, step.tilting]
         self._before = None
         if step.clouds is not None:
             self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
@@ -303,11 +296,13 @@ class FaultPosterior:
             parting.lag -= delay
         if delay:
             for lags in (self.steady, self.growing):
-                shares, place = lags.copy(), (LAGS - delay) / float(LAGS[1])
+                shares, place = lags.copy(), np.clip((LAGS - delay) / float(LAGS[1]), 0.0, len(LAGS) - 1.0)
                 if lags is self.steady:
                     place[0] = 0.0  # the good state stays good by the new calibration
+                below = np.minimum(place.astype(np.int64), len(LAGS) - 2)
                 lags[:] = 0.0
-                np.add.at(lags, np.clip(np.round(place), 0, len(LAGS) - 1).astype(np.int64), shares)
+                np.add.at(lags, below, (1.0 - place + below) * shares)
+                np.add.at(lags, below + 1, (place - below) * shares)
 
     def rescaled(self, risk: float) -> tuple[float, float] | None:
         """Return the factor by which odometry is out of scale, and its sigma, if that is sure: good again."""
@@ -359,7 +354,7 @@ class FaultPosterior:
     def _going_on(self, step: Step) -> tuple[Floats, Floats]:
         """Return the motion (3,) of a body that goes on as its clouds have moved, and its covariance (3, 3)."""
         if self._before is None:
-            return step.odometry.motion, np.diag(_ANYWHERE**2)
+            return step.odometry.motion, np.diag(ANYWHERE**2)
         seconds, _, seen = self._before
         inertia, share = _INERTIA * 0.5 * (seconds + step.seconds) * step.seconds, step.seconds / seconds
         covariance = np.zeros((3, 3)) if step.clouds is None else step.clouds.covariance
@@ -379,104 +374,18 @@ class FaultPosterior:
         return math.exp(min(max(exponent, -30.0), 30.0))
 
 
-def _likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floats:
-    """Return the likelihood of a step's clouds and map if a motion (..., 3) with a covariance (..., 3, 3) is expected.
-
-    Either registration may be wrong; where both are right they err together by the expected motion's covariance.
-    """
-    seen, on_map, o = step.clouds, step.on_map, step.odometry.motion
-    anywhere = np.diag(_ANYWHERE**2)
-    if seen is None and on_map is None:
-        return np.ones(np.shape(motion)[:-1])
-    if seen is None or on_map is None:
-        one, fails = (seen, step.fails) if seen is not None else (on_map, _MAP_FAILS)
-        assert one is not None
-        likely = (1.0 - fails) * _normal(one.motion - motion, one.covariance + spread)
-        likely = likely + fails * _normal(one.motion - o, anywhere)
-    else:
-        L, M = seen.covariance, on_map.covariance
-        gap = on_map.motion - seen.motion
-        gap[2] = wrap_angle(float(gap[2]))
-        gain = L @ np.linalg.inv(L + M)
-        fused = _normal(seen.motion + gain @ gap - motion, L - gain @ L + spread)
-        l_right, l_wrong = _normal(seen.motion - motion, L + spread), _normal(seen.motion - o, anywhere)
-        m_right, m_wrong = _normal(on_map.motion - motion, M + spread), _normal(on_map.motion - o, anywhere)
-        likely = (1.0 - step.fails) * (1.0 - _MAP_FAILS) * _normal(gap, L + M) * fused
-        likely = likely + (1.0 - step.fails) * _MAP_FAILS * l_right * m_wrong
-        likely = likely + step.fails * ((1.0 - _MAP_FAILS) * l_wrong * m_right + _MAP_FAILS * l_wrong * m_wrong)
-    return np.asarray(likely if seen is None else likely * (alone if step.apart else 1.0 - alone))
+_LONGER = float(LAGS[1]) * np.arange(1.0 - len(LAGS), len(LAGS))
+_LONGER_OF = np.arange(len(LAGS))[None] - np.arange(len(LAGS))[:, None] + len(LAGS) - 1
+"""Seconds by which lags become longer, and their index for each pair of a lag before and one now."""
 
 
-def _at_once(step: Step, covariance: Floats) -> float:
-    """Return the likelihood that clouds have left odometry's motion at one moment of a step: in one of its parts.
-
-    A body that is carried, or whose wheels slip, leaves it by and by.
-    """
-    gaps = [compose(inverted(odometry), clouds) for _, odometry, clouds in step.parts]
-    squares = [float(gap @ np.linalg.solve(covariance, gap)) for gap in gaps]
-    return math.exp(-0.5 * min(squares, default=0.0))
-
-
-def _of_several_places(step: Step) -> float:
-    """Return the likelihood of a step's clouds and map where each is registered to anything."""
-    likely = 1.0
-    for seen in (step.clouds, step.on_map):
-        likely *= 1.0 if seen is None else float(_normal(seen.motion - step.odometry.motion, np.diag(_ANYWHERE**2)))
-    return likely if step.clouds is None else likely * (_APART if step.apart else 1.0 - _APART)
-
-
-def _normal(gap: Floats, covariance: Floats) -> Floats:
-    """Return the density of gaps (..., 3) of planar motions."""
-    gap = np.concatenate([gap[..., :2], np.angle(np.exp(1j * gap[..., 2:]))], axis=-1)
-    square = np.einsum("...i,...ij,...j", gap, np.linalg.inv(covariance), gap)
-    return np.asarray(np.exp(-0.5 * square) / np.sqrt((2.0 * math.pi) ** 3 * np.linalg.det(covariance)))
-
-
-def _density(C: Floats, sigmas: Floats) -> float:
-    return float(_normal(C, np.diag(sigmas**2)))
-
-
-def compose(a: Floats, b: Floats) -> Floats:
-    """Return planar motion ``a`` (3,) followed by ``b`` (3,)."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap_angle(float(a[2] + b[2]))])
-
-
-def inverted(a: Floats) -> Floats:
-    """Return the planar motion (3,) back."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
-
-
-def _between(before: Floats, now: Floats) -> Floats:
-    """Return the motion (L, M, 3) from each of the poses (L, 3) to each of others (M, 3)."""
-    gap = now[None] - before[:, None]
-    c, s = np.cos(before[:, 2])[:, None], np.sin(before[:, 2])[:, None]
-    x, y = c * gap[..., 0] + s * gap[..., 1], c * gap[..., 1] - s * gap[..., 0]
-    return np.stack([x, y, gap[..., 2]], axis=-1)
-
-
-def _unsure(step: Step) -> Floats | None:
-    """Covariance (L, L, 3, 3) of odometry between each pair of lags, where there are holes in it; None without."""
-    if step.unsure is None or float(step.unsure.max()) < _WHOLE:
-        return None
-    squares = step.unsure[0][:, None] ** 2 + step.unsure[1] ** 2
-    return np.asarray(squares[..., None, None] * np.diag(_ACCELERATIONS**2))
+def _scale_density(scale: float) -> float:
+    return math.exp(-0.5 * ((scale - 1.0) / _SCALES) ** 2) / (_SCALES * math.sqrt(2.0 * math.pi))
 
 
 def _grid_spread(o: Floats, dt: float) -> Floats:
     """Covariance (3, 3) of a motion between lags of the grid, which is as coarse as it is."""
     return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
-
-
-def _stamps_allow(step: Step, longer: Floats) -> Floats:
-    """Return the likelihood of the stamps' distances if the lag becomes ``longer`` (...) by seconds, against no lag.
-
-    A lidar turns at a constant rate. So where clouds become late by a second, their stamps have a hole of a second:
-    the clock has jumped, or they are stamped where they arrive.
-    """
-    allowed = longer <= step.excess + _SLACK
-    return np.where(longer <= _SLACK, 1.0, np.where(allowed, (1.0 - _NO_HOLE) / step.holes, _NO_HOLE))
 
 
 def _lag_rates(dt: float, come: float) -> tuple[Floats, Floats, Floats]:

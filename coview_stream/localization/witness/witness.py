@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.special import chdtri
 
 from coview_stream.config import RegistrationConfig
@@ -23,18 +24,19 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.tracker import Tracker
+from coview_stream.localization.witness.agreement import FAILS, Seen, Step
 from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter
-from coview_stream.localization.witness.faults import FAILS, LAGS, Accusation, FaultPosterior, Seen, Step
+from coview_stream.localization.witness.faults import LAGS, Accusation, FaultPosterior
 from coview_stream.localization.witness.first_motions import Conventions
+from coview_stream.localization.witness.stamps import step_stamps
 
 _METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # of a step, whichever comes first
 _SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
 _FAR = 5.0  # metres
 _MANY = 5  # frames of a step, which one more makes hardly longer
-_RECENT = 3  # frames of odometry of which the velocity is taken
+_RECENT = 3  # frames of odometry of which the velocities are taken
 _HISTORY = 600  # frames of odometry
 _HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
-_HOLES, _HOLES_OVER = 0.02, 100.0  # share of steps with a hole in the stamps, at first; steps that it is measured over
 _APART = 2.0  # times worse than usual: clouds do not fit each other
 _RISK = 1e-3  # of a protection level
 _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
@@ -81,8 +83,8 @@ class Witness:
         self._previous: _Frame | None = None
         self._reference: _Frame | None = None
         self._waiting: _Waiting | None = None
+        self._tilting = 0.0  # radians per second of the body about its x and y, of late
         self._calibration = Calibration()
-        self._holes = _HOLES
         self._cloud: Points | None = None  # the newest
 
     def forget_scan(self) -> None:
@@ -94,6 +96,9 @@ class Witness:
         calibration = self._estimator.calibration
         pose = np.zeros(3)
         if self._odometry is not None:
+            if stamp > self._path[-1][0]:
+                tilted = float(np.arccos(np.clip(self._odometry[2, :3] @ T_odom_raw[2, :3], -1.0, 1.0)))
+                self._tilting += (tilted / (stamp - self._path[-1][0]) - self._tilting) / _RECENT
             step = planar_motion(self._odometry, T_odom_raw)
             step[:2] *= 1.0 + calibration.scale
             step[2] += calibration.turn * float(np.linalg.norm(step[:2]))
@@ -117,7 +122,7 @@ class Witness:
         self._compare_waiting(drift)
         before, now = self._reference, self._newest
         if before is not None and now is not None and self._is_due() and not self._may_hide_turns():
-            seen = self._compare(now, self._previous, drift)
+            seen = self._compare(now, self._previous, drift, tracking=False)
             if conventions is not None and seen is not None and seen.T is not None:
                 variance = float(seen.covariance.diagonal()[:2].max())
                 conventions.add_motion(seen.T, variance, before.T_odom_raw, now.T_odom_raw)
@@ -200,6 +205,7 @@ class Witness:
         registered: Estimate | None = None,
         belief: Estimate | None = None,
         contradicted: bool = False,
+        tracking: bool = True,
     ) -> CloudMotion | None:
         """Compare a frame with the one of the last comparison; return the clouds' motion, if they show one.
 
@@ -210,6 +216,7 @@ class Witness:
             registered: the frame's registration to the map, the prior removed, if it fits.
             belief: of the frame's pose without it, if there is a pose.
             contradicted: by the map, so the frame just before is compared, too: bodies do not jump.
+            tracking: a place is known; a search has its own measurements between clouds for the calibration.
         """
         before = self._reference
         if before is None or now.stamp <= before.stamp:
@@ -224,9 +231,12 @@ class Witness:
         along, across = calibration.sigma_scale * driven, max(calibration.sigma_heading, _HEADING) * driven
         noise = np.diag(_JITTER**2 + [x + along**2, y + across**2, yaw + (calibration.sigma_turn * driven) ** 2])
         on_map = None if registered is None else _on_map(before.on_map, registered)
+        stamps = step_stamps(np.array([at for at, _ in self._path]), before.stamp, now.stamp)
         seen: CloudMotion | None = None
-        if driven <= LONGEST:
-            guess = on_map.motion if contradicted and on_map is not None else None
+        guess = on_map.motion if contradicted and on_map is not None else None
+        if stamps.hole and guess is None:  # the cloud may be of the time before it
+            guess = between(past[0], self._by_lags(now.stamp - delay - stamps.hole)[0])
+        if driven <= LONGEST or (guess is not None and float(np.linalg.norm(guess[:2])) <= LONGEST):
             seen = self._meter.measure(before.scan, now.scan, calibration, guess)
         clouds = None if seen is None else Seen(seen.motion, seen.covariance)
         misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
@@ -234,18 +244,16 @@ class Witness:
         if seen is not None and (contradicted or _contradicts(o, noise, seen)):
             parts = self._parts(seen, before, middle, now, calibration)
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
-        excess = self._excess(before.stamp, now.stamp)
-        self._holes += (float(excess > 0.0) - self._holes) / _HOLES_OVER
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
             fails=fails, apart=misfit > _APART, copied=now.copied, parts=parts,
-            unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), excess=excess,
-            holes=max(self._holes, 1.0 / _HOLES_OVER),  # so many steps tell no smaller share
+            unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), stamps=stamps,
+            start=guess, tilting=self._tilting,
         )  # fmt: skip
         self.faults.add(step)
         if self.faults.good + self.faults.odometry > 0.5:
             self._right_until = now.stamp
-        if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None:
+        if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None and tracking:
             # nothing else tells the new mount or clock: registrations to the map are not believed meanwhile
             spread = seen.covariance + np.diag(_JITTER**2 + [x, y, yaw])
             moments = before.scan.moment, now.scan.moment
@@ -254,13 +262,6 @@ class Witness:
             self._estimator.rescale(*rescaled)
         self._reference = now
         return seen
-
-    def _excess(self, begin: float, end: float) -> float:
-        """Return the seconds by which stamps from ``begin`` to ``end`` are farther apart than usual; 0 within half."""
-        stamps = np.array([at for at, _ in self._path])
-        usual = float(np.median(np.diff(stamps)))
-        excess = end - begin - usual * float(np.count_nonzero((stamps > begin) & (stamps <= end)))
-        return excess if excess > 0.5 * usual else 0.0
 
     def _parts(
         self, seen: CloudMotion, before: _Frame, middle: _Frame | None, now: _Frame, calibration: Calibration
@@ -282,20 +283,30 @@ class Witness:
         calibration = self._estimator.calibration
         moved = calibration.T_body_cloud @ inverse(self._calibration.T_body_cloud)
         self.faults.corrected(planar_pose(moved), calibration.delay - self._calibration.delay)
+        factor = (1.0 + calibration.scale) / (1.0 + self._calibration.scale)
+        if factor != 1.0:  # all steps of odometry are of one scale
+            here, resized = self._path[-1][1], np.array([factor, factor, 1.0])
+            self._path = deque(((at, here + resized * (pose - here)) for at, pose in self._path), maxlen=_HISTORY)
         self._calibration = calibration
         return calibration
 
     def _by_lags(self, stamp: float) -> Floats:
         """Return odometry's planar poses (L, 3) by LAGS before a stamp.
 
-        Before the first frame it stood still, after the newest it goes on as before.
+        Before the first frame it stood still, after the newest it goes on as before. Within holes in odometry it
+        goes from the speed before to the one after.
         """
         stamps = np.array([at for at, _ in self._path])
         poses = np.stack([pose for _, pose in self._path])
         if len(stamps) > _RECENT:
             velocity = (poses[-1] - poses[-1 - _RECENT]) / (stamps[-1] - stamps[-1 - _RECENT])
             stamps, poses = np.append(stamps, stamps[-1] + 1.0), np.vstack([poses, poses[-1] + velocity])
-        return np.stack([np.interp(stamp - LAGS, stamps, column) for column in poses.T], axis=1)
+        at = np.clip(stamp - LAGS, stamps[0], stamps[-1])
+        if len(stamps) <= _RECENT:
+            return np.stack([np.interp(at, stamps, column) for column in poses.T], axis=1)
+        first = max(0, int(np.searchsorted(stamps, at[-1])) - _RECENT)
+        stamps, poses = stamps[first:], poses[first:]
+        return np.asarray(CubicHermiteSpline(stamps, poses, np.gradient(poses, stamps, axis=0))(at))
 
     def _unsure(self, stamp: float) -> Floats:
         """Return half of the products (L,) of the seconds to the frames of odometry before and after, by LAGS."""

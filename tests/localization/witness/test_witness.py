@@ -102,7 +102,7 @@ def test_hours_without_a_hole_in_the_stamps_make_none_impossible():
     """Else the first cloud that is dropped would prove that all others are late."""
     steps = compared([np.zeros((1, 3), dtype=np.float32)] * 200)
     assert len(steps) == 199
-    assert 0.005 < steps[-1].holes < 0.02
+    assert 0.005 < steps[-1].stamps.holes < 0.02
 
 
 @pytest.mark.parametrize(("cause", "waits"), [(RejectionReason.VERIFIED, True), (RejectionReason.FITNESS, False)])

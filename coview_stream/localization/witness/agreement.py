@@ -1,0 +1,142 @@
+"""Agreement of the motions that odometry, clouds and map show over a step, as likelihoods.
+
+Over a step odometry moves by o, the clouds, registered to each other, by l, and registrations to the map by m. Either
+registration fails with a small probability and then says anything: mostly something within metres of odometry's motion,
+where it began, but there is no motion that it cannot say (Student's t with one degree of freedom). Motions are planar:
+(x, y, heading) in the level axes of the earlier body.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.planar import between
+from coview_stream.geometry.transforms import wrap_angle
+from coview_stream.localization.witness.stamps import StepStamps
+
+FAILS = 0.05
+"""Probability that clouds are registered wrongly, where they fit each other as usual."""
+MAP_FAILS = 0.02
+"""Likewise a verified registration to the map."""
+ALONE = 0.05
+"""Probability that clouds of one place do not fit each other."""
+ANYWHERE: Floats = np.array([2.0, 2.0, math.radians(20.0)])
+"""Scale of a wrong registration about odometry's motion: metres, radians."""
+_APART = 0.7  # probability that clouds of several places do not fit each other
+_ACCELERATIONS = np.array([0.25, 0.25, 0.12])  # m/s^2 and rad/s^2 of wheeled robots beyond the speeds about a hole
+_WHOLE = 0.01  # seconds^2: odometry of five frames per second has no holes
+
+
+class Seen(NamedTuple):
+    """Motion (3,) as seen by one witness, with its covariance (3, 3)."""
+
+    motion: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a robot by its witnesses; motions are planar: (x, y, heading) in the earlier body's axes."""
+
+    seconds: float
+    odometry: Seen
+    clouds: Seen | None  # None where there is too little to see
+    on_map: Seen | None  # None without a verified registration at both ends
+    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the begin of the step
+    path_now: Floats  # and before its end
+    fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
+    apart: bool = False  # the clouds fit each other much less than usual
+    copied: bool = False  # the clouds are the same bytes
+    unsure: Floats | None = None  # (2, L) seconds^2 by which odometry at these poses misses accelerations in holes
+    stamps: StepStamps | None = None  # of the clouds
+    start: Floats | None = None  # (3,) from which the clouds' registration began beside odometry's motion
+    tilting: float = 0.0  # radians per second of the body about its x and y
+    parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
+
+
+def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floats:
+    """Return the likelihood of a step's clouds and map if a motion (..., 3) with a covariance (..., 3, 3) is expected.
+
+    Either registration may be wrong; where both are right they err together by the expected motion's covariance.
+    """
+    seen, on_map, o = step.clouds, step.on_map, step.odometry.motion
+    if seen is None and on_map is None:
+        return np.ones(np.shape(motion)[:-1])
+    if seen is None or on_map is None:
+        one, fails = (seen, step.fails) if seen is not None else (on_map, MAP_FAILS)
+        assert one is not None
+        wrong = _wrong(step, seen) if seen is not None else anywhere(one.motion - o)
+        likely = (1.0 - fails) * normal(one.motion - motion, one.covariance + spread)
+        likely = likely + fails * wrong
+    else:
+        L, M = seen.covariance, on_map.covariance
+        gap = on_map.motion - seen.motion
+        gap[2] = wrap_angle(float(gap[2]))
+        gain = L @ np.linalg.inv(L + M)
+        fused = normal(seen.motion + gain @ gap - motion, L - gain @ L + spread)
+        l_right, l_wrong = normal(seen.motion - motion, L + spread), _wrong(step, seen)
+        m_right, m_wrong = normal(on_map.motion - motion, M + spread), anywhere(on_map.motion - o)
+        likely = (1.0 - step.fails) * (1.0 - MAP_FAILS) * normal(gap, L + M) * fused
+        likely = likely + (1.0 - step.fails) * MAP_FAILS * l_right * m_wrong
+        likely = likely + step.fails * ((1.0 - MAP_FAILS) * l_wrong * m_right + MAP_FAILS * l_wrong * m_wrong)
+    return np.asarray(likely if seen is None else likely * (alone if step.apart else 1.0 - alone))
+
+
+def _wrong(step: Step, seen: Seen) -> float:
+    """Return the density of the clouds' motion if they are registered wrongly: near a motion that it began with."""
+    density = anywhere(seen.motion - step.odometry.motion)
+    return density if step.start is None else 0.5 * (density + anywhere(seen.motion - step.start))
+
+
+def at_once(step: Step, covariance: Floats) -> float:
+    """Return the likelihood that clouds have left odometry's motion at one moment of a step: in one of its parts.
+
+    A body that is carried, or whose wheels slip, leaves it by and by.
+    """
+    gaps = [between(odometry, clouds) for _, odometry, clouds in step.parts]
+    squares = [float(gap @ np.linalg.solve(covariance, gap)) for gap in gaps]
+    return math.exp(-0.5 * min(squares, default=0.0))
+
+
+def of_several_places(step: Step) -> float:
+    """Return the likelihood of a step's clouds and map where each is registered to anything."""
+    likely = 1.0
+    for seen in (step.clouds, step.on_map):
+        likely *= 1.0 if seen is None else anywhere(seen.motion - step.odometry.motion)
+    return likely if step.clouds is None else likely * (_APART if step.apart else 1.0 - _APART)
+
+
+def anywhere(gap: Floats) -> float:
+    """Return the density of a wrong registration (3,) beside odometry's motion: Student's t, one degree of freedom."""
+    square = float((np.append(gap[:2], wrap_angle(float(gap[2]))) ** 2 / ANYWHERE**2).sum())
+    return 1.0 / (math.pi**2 * float(ANYWHERE.prod()) * (1.0 + square) ** 2)
+
+
+def normal(gap: Floats, covariance: Floats) -> Floats:
+    """Return the density of gaps (..., 3) of planar motions."""
+    gap = np.concatenate([gap[..., :2], np.angle(np.exp(1j * gap[..., 2:]))], axis=-1)
+    square = np.einsum("...i,...ij,...j", gap, np.linalg.inv(covariance), gap)
+    return np.asarray(np.exp(-0.5 * square) / np.sqrt((2.0 * math.pi) ** 3 * np.linalg.det(covariance)))
+
+
+def density(C: Floats, sigmas: Floats) -> float:
+    """Return the density of a planar motion (3,) about none, by sigmas (3,)."""
+    return float(normal(C, np.diag(sigmas**2)))
+
+
+def unsure(step: Step) -> Floats | None:
+    """Covariance (L, L, 3, 3) of odometry between each pair of lags, where there are holes in it; None without."""
+    if step.unsure is None or float(step.unsure.max()) < _WHOLE:
+        return None
+    squares = step.unsure[0][:, None] ** 2 + step.unsure[1] ** 2
+    return hidden_by(np.sqrt(squares))
+
+
+def hidden_by(seconds: Floats) -> Floats:
+    """Covariance (..., 3, 3) of accelerations that act over half of ``seconds`` (...) squared, unseen by odometry."""
+    return np.asarray(np.square(seconds)[..., None, None] * np.diag(_ACCELERATIONS**2))

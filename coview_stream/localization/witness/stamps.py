@@ -1,0 +1,90 @@
+"""Stamps of clouds against the turns of the lidar, which go on evenly whatever the stamps say.
+
+Clouds that become late are stamped further apart than the lidar turns: by a hole where their lag jumps, by stretched
+distances where it grows. So a step's stamps say how probable it is that clouds have become later by so many seconds.
+The lidar's period is measured from the stamps: frames may be left out, so their distances are multiples of it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+
+_RATE = 0.01  # share by which a lidar's turns differ: spinning ones hold their rate to a per cent
+_PARTS = np.arange(1.0, 11.0)  # turns between two frames, at most ten: a frame a second of a lidar of 10 Hz
+_SHORT = 0.1  # quantile of the distances that is a short one: shorter ones may be jitter
+_BEYOND = 1.5  # times the usual distance: a frame at least is missing
+_FEWEST = 50.0  # distances that an unseen share of them counts as: no rarer event is known at first
+_LEAST = 0.01  # share of holes and of jitter, at least: events have causes in common, and are not told apart further
+_BIN = 0.05 / np.sqrt(12.0)  # sigma of a lag that is known within a twentieth of a second
+
+
+class StepStamps(NamedTuple):
+    """Distances of stamps within a step, with what is usual for them."""
+
+    seconds: Floats  # (N,) distances
+    period: float  # of the lidar, seconds
+    sigma: float  # of a distance from a multiple of it, seconds
+    usual: float  # distance, seconds
+    holes: float  # share of distances with a hole
+    jitter: float  # share of distances that are no multiple
+
+    def allow(self, longer: Floats, sigma: float = _BIN) -> Floats:
+        """Return the likelihood (...) of the stamps if the lag becomes ``longer`` (...) by seconds, against no change.
+
+        It does so at once, or all along the step; ``sigma`` is of ``longer``, seconds.
+        """
+        flat = np.ravel(longer)
+        now = self._likelihood(self.seconds, 0.0)
+        at_once = (self._likelihood(self.seconds - flat[:, None], sigma) / now).max(axis=1)
+        shares = self.seconds / self.seconds.sum()
+        along = self._likelihood(self.seconds - flat[:, None] * shares, sigma * float(shares.max()))
+        steady = np.exp(np.log(along / now).mean(axis=1))  # one cause for all of them
+        return np.where(flat == 0.0, 1.0, 0.5 * (at_once + steady)).reshape(np.shape(longer))
+
+    @property
+    def hole(self) -> float:
+        """Seconds by which the longest distance is longer than usual, if frames are missing there; else 0."""
+        longest = float(self.seconds.max())
+        return longest - self.usual if longest > _BEYOND * self.usual else 0.0
+
+    def stalled(self, lags: Floats) -> Floats:
+        """Return the shares (L,) of lags (L,) that a hole leaves if clouds are late since: the rest of it is usual."""
+        rest = float(self.seconds.max()) - lags
+        likely = np.where(rest > _BEYOND * self.usual, 0.0, self._likelihood(rest, _BIN)) * (lags > 0.0)
+        return likely / likely.sum() if self.hole and likely.any() else 0.0 * likely
+
+    def _likelihood(self, seconds: Floats, sigma: float) -> Floats:
+        """Return the likelihood of distances, that of a usual one being about one."""
+        turns = np.maximum(np.round(seconds / self.period), 1.0)
+        off = (seconds - turns * self.period) ** 2 / (self.sigma**2 + sigma**2)
+        kept = np.where(turns * self.period > _BEYOND * self.usual, self.holes, 1.0 - self.holes)
+        return np.asarray(kept * np.exp(-0.5 * off) + self.jitter)
+
+
+def step_stamps(stamps: Floats, begin: float, end: float) -> StepStamps:
+    """Return the stamps of a step from ``begin`` to ``end``, by all newest ``stamps`` (M,), at least two."""
+    seconds = np.diff(stamps)
+    period, sigma = _period(seconds)
+    off = seconds - np.maximum(np.round(seconds / period), 1.0) * period
+    usual = float(np.median(seconds))
+    holes, jitter = (
+        max(_LEAST, float(events.sum() + 1.0) / (len(seconds) + _FEWEST))
+        for events in (seconds > _BEYOND * usual, np.abs(off) > 3.0 * sigma)
+    )
+    within = seconds[(stamps[1:] > begin) & (stamps[1:] <= end)]
+    return StepStamps(within, period, sigma, usual, holes, jitter)
+
+
+def _period(seconds: Floats) -> tuple[float, float]:
+    """Return the period of which distances (N,) are multiples, and the sigma of one from a multiple, seconds."""
+    periods = float(np.quantile(seconds, _SHORT)) / _PARTS
+    turns = np.maximum(np.round(seconds / periods[:, None]), 1.0)
+    periods = np.median(seconds / turns, axis=1)
+    off = np.median(np.abs(seconds - turns * periods[:, None]), axis=1)
+    sigmas = np.maximum(1.48 * off, _RATE * periods)
+    best = int((sigmas / periods).argmin())  # of several that fit alike the longest
+    return float(periods[best]), float(sigmas[best])
