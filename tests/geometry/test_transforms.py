@@ -149,6 +149,8 @@ def test_quaternion_round_trip():
 def test_log_so3_matches_scipy():
     R = Rotation.random(200, random_state=5)
     np.testing.assert_allclose(log_so3(R.as_matrix()), R.as_rotvec(), atol=1e-9)
+    for single in R:
+        np.testing.assert_allclose(log_so3(single.as_matrix()), single.as_rotvec(), atol=1e-9)
     np.testing.assert_array_equal(log_so3(np.eye(3)), np.zeros(3))
 
 
