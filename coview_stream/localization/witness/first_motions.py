@@ -214,14 +214,17 @@ class Conventions:
             self._pairs_in_feet.clear()
             self.doubtful = False
             self._motions_in_feet = CloudPairs(AXES[axis])
-        found = [(self._pairs, self._motions.add(points, T_odom_body))]
-        if not self.plausible:
+        pair, in_feet = self._motions.add(points, T_odom_body), None
+        if pair is not None:
+            self._pairs.append(pair)
+        if fit(self._pairs).odds > 0.0:  # so clouds are not in feet
+            self._pairs_in_feet.clear()
+            self._motions_in_feet = CloudPairs(AXES[axis])
+        elif not self.plausible:
             in_feet = self._motions_in_feet.add(points * np.float32(FOOT), T_odom_body)
-            found.append((self._pairs_in_feet, in_feet))
-        for pairs, pair in found:
-            if pair is not None:
-                pairs.append(pair)
-        if any(pair is not None for _, pair in found):
+            if in_feet is not None:
+                self._pairs_in_feet.append(in_feet)
+        if pair is not None or in_feet is not None:
             self._judge()
 
     def add_motion(self, motion: Pose, variance: float, T_before: Pose, T_odom_body: Pose) -> None:
@@ -272,4 +275,5 @@ class Conventions:
             yield _ODD + _ANY_HEADING, turned_clouds(self._axis, seen.yaw)
         if AXIS_NAMES[self._axis] == "-y":
             yield _ODD, BOTH_CAMERA
-        yield from ((_ODD if sent else 2.0 * _ODD, reading) for reading in (FEET, MIRRORED, *ODOMETRY))
+        others = (*((FEET,) if self._pairs_in_feet else ()), MIRRORED, *ODOMETRY)
+        yield from ((_ODD if sent else 2.0 * _ODD, reading) for reading in others)
