@@ -65,7 +65,7 @@ def warn(message: str | None) -> None:
 EXTRA_OF = {
     "scipy": "node",
     "tqdm": "node",
-    "taichi": "node",
+    "taichi": "taichi",
     "quadrants": "node",
     "gtsam": "node",
     "onnxruntime": "node",

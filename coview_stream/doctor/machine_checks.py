@@ -129,7 +129,7 @@ def blas_finding(threads: str) -> Finding:
 def kernels_finding(result: dict[str, Any], forced: bool) -> Finding:
     """Judge the backend of the kernels; ``forced``: ``COVIEW_KERNELS`` is set."""
     if "error" in result:
-        remedy = "COVIEW_KERNELS=numpy does without, but is slower; reinstall taichi"
+        remedy = "COVIEW_KERNELS=numpy does without, but is slower; reinstall quadrants"
         if forced:
             remedy = "unset COVIEW_KERNELS, or set it to numpy"
         return Finding("FAIL", "kernels", str(result["error"]), remedy)
@@ -138,7 +138,7 @@ def kernels_finding(result: dict[str, Any], forced: bool) -> Finding:
         text += f"; wrong results from {', '.join(result['differing'])}"
         return Finding("FAIL", "kernels", text, "set COVIEW_KERNELS=numpy, and report it with this output")
     if result["backend"] == "numpy":
-        remedy = "unset COVIEW_KERNELS" if forced else "`pip install taichi` (on aarch64: quadrants)"
+        remedy = "unset COVIEW_KERNELS" if forced else "`pip install quadrants`"
         return Finding("warn", "kernels", text, f"slower than need be: {remedy}")
     return Finding("ok", "kernels", f"{text}; results as from their NumPy twins")
 

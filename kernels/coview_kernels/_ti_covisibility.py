@@ -53,7 +53,7 @@ def describe_grid(
             value[b] = out
 
 
-@ti.kernel
+@runtime.kernel
 def coview(
     grids: i32, chunks: i32, rings: i32, sectors: i32, rule: i32,
     highest: Floats, count: Integers, mean: Floats, value: Floats,

@@ -24,7 +24,7 @@ def inside(settings: ti.template(), x: f32, y: f32, z: f32) -> i32:
     return ti.cast(dx * dx + dy * dy < settings[RADIUS], i32) & ti.cast(ti.abs(z) <= FINITE, i32)
 
 
-@ti.kernel
+@runtime.kernel
 def measure(points: Floats, spans: Integers, settings: Doubles, bounds: Floats, count: Integers):
     """Lowest (3) and highest (3) coordinates of the points inside, and their number."""
     ti.loop_config(serialize=True)
@@ -45,7 +45,7 @@ def measure(points: Floats, spans: Integers, settings: Doubles, bounds: Floats, 
         count[0] = number
 
 
-@ti.kernel
+@runtime.kernel
 def sort(
     points: Floats, normals: Bytes, spans: Integers, settings: Doubles,
     cell: Integers, starts: Integers, rows: Integers, planes: Floats,

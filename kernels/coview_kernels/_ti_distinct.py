@@ -10,7 +10,7 @@ FLOATS = ti.types.ndarray(f32, 1)
 WHOLES = ti.types.ndarray(i32, 1)
 
 
-@ti.kernel
+@runtime.kernel
 def distinct(
     poses: FLOATS, kept: FLOATS, chosen: WHOLES, found: WHOLES, size: i32, count: i32, square: f32, cosine: f32
 ):

@@ -156,7 +156,7 @@ def rise(
     return total / ti.max(number, 1)
 
 
-@ti.kernel
+@runtime.kernel
 def score(
     planes: PLANES, blocks: ti.i32, high: ti.i32,
     table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, first: ti.i32, surface: WHOLES,

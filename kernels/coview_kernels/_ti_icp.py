@@ -245,7 +245,7 @@ def advance(about, settings: ti.template(), state: ti.template(), system: ti.tem
             state[STATUS] = DONE
 
 
-@ti.kernel
+@runtime.kernel
 def align(
     settings: DOUBLES, starts: WHOLES, rows: WHOLES, normals: FLOATS, source: FLOATS, kinds: WHOLES, memory: DOUBLES,
     partners: FLOATS, bins: WHOLES, system: ti.types.ndarray(ti.f64, 2), state: DOUBLES, chunks: ti.i32,

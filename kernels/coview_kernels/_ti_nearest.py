@@ -107,7 +107,7 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
     return best, found, beyond
 
 
-@ti.kernel
+@runtime.kernel
 def nearest(frame: DOUBLES, starts: WHOLES, rows: WHOLES, queries: POINTS, T: MATRIX, radius: ti.f64, answer: MATRIX):
     """Write distances and indices, the rows of ``answer``, where there is a point.
 
@@ -129,7 +129,7 @@ def nearest(frame: DOUBLES, starts: WHOLES, rows: WHOLES, queries: POINTS, T: MA
             answer[1, n] = rows[4 * found + 3]
 
 
-@ti.kernel
+@runtime.kernel
 def sort(points: POINTS, frame: DOUBLES, cell: WHOLES, starts: WHOLES, rows: WHOLES):
     """Sort the points by cell into ``rows``, by counting; ``starts`` comes as zeros, one more than cells."""
     for n in range(points.shape[0]):

@@ -23,7 +23,7 @@ def cell_of(points: ti.template(), k, frame: ti.template(), rows, columns):
     return x, y, cell
 
 
-@ti.kernel
+@runtime.kernel
 def lowest(points: FLOATS, frame: FLOATS, rows: i32, columns: i32, out: FLOATS):
     """Keep the lowest height of each cell; ``frame``: x, y of the corner, cells per metre."""
     ti.loop_config(serialize=True)
@@ -33,7 +33,7 @@ def lowest(points: FLOATS, frame: FLOATS, rows: i32, columns: i32, out: FLOATS):
             out[cell] = ti.min(out[cell], points[3 * k + 2])
 
 
-@ti.kernel
+@runtime.kernel
 def near(
     points: FLOATS, frame: FLOATS, rows: i32, columns: i32, level: FLOATS, band: f32, count: LONGS, total: DOUBLES
 ):
@@ -48,7 +48,7 @@ def near(
                 total[cell] += ti.cast(off, f64)
 
 
-@ti.kernel
+@runtime.kernel
 def columns_of(
     points: FLOATS, frame: FLOATS, rows: i32, columns: i32, ground: FLOATS, wide: i32, occupied: BYTES, top: FLOATS,
     seen: BYTES,

@@ -122,7 +122,7 @@ def add(
                 total[b] = total[b] + height[j]
 
 
-@ti.kernel
+@runtime.kernel
 def bins(
     points: Floats, rows: i32, chunks: i32, rings: i32, sectors: i32,
     params: Doubles, edges: Doubles, highest: Floats, count: Integers, total: Doubles,
@@ -146,7 +146,7 @@ def bins(
                 add(start, n, first, points, rings, sectors, params, edges, highest, count, total)
 
 
-@ti.kernel
+@runtime.kernel
 def station_bins(
     stations: i32, chunks: i32, size: i32, top: Floats, points: Integers, base: Integers, ground: Floats,
     starts: Integers, offsets: Integers, highest: Floats, count: Integers,
@@ -174,7 +174,7 @@ def station_bins(
                         count[m * size + b] = number
 
 
-@ti.kernel
+@runtime.kernel
 def station_means(
     stations: i32, chunks: i32, size: i32, total: Doubles, base: Integers, ground: Floats,
     starts: Integers, offsets: Integers, count: Integers, mean: Floats,

@@ -35,7 +35,7 @@ def met(corners: ti.template(), at, o, d) -> ti.f64:
     return distance
 
 
-@ti.kernel
+@runtime.kernel
 def cast(boxes: FLOATS, axes: WHOLES, corners: FLOATS, rays: FLOATS, distance: FLOATS, found: WHOLES):
     """Write the distance to the first triangle of each ray, and its place among the corners (-1: none)."""
     for n in range(distance.shape[0]):

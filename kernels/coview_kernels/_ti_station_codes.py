@@ -51,7 +51,7 @@ def _best(serial: bool):
                 x[b] += sx
                 y[b] += sy
 
-    @ti.kernel
+    @runtime.kernel
     def best(codes: SHORTS, query: SHORTS, turn: SHORTS, found: WHOLES, length: i32):
         if ti.static(serial):
             ti.loop_config(serialize=True)
@@ -113,7 +113,7 @@ def _best(serial: bool):
     return best
 
 
-@ti.kernel
+@runtime.kernel
 def products(codes: SHORTS, query: FLOATS, stations: WHOLES, found: FLOATS, count: i32):
     ti.loop_config(serialize=True)
     for k in range(count):
@@ -133,7 +133,7 @@ def products(codes: SHORTS, query: FLOATS, stations: WHOLES, found: FLOATS, coun
                 found[k * 4 * LANES + (g * 2 + 1) * LANES + b] = y[b]
 
 
-@ti.kernel
+@runtime.kernel
 def at(codes: SHORTS, table: FLOATS, stations: WHOLES, shifts: WHOLES, found: FLOATS, count: i32):
     ti.loop_config(serialize=True)
     for k in range(count):

@@ -112,7 +112,7 @@ def keep_first(
     return out, cubes, at, last, seen
 
 
-@ti.kernel
+@runtime.kernel
 def voxel_filter(
     points: Floats, blocks: i32, call: i64, bits: i32, merge: i64,
     settings: Doubles, table: Longs, moved: Floats, totals: Integers,

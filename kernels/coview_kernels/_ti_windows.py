@@ -16,7 +16,7 @@ BYTES = ti.types.ndarray(i8, 1)
 WHOLES = ti.types.ndarray(i32, 1)
 
 
-@ti.kernel
+@runtime.kernel
 def products(
     raster: BYTES, wide: i32, images: BYTES, stride: i32, spans: WHOLES, first: WHOLES, which: WHOLES, out: WHOLES
 ):

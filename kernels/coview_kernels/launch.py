@@ -1,10 +1,9 @@
 """Launches of a kernel whose arguments stay, prepared once instead of at every call.
 
-A call of a Taichi 1.7 kernel costs 36 us, 22 us more for each array and 6 for each number (measured): types
-are looked up, checked and converted every time. A :class:`Launch` sets the arguments once and afterwards
-costs 4 us, plus 3 for an array that changes. It uses Taichi's own launch context, which is not public, so only
-that of the versions it has been tested with; elsewhere (quadrants, which is quick by itself) it calls the
-kernel.
+A call of a kernel costs 15 us in quadrants 1.3 and 36 in Taichi 1.7, and 5 to 20 us more for each argument (measured):
+types are looked up, checked and converted every time. A :class:`Launch` sets the arguments once and afterwards costs
+4 us, plus 3 for an array that changes. It uses the library's own launch context, which is not public, so only that of
+the versions that it has been tested with; elsewhere it calls the kernel.
 """
 
 from __future__ import annotations
@@ -14,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from coview_kernels import runtime
-from coview_kernels.front_end import tested
+
+TESTED_VERSIONS = {"quadrants": ((1, 3), (1, 4)), "taichi": ((1, 7),)}
+"""Libraries of which the launch context is known."""
 
 SPAN = 512
 """Iterations per chunk of a parallel loop.
@@ -22,6 +23,11 @@ SPAN = 512
 Both libraries cut a range into blocks of at least 512 iterations for any ``block_dim``: a loop over C
 chunks of work must run over ``C * SPAN`` and do the work in every SPAN-th iteration, or one thread does it all.
 """
+
+
+def tested(library: Any) -> bool:
+    """Tell whether this version's launch context is known."""
+    return tuple(library.__version__[:2]) in TESTED_VERSIONS.get(library.__name__, ())
 
 
 class Launch:
@@ -51,26 +57,22 @@ class Launch:
     def __call__(self) -> None:
         """Run the kernel and wait for its end."""
         program = runtime.program()
-        if self._program is not program:
-            if not tested(runtime.library()):
-                self._kernel()(*self._arguments)
-                return
+        if self._program is program:
+            program.launch_kernel(self._compiled, self._context)
+        elif _compiled.get(self._name, (None,))[0] is program:
             self._prepare(program)
-        program.launch_kernel(self._compiled, self._context)
-
-    def _kernel(self) -> Any:
-        module, name = self._name
-        return getattr(runtime.kernels(module), name)
+            program.launch_kernel(self._compiled, self._context)
+        else:
+            module, name = self._name
+            kernel = getattr(runtime.kernels(module), name)
+            kernel(*self._arguments)
+            if tested(runtime.library()):
+                _compiled[self._name] = program, *_forms(kernel._primal, program)
+                self._prepare(program)
 
     def _prepare(self, program: Any) -> None:
-        known, native, compiled = _compiled.get(self._name, (None, None, None))
-        if known is not program:
-            primal = self._kernel()._primal
-            # the kernels declare all types, so that each has one compiled form
-            native = primal.compiled_kernels[primal.ensure_compiled(*self._arguments)]
-            compiled = program.compile_kernel(program.config(), program.get_device_caps(), native)
-            _compiled[self._name] = program, native, compiled
-        self._context, self._compiled = native.make_launch_context(), compiled
+        _, native, self._compiled = _compiled[self._name]
+        self._context = native.make_launch_context()
         for index, value in enumerate(self._arguments):
             _set_argument(self._context, index, value)
         self._program = program
@@ -79,11 +81,20 @@ class Launch:
 _compiled: dict[tuple[str, str], tuple[Any, Any, Any]] = {}
 
 
+def _forms(kernel: Any, program: Any) -> tuple[Any, Any]:
+    """Return the read and the compiled form of a kernel that has run: one, as all its types are declared."""
+    if runtime.library().__name__ == "quadrants":
+        return next(iter(kernel.materialized_kernels.values())), next(iter(kernel.compiled_kernel_data_by_key.values()))
+    native = next(iter(kernel.compiled_kernels.values()))
+    return native, program.compile_kernel(program.config(), program.get_device_caps(), native)
+
+
 def _set_argument(context: Any, index: int, value: Any) -> None:
+    place: Any = index if runtime.library().__name__ == "quadrants" else (index,)
     if isinstance(value, np.ndarray):
         address = value.__array_interface__["data"][0]
-        context.set_arg_external_array_with_shape((index,), address, value.nbytes, value.shape, 0)
+        context.set_arg_external_array_with_shape(place, address, value.nbytes, value.shape, 0)
     elif isinstance(value, float):
-        context.set_arg_float((index,), value)
+        context.set_arg_float(place, value)
     else:
-        context.set_arg_int((index,), value)
+        context.set_arg_int(place, value)

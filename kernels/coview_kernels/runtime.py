@@ -1,14 +1,17 @@
-"""Start, choice and end of the backend, in the only module that imports Taichi (or quadrants, its maintained fork).
+"""Start, choice and end of the backend, in the only module that imports quadrants (or Taichi, which it is a fork of).
+
+"Taichi" stands for either, here and elsewhere: both compile the same source. Quadrants comes first: it needs no system
+library but libc, and starts in half the time (``python -m bench start``).
 
 Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
 launched on the same thread, and concurrent launches fail now and then. One daemon thread owns it and takes calls from
 a queue; callers, on any thread, wait for their result.
 
-* ``COVIEW_KERNELS`` = ``taichi``, ``quadrants`` or ``numpy`` forces a backend; unset, the first usable one serves.
+* ``COVIEW_KERNELS`` = ``quadrants``, ``taichi`` or ``numpy`` forces a backend; unset, the first usable one serves.
 * ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; unset, all cores of the process serve, up to 16.
-* A host program that has initialised Taichi keeps it: a second ``init`` would destroy its fields. We then take
-  quadrants, if installed, or NumPy; likewise if the host initialises Taichi after us, which it must not do while one
-  of our kernels runs.
+* A host program that has initialised Taichi keeps it: a second ``init`` would destroy its fields. We then take the
+  other library, if installed, or NumPy; likewise if the host initialises Taichi after us, which it must not do while
+  one of our kernels runs.
 * A forked child inherits Taichi's state without its threads and would hang: it computes in NumPy.
 * :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It runs at exit by itself.
 """
@@ -17,25 +20,27 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import os
+import shutil
 import sys
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
-from coview_kernels import front_end
 from coview_kernels.owner_thread import OwnerThread, StoppedError
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_BACKENDS = ("taichi", "quadrants", "numpy")
+_BACKENDS = ("quadrants", "taichi", "numpy")
 _STALE_LOCK = 60.0  # seconds; the cache is locked for milliseconds
 _MAX_WORKERS = 16  # the kernels are bound by memory; more threads only add private bins to merge
 
@@ -87,8 +92,8 @@ def _import(name: str) -> ModuleType:
         os.environ["HOME"] = home if os.access(home, os.W_OK) else tempfile.gettempdir()
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
-    with front_end.lean_import(name):
-        return importlib.import_module(name)
+    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # else Taichi asks over the network, once a day
+    return importlib.import_module(name)
 
 
 def _program(library: Any) -> Any:
@@ -102,29 +107,59 @@ def _init(library: Any) -> None:
     # there: redirecting sys.stdout would swallow what other threads print meanwhile.
     misc = library.lang.misc
     misc.print = lambda *args, **kwargs: None
-    _remove_stale_lock(library)
+    folder = _cache_folder(library)
+    _remove_stale_lock(folder)
+    library.set_logging_level(library.ERROR)  # that of init comes too late for the folder's environment variable
     try:
         library.init(
             arch=library.cpu,
             cpu_max_num_threads=workers(),
             fast_math=False,  # the twins agree to the bit on edges; measured to cost nothing here
             log_level="error",
+            offline_cache_file_path=str(folder),
         )
     finally:
         del misc.print
-    front_end.shorten(library)
 
 
-def _remove_stale_lock(library: Any) -> None:
+def _cache_folder(library: Any) -> Path:
+    """Return the folder of compiled kernels: quadrants' own, as one finds a kernel by its source (see :func:`kernel`).
+
+    That hash knows the functions of a kernel but not the constants that these use, so all our sources name the folder.
+    """
+    own = library.lang.impl.default_cfg().offline_cache_file_path
+    if library.__name__ != "quadrants":
+        return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or own)
+    warnings.filterwarnings("ignore", message=r"\[PURE\.VIOLATION\]", category=UserWarning)  # of those constants
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    folder = Path(os.environ.get("QD_OFFLINE_CACHE_FILE_PATH") or own) / f"coview-{digest.hexdigest()[:16]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(1 << 16))
+    except OSError:  # a full disk, or one that only reads: quadrants would raise
+        folder = Path(tempfile.mkdtemp(prefix="coview-kernels."))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Decorate the source of a kernel, in its module; quadrants then finds the compiled form without reading it."""
+    decorate = library().kernel
+    return decorate(fastcache=True)(function) if library().__name__ == "quadrants" else decorate(function)
+
+
+def _remove_stale_lock(folder: Path) -> None:
     """Remove the lock that a killed process has left on the cache of compiled kernels.
 
     The library holds it for an instant, and does without the cache while it is there: every start would compile.
     """
-    with contextlib.suppress(OSError, AttributeError):
-        folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or library.lang.impl.default_cfg().offline_cache_file_path
-        lock = Path(folder) / "ticache.lock"
-        if time.time() - lock.stat().st_mtime > _STALE_LOCK:
-            lock.unlink()
+    for lock in (folder / "ticache.lock", folder / "qdcache.lock"):
+        with contextlib.suppress(OSError):
+            if time.time() - lock.stat().st_mtime > _STALE_LOCK:
+                lock.unlink()
 
 
 def cores() -> int:

@@ -16,7 +16,7 @@ from coview_stream.doctor.map_checks import map_findings, node_memory, open_map
 from coview_stream.errors import MapError
 
 GOOD = {
-    "kernels": {"backend": "taichi", "seconds": 1.5, "differing": []},
+    "kernels": {"backend": "quadrants", "seconds": 1.5, "differing": []},
     "zenoh": {"version": "1.10.2"},
     "codecs": {"missing": []},
     "open3d": {"version": "0.20"},
@@ -51,7 +51,7 @@ def test_healthy_machine_has_no_failures(monkeypatch):
         (machine.kernels_finding({"error": "SIGILL"}, False), "FAIL", "COVIEW_KERNELS=numpy"),
         (machine.kernels_finding({"error": "no cuda"}, True), "FAIL", "unset"),
         (machine.kernels_finding(GOOD["kernels"] | {"differing": ["polar_bin"]}, False), "FAIL", "numpy"),
-        (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, False), "warn", "install taichi"),
+        (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, False), "warn", "install quadrants"),
         (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, True), "warn", "unset"),
         (machine.zenoh_finding({"error": "ModuleNotFoundError"}), "FAIL", "eclipse-zenoh"),
         (machine.zenoh_finding({"version": "1.9.0"}), "warn", "upgrade"),

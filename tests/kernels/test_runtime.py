@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -16,7 +17,7 @@ from kernel_cases import ROOT, run_python
 import coview_kernels
 from coview_kernels import backend, polar_bin, reference, runtime, shutdown, submit, warm_up
 
-LIBRARIES = [name for name in ("taichi", "quadrants") if importlib.util.find_spec(name)]
+LIBRARIES = [name for name in ("quadrants", "taichi") if importlib.util.find_spec(name)]
 needs_library = pytest.mark.skipif(not LIBRARIES, reason="neither taichi nor quadrants is installed")
 USE = (
     "import numpy as np, coview_kernels as ck\n"
@@ -219,11 +220,51 @@ def test_invalid_coview_threads_raises(monkeypatch, asked):
 
 
 @pytest.mark.parametrize(("age", "left"), [(0.0, True), (3600.0, False)])
-def test_lock_that_a_killed_process_left_on_the_cache_is_removed(tmp_path, monkeypatch, age, left):
-    lock = tmp_path / "ticache.lock"
+def test_lock_that_a_killed_process_left_on_the_cache_is_removed(tmp_path, age, left):
+    lock = tmp_path / "qdcache.lock"
     lock.touch()
     os.utime(lock, (time.time() - age,) * 2)
-    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path))
-    runtime._remove_stale_lock(None)
+    runtime._remove_stale_lock(tmp_path)
     assert lock.exists() == left
-    runtime._remove_stale_lock(None)
+    runtime._remove_stale_lock(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("quadrants" not in LIBRARIES, reason="quadrants is not installed")
+def test_kernels_are_found_by_their_sources_and_the_constants_that_they_use(tmp_path):
+    """The second start reads no kernel; the third one does, as a module has changed that may hold a constant."""
+    sources = tmp_path / "kernels"
+    shutil.copytree(ROOT / "kernels", sources, ignore=shutil.ignore_patterns("__pycache__"))
+    cache = {
+        "COVIEW_KERNELS": "quadrants",
+        "ENABLE_QUADRANTS_HEADER_PRINT": "0",
+        "QD_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "cache"),
+    }
+    code = (
+        f"import sys\nsys.path.insert(0, {str(sources)!r})\n"
+        "import quadrants.lang.ast.ast_transformer as reader\n"
+        "read = set()\n"
+        "name = reader.ASTTransformer.build_Name\n"
+        "def counted(ctx, node):\n    read.add(ctx.func.func.__name__)\n    return name(ctx, node)\n"
+        "reader.ASTTransformer.build_Name = staticmethod(counted)\n"
+    )
+    code += USE + "use()\nprint('bins' in read)"
+    said = []
+    for edit in (None, None, "reference/polar.py"):
+        if edit:
+            with (sources / "coview_kernels" / edit).open("a") as file:
+                file.write("MORE = 1\n")
+        done = run_python(code, **cache)
+        assert (done.returncode, done.stderr) == (0, "")
+        said.append(done.stdout.strip())
+    assert said == ["True", "False", "True"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("quadrants" not in LIBRARIES, reason="quadrants is not installed")
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path):
+    (tmp_path / "file").touch()
+    environment = {"COVIEW_KERNELS": "quadrants", "QD_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "file")}
+    done = run_python(USE + "use()", TMPDIR=str(tmp_path), **environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

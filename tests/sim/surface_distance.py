@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 
 def distance_to_surfaces(scene, points):
     """(N,) metres to the nearest triangle of the scene as it is now."""
+    from coview_stream.errors import DependencyError
     from coview_stream.sim.casting import open3d
 
-    o3d = open3d()
+    try:
+        o3d = open3d()
+    except DependencyError as error:
+        pytest.skip(str(error))
     surfaces = o3d.t.geometry.RaycastingScene(nthreads=1)
     for mesh in (scene.now.solid, scene.now.foliage):
         if len(mesh.triangles):
