@@ -56,10 +56,10 @@ class Launch:
 
     def __call__(self) -> None:
         """Run the kernel and wait for its end."""
-        program = runtime.program()
+        program: Any = runtime.program()
         if self._program is program:
             program.launch_kernel(self._compiled, self._context)
-        elif _compiled.get(self._name, (None,))[0] is program:
+        elif self._name in _compiled and _compiled[self._name][0] is program:
             self._prepare(program)
             program.launch_kernel(self._compiled, self._context)
         else:
