@@ -90,7 +90,7 @@ class KeyframeBuffer:
         self._in_part = 0  # keyframes in the newest part
 
     def add(self, scan: RawScan, stamp: float, frame: Points | None = None) -> Keyframe | None:
-        """Add a frame; return the keyframe that it completes, if any, which holds ``frame``."""
+        """Add a frame; return the keyframe that it completes, if any, which holds a copy of ``frame``."""
         self.calibration = scan.calibration
         leans = any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
         at = self._levelled_at
@@ -106,7 +106,7 @@ class KeyframeBuffer:
             moved = float(np.linalg.norm(scan.position - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None
-        keyframe = Keyframe(stamp, self._merged(scan), anew, _no_points() if frame is None else frame)
+        keyframe = Keyframe(stamp, self._merged(scan), anew, _no_points() if frame is None else frame.copy())
         self._pending = []
         self._gather(keyframe)
         return keyframe

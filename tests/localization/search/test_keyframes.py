@@ -154,11 +154,12 @@ def test_earlier_keyframes_are_read_as_they_were_by_the_newest_calibration():
     """Their submaps reach no further than they did then, and all are levelled as if the lean had been known."""
     known = [Calibration(pitch=np.radians(pitch)) for pitch in (0.0, 0.0, 2.6)]
     leaning, straight = (KeyframeBuffer(KeyframeConfig(distance=1.0)) for _ in range(2))
-    then = []
+    then, newest = [], cloud(0)
     for k, present in enumerate(known):
+        newest[:] = cloud(k)  # a caller may write all clouds into one array
         for buffer, level in ((leaning, present), (straight, known[-1])):
             points = transform(at(1.5 * k), level.level(cloud(k, 300)))
-            keyframe = buffer.add(RawScan(points, at(1.5 * k), level), float(k), cloud(k))
+            keyframe = buffer.add(RawScan(points, at(1.5 * k), level), float(k), newest)
         then.append(straight.recent(2))
     assert keyframe.begins_anew is False
     earlier = leaning.at_earlier(2)
