@@ -21,6 +21,12 @@ def planar_pose(T: Pose) -> Floats:
     return np.array([T[0, 3], T[1, 3], yaw_of(T)])
 
 
+def planar_covariance(covariance: Floats, T: Pose) -> Floats:
+    """Return what a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, says of motions (3, 3) from a pose."""
+    R = rot_z(-yaw_of(T))
+    return np.asarray(R @ covariance[np.ix_([3, 4, 2], [3, 4, 2])] @ R.T)
+
+
 def spatial(motion: Floats) -> Pose:
     """Return a motion (3,) as a pose (4, 4)."""
     return pose_from(rot_z(float(motion[2])), [motion[0], motion[1], 0.0])

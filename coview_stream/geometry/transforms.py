@@ -64,12 +64,12 @@ def exp_so3(rotvec: npt.ArrayLike) -> Floats:
 
 def log_so3(R: Reals) -> Floats:
     """Return rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    if R.shape == (3, 3):  # ten times as quick, and tracking asks some times per frame
-        (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-        sine, cosine = 0.5 * math.hypot(h - f, c - g, d - b), 0.5 * (a + e + i - 1.0)
-        if cosine > -0.9:  # near half a turn the sine loses the axis
-            ratio = 1.0 if sine < _SMALL else math.atan2(sine, cosine) / sine
-            return np.array([h - f, c - g, d - b]) * (0.5 * ratio)
+    M = np.asarray(R, dtype=np.float64)
+    axis = 0.5 * (M[..., [2, 0, 1], [1, 2, 0]] - M[..., [1, 2, 0], [2, 0, 1]])  # times the sine
+    sine, cosine = np.sqrt((axis * axis).sum(axis=-1)), 0.5 * (np.trace(M, axis1=-2, axis2=-1) - 1.0)
+    if (cosine > -0.9).all():  # near half a turn the sine loses the axis
+        small = sine < _SMALL
+        return np.asarray(axis * np.where(small, 1.0, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))[..., None])
     turn = matrix_to_quat(R)
     turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
     sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)

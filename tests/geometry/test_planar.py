@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.geometry.planar import between, compose, inverted, planar_motion, planar_pose, spatial
+from coview_stream.geometry.planar import (
+    between,
+    compose,
+    inverted,
+    planar_covariance,
+    planar_motion,
+    planar_pose,
+    spatial,
+)
 from coview_stream.geometry.transforms import inverse
 
 
@@ -30,3 +38,10 @@ def test_motions_between_every_two_poses(motions):
     assert every.shape == (40, 7, 3)
     assert every[11, 5] == pytest.approx(between(a[11], b[5]))
     assert compose(a[11], every[11, 5])[:2] == pytest.approx(b[5][:2])
+
+
+def test_a_covariance_turns_into_the_axes_of_the_pose():
+    covariance = np.diag([9.0, 9.0, 0.1, 1.0, 4.0, 9.0])
+    covariance[3, 2] = covariance[2, 3] = 0.2  # the map's x, with the heading
+    left = planar_covariance(covariance, spatial(np.array([5.0, 6.0, np.pi / 2])))
+    assert left == pytest.approx(np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -0.2], [0.0, -0.2, 0.1]]))

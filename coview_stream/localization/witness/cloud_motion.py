@@ -17,7 +17,7 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.planar import planar_motion
+from coview_stream.geometry.planar import planar_covariance, planar_motion
 from coview_stream.geometry.transforms import Pose, Poses, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud, prepare_scan
@@ -144,6 +144,6 @@ def _starts(odometry: Pose) -> Poses:
 
 def _in_plane(T_now: Pose, covariance: Floats, T_before: Pose) -> tuple[Floats, Floats]:
     """Return a pose (4, 4) after another and its covariance (6, 6) as a planar motion and its (3, 3)."""
-    motion, R, axes = planar_motion(T_before, T_now), rot_z(-yaw_of(T_before)), np.ix_([3, 4, 2], [3, 4, 2])
+    motion = planar_motion(T_before, T_now)
     position, angle = motion_sigmas(float(np.linalg.norm(motion[:2])))
-    return motion, R @ covariance[axes] @ R.T + np.diag([position, position, angle]) ** 2
+    return motion, planar_covariance(covariance, T_before) + np.diag([position, position, angle]) ** 2

@@ -13,9 +13,17 @@ from scipy.special import chdtri
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.planar import between, compose, inverted, planar_motion, planar_pose, spatial
+from coview_stream.geometry.planar import (
+    between,
+    compose,
+    inverted,
+    planar_covariance,
+    planar_motion,
+    planar_pose,
+    spatial,
+)
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
-from coview_stream.geometry.transforms import Points, Pose, inverse, rot_z, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.surfaces import LONGEST
@@ -327,6 +335,6 @@ def _on_map(before: Estimate | None, now: Estimate | None) -> Seen | None:
     if before is None or now is None:
         return None
     motion = planar_motion(before.T_map_body, now.T_map_body)
-    R, axes = rot_z(-yaw_of(before.T_map_body)), np.ix_([3, 4, 2], [3, 4, 2])
+    both = planar_covariance(before.covariance + now.covariance, before.T_map_body)
     lever = np.array([0.0, float(np.linalg.norm(motion[:2])), 0.0]) * np.sqrt(before.covariance[2, 2])
-    return Seen(motion, R @ (before.covariance[axes] + now.covariance[axes]) @ R.T + np.diag(lever**2 + 1e-6))
+    return Seen(motion, both + np.diag(lever**2 + 1e-6))
