@@ -95,7 +95,8 @@ class RecordingLocalizer(Localizer):
         self._slipped, self._backward = False, True
         calibration = replace(calibration, delay=-calibration.delay)  # time runs backwards
         self._frames.estimator.learn(calibration, same_run=True)
-        self.hint_calibration(calibration)
+        if not self._tracker.ground.metres:
+            self._tracker.ground.restore(calibration.ground)
         frame, _ = self._predict(cloud, T_odom_body, stamp)
         level = self._frames.calibration
         leader = T_map_cloud @ inverse(frame.T_odom_body @ level.T_body_cloud)

@@ -40,7 +40,7 @@ HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 
 """Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
 _RANGES = {
     **dict.fromkeys(("roll", "pitch"), math.radians(45.0)), "heading": math.pi,
-    "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 0.5, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
+    "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 0.95, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
     **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "ground", "changed"), MAX_LEVER),
     **dict.fromkeys(("delay", "stated_delay", "sigma_delay"), 2.0 * MAX_DELAY),
 }  # fmt: skip

@@ -16,7 +16,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import Trust
 from coview_stream.config import LocalizerConfig
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import MapError, RunError
+from coview_stream.errors import InputError, MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import SearchResult
@@ -94,9 +94,10 @@ class TrackEngine(Engine):
         if job.require_verification:
             localizer.require_verification()
         if job.calibration is not None:
-            localizer.hint_calibration(job.calibration)
+            with contextlib.suppress(InputError):  # a hint of no use is no reason to drop the frame
+                localizer.hint_calibration(job.calibration)
         if job.hint is not None:
-            with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
+            with contextlib.suppress(RunError):
                 localizer.hint_pose(job.hint)
         if job.guess is not None:
             localizer.guess_place(job.guess, check=False)  # the node has said that it is taken
