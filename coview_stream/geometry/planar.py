@@ -22,7 +22,7 @@ def planar_pose(T: Pose) -> Floats:
 
 
 def planar_covariance(covariance: Floats, T: Pose) -> Floats:
-    """Return what a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, says of motions (3, 3) from a pose."""
+    """Return a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, as one (3, 3) of motions from a pose."""
     R = rot_z(-yaw_of(T))
     return np.asarray(R @ covariance[np.ix_([3, 4, 2], [3, 4, 2])] @ R.T)
 
