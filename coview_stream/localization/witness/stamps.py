@@ -23,7 +23,7 @@ _BIN = 0.05 / np.sqrt(12.0)  # sigma of a lag that is known within a twentieth o
 
 
 class StepStamps(NamedTuple):
-    """Distances of stamps within a step, with what is usual for them."""
+    """Distances of stamps within a step, and the usual ones."""
 
     seconds: Floats  # (N,) distances
     period: float  # of the lidar, seconds
