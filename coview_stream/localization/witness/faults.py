@@ -285,11 +285,13 @@ class FaultPosterior:
         if step.clouds is not None:
             self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
 
-    def corrected(self, D: Floats, delay: float) -> None:
+    def corrected(self, D: Floats, delay: float, factor: float = 1.0) -> None:
         """Follow a calibration that has turned and shifted clouds by ``D`` (3,) and now takes them for later.
 
-        ``D`` is body <- the body's axes by the earlier calibration, ``delay`` the change of its delay, seconds.
+        ``D`` is body <- the body's axes by the earlier calibration, ``delay`` the change of its delay, seconds,
+        ``factor`` that by which odometry is longer now.
         """
+        self.scaled = [replace(h, scale=h.scale / factor, sigma=h.sigma / factor) for h in self.scaled]
         for h in self.moved:
             h.C = compose(h.C, inverted(D))
         for parting in self.parting:

@@ -86,5 +86,6 @@ def _period(seconds: Floats) -> tuple[float, float]:
     periods = np.median(seconds / turns, axis=1)
     off = np.median(np.abs(seconds - turns * periods[:, None]), axis=1)
     sigmas = np.maximum(1.48 * off, _RATE * periods)
-    best = int((sigmas / periods).argmin())  # of several that fit alike the longest
+    apart = sigmas / periods
+    best = int((apart < 1.01 * apart.min()).argmax())  # of several that fit alike the longest
     return float(periods[best]), float(sigmas[best])

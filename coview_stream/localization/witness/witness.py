@@ -267,7 +267,8 @@ class Witness:
             moments = before.scan.moment, now.scan.moment
             self._estimator.measure_motion(np.eye(4), spatial(seen.motion), spatial(o), spread, moments)
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
-            self._estimator.rescale(*rescaled)
+            learned = (1.0 + self._estimator.calibration.scale) / (1.0 + calibration.scale)  # in this step already
+            self._estimator.rescale(rescaled[0] / learned, rescaled[1] / learned)
         self._reference = now
         return seen
 
@@ -290,8 +291,8 @@ class Witness:
         """Take over a changed calibration; return it."""
         calibration = self._estimator.calibration
         moved = calibration.T_body_cloud @ inverse(self._calibration.T_body_cloud)
-        self.faults.corrected(planar_pose(moved), calibration.delay - self._calibration.delay)
         factor = (1.0 + calibration.scale) / (1.0 + self._calibration.scale)
+        self.faults.corrected(planar_pose(moved), calibration.delay - self._calibration.delay, factor)
         if factor != 1.0:  # all steps of odometry are of one scale
             here, resized = self._path[-1][1], np.array([factor, factor, 1.0])
             self._path = deque(((at, here + resized * (pose - here)) for at, pose in self._path), maxlen=_HISTORY)

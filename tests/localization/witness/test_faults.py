@@ -308,3 +308,12 @@ def test_robot_that_tilts_is_off_by_a_short_lag():
     shaken, _, _ = drive(late, until=14.0, tilting=tilting)
     assert even.accusation(*level, RISK) is None
     assert shaken.accusation(*level, RISK).cause is RejectionReason.CLOCK
+
+
+def test_a_scale_that_the_calibration_has_learned_is_not_learned_twice():
+    def longer(o, t):
+        return o * [1.5, 1.5, 1.0], o
+
+    faults, _, _ = drive(longer, until=20.0)
+    faults.corrected(np.zeros(3), 0.0, 0.8)
+    assert faults.rescaled(RISK)[0] == pytest.approx(1.0 / 1.5 / 0.8, rel=0.02)

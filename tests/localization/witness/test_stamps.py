@@ -51,3 +51,10 @@ def test_stamps_without_a_rhythm_say_nothing_of_short_lags():
 
 def test_lags_that_end_are_no_more_likely():
     assert float(stamps([0.1] * 5).allow(np.array(-0.3))) < 0.2
+
+
+@pytest.mark.parametrize("period", [0.05, 0.1, 0.1001, 0.2, 2.0])
+def test_period_of_even_stamps_is_no_part_of_it(period):
+    begin = 1.7e9 if period > 0.1 else 1000.0
+    even = begin + period * np.arange(120.0) + 1e-6 * np.arange(120)
+    assert step_stamps(even, even[-9], even[-1]).period == pytest.approx(period, rel=0.01)
