@@ -28,6 +28,7 @@ def options_of(*argv):
         (["--odometry-timeout", "1.5"], lambda o: (o.node.odometry_timeout, o.node.max_gap), (1.5, 1.5)),
         (["--max-payload", "99"], lambda o: o.node.max_payload, 99),
         (["--max-outage", "7"], lambda o: o.node.max_outage, 7.0),
+        (["--cloud-delay", "-0.1"], lambda o: o.localizer.cloud_delay, -0.1),
         (
             ["--odometry", "kiss-icp", "--gravity", "0,0.1,-9.8", "--max-speed", "9"],
             lambda o: (o.lidar.gravity, o.lidar.max_speed, o.node.max_speed),
