@@ -119,6 +119,12 @@ class _Parting:
     rate: float  # seconds per second
     sigma: float
     lag: float  # seconds
+    seconds: float = 0.0  # since it began
+
+    def beyond(self, lag: float) -> float:
+        """Return the probability that the clouds are later or earlier by more than ``lag`` seconds, if it is so."""
+        sigma = math.sqrt(2.0) * max(self.sigma * self.seconds, float(LAGS[1]) / 2.0)
+        return 1.0 - 0.5 * (math.erf((lag - self.lag) / sigma) + math.erf((lag + self.lag) / sigma))
 
     def expected(self, step: Step) -> tuple[Floats, Floats]:
         """Return the clouds' motion (3,) over a step, and its covariance (3, 3)."""
@@ -140,7 +146,9 @@ class _Parting:
         """Return the hypothesis after a step with a likelihood of its motions."""
         longer, sigma = self.rate * step.seconds, self.sigma * step.seconds
         allowed = 1.0 if step.stamps is None else float(step.stamps.allow(np.array(longer), sigma))
-        return replace(self, weight=self.weight * likelihood * allowed, lag=self.lag + longer)
+        return replace(
+            self, weight=self.weight * likelihood * allowed, lag=self.lag + longer, seconds=self.seconds + step.seconds
+        )
 
 
 class Accusation(NamedTuple):
@@ -336,11 +344,12 @@ class FaultPosterior:
             words = f"clouds are {lag:.1f} s older than their stamps{grows}"
             wrong.append(Accusation(RejectionReason.CLOCK, share, words, True))
         speed, turning = float(np.linalg.norm(self._speed[:2])), float(self._speed[2])
-        parted = [h for h in self.parting if abs(h.lag) * speed > metres or abs(h.lag) * turning > radians]
-        if parted:
-            best = max(parted, key=lambda h: h.weight)
+        if self.parting:
+            longest = min(metres / max(speed, 1e-9), radians / max(turning, 1e-9))  # that a pose can be right with
+            share = sum(h.weight * h.beyond(longest) for h in self.parting)
+            best = max(self.parting, key=lambda h: h.weight)
             words = f"clouds are {best.lag:.1f} s older than their stamps and more and more"
-            wrong.append(Accusation(RejectionReason.CLOCK, sum(h.weight for h in parted), words))
+            wrong.append(Accusation(RejectionReason.CLOCK, share, words))
         for h in self.moved:
             shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))
             if shift > metres or turn > radians:
