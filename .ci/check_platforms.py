@@ -26,7 +26,7 @@ PROMISED = {
 """Platforms as uv names them, with the oldest glibc, and what README says resolves there."""
 
 TRIED = ("x86_64-manylinux_2_31", "x86_64-manylinux_2_17", "aarch64-manylinux_2_31", "x86_64-pc-windows-msvc")
-PYTHONS = ("3.11", "3.12", "3.13")
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 
 
 def resolves(uv: str, platform: str, python: str, part: str) -> str:

@@ -79,5 +79,5 @@ def rows(asked: Namespace) -> Iterator[Row]:
     yield informs("start/search prepared", float(np.median([search_prepared(site) for _ in range(serves)])), "s")
     for name, measure in (("serve ready", served), ("search prepared", search_prepared)):
         with tempfile.TemporaryDirectory(prefix="coview-cache.") as cache:
-            seconds = measure(site, TI_OFFLINE_CACHE_FILE_PATH=cache)
+            seconds = measure(site, TI_OFFLINE_CACHE_FILE_PATH=cache, QD_OFFLINE_CACHE_FILE_PATH=cache)
             yield bounded(f"start/{name}, first run ever", seconds, "s", FIRST)

@@ -92,9 +92,9 @@ def parts_finding(lacking: dict[str, list[str] | None]) -> Finding:
 def python_finding(version: tuple[int, ...]) -> Finding:
     """Judge the interpreter's version."""
     text = f"{'.'.join(map(str, version))}, {platform.system()} {platform.machine()}"
-    if (3, 11) <= version[:2] < (3, 14):
+    if (3, 11) <= version[:2] < (3, 15):
         return Finding("ok", "python", text)
-    return Finding("warn", "python", text, "3.11, 3.12 and 3.13 are tested: make the environment with one of them")
+    return Finding("warn", "python", text, "3.11 to 3.14 are tested: make the environment with one of them")
 
 
 def processor_finding(model: str, cores: int, quota: float | None) -> Finding:

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from bench.fusion.changes import _new, distance
+from coview_stream.errors import DependencyError
 from coview_stream.fusion.fuse import NEW, SAME, Fused
+from coview_stream.sim.casting import open3d
 from coview_stream.sim.mesh import EMPTY, prism, rectangle
 from coview_stream.sim.scenes import SceneState
+
+try:
+    open3d()
+except DependencyError as error:
+    pytest.skip(str(error), allow_module_level=True)
 
 BOX = prism(rectangle(2.0, 2.0, 0.0), rectangle(2.0, 2.0, 1.0))
 NOTHING, THERE = SceneState(EMPTY, EMPTY), SceneState(BOX, EMPTY)

@@ -41,7 +41,7 @@ def direct_needs(extra):
 
 @pytest.mark.parametrize(("lock", "extra"), [("test", "test"), ("wheel", "all"), ("tools", None)])
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
-@pytest.mark.parametrize("python", ["3.11", "3.12", "3.13"])
+@pytest.mark.parametrize("python", ["3.11", "3.12", "3.13", "3.14"])
 def test_lock_has_every_direct_dependency_at_an_allowed_version(lock, extra, machine, python):
     where = {
         "python_version": python, "python_full_version": f"{python}.0", "sys_platform": "linux",

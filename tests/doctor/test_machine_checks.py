@@ -38,9 +38,9 @@ def test_healthy_machine_has_no_failures(monkeypatch):
 @pytest.mark.parametrize(
     ("finding", "verdict", "part"),
     [
-        (machine.python_finding((3, 14, 1)), "warn", "3.11"),
+        (machine.python_finding((3, 15, 1)), "warn", "3.11"),
         (machine.python_finding((3, 10, 9)), "warn", "3.11"),
-        (machine.python_finding((3, 13, 1)), "ok", ""),
+        (machine.python_finding((3, 14, 1)), "ok", ""),
         (machine.processor_finding("cpu", 8, 1.5), "warn", "2 or more"),
         (machine.processor_finding("cpu", 1, None), "warn", "2 or more"),
         (machine.processor_finding("cpu", 4, 3.0), "ok", ""),
