@@ -150,20 +150,22 @@ class Witness:
         registered = Estimate(match.T_map_body, match.covariance) if fits else None
         contradicted = belief is not None and (match.moves_place or not match.verdict.verified)
         due, now = self._is_due(), self._newest
-        if now is not None and due and belief is not None and not contradicted:
+        at_once = contradicted or self.faults.stopped > _RISK  # the robot may have been set down
+        if now is not None and due and belief is not None and not at_once:
             self._waiting = _Waiting(self._previous, now, registered, belief)
-        elif now is not None and (due or contradicted):
+        elif now is not None and (due or at_once):
             self._compare(now, self._previous, tracker.odometry.drift, registered, belief, contradicted)
         accused = self._accused(tracker)
         if accused is None:
             return match
         verdict = replace(match.verdict, cause=accused.cause, reason=accused.sentence)
-        return replace(match, verdict=verdict, moves_place=False)
+        follows = match.moves_place and accused.cause is RejectionReason.STOPPED  # the lidar is right
+        return replace(match, verdict=verdict, moves_place=follows)
 
     def _accused(self, tracker: Tracker) -> Accusation | None:
         """Return the fault that makes the tracker's poses wrong by more than their level, if there is one."""
         level, decided = tracker.protection_level(), self._decided
-        accused = self._accusation(min(level.metres, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
+        accused = self._accusation(min(level.horizontal, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
         if self._decided is not decided:
             tracker.odometry.forget_registration()  # of another mount or clock
         return accused
