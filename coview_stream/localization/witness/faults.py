@@ -286,9 +286,9 @@ class FaultPosterior:
         if not stands:
             self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
         if step.clouds is not None:
-            moved = float(np.linalg.norm(step.clouds.motion[:2]))
-            moves = moved > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still: they agree
-            self._moved_on = self._moved_on + moved if moves and self.stopped > _NEGLIGIBLE else 0.0
+            metres = float(np.linalg.norm(step.clouds.motion[:2]))
+            moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still: they agree
+            self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
         self._speed = np.abs(o) / dt + [0.0, 0.0, step.tilting]
         self._before = None
         if step.clouds is not None:
