@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
@@ -18,6 +18,12 @@ from coview_stream.stream.transport.transport import Urgency
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
 _JSON = "application/json"
 _MAX_WAITING = 1024  # messages that wait for the link: 5 s of 200 Hz odometry
+MAX_QUERY = 8192
+"""Bytes of a query's parameters, payload and attachment; no answer of ours reads the last two."""
+
+MAX_QUERIES = 16
+"""Queries that wait on one key; the next ones are refused."""
+
 FLUSH = 0.3  # seconds for them at closing
 
 Answer = Callable[[dict[str, str]], dict[str, Any]]
@@ -153,19 +159,38 @@ def quality(urgency: Urgency) -> dict[str, Any]:
 
 
 class Answers:
-    """Queue of queries to answer, worked on by one thread for all keys."""
+    """Queue of queries to answer, worked on by one thread for all keys.
+
+    At most :data:`MAX_QUERIES` wait on one key, of :data:`MAX_QUERY` bytes each: the others are refused at once.
+    """
 
     def __init__(self, guard: RateLimitedErrors) -> None:
         self._guard = guard
         self._queries: SimpleQueue[tuple[str, Any, Answer, threading.Event] | None] = SimpleQueue()
+        self._waiting: Counter[str] = Counter()
+        self._lock = threading.Lock()
 
     def callback(self, key: str, handler: Answer, ended: threading.Event) -> Callable[[Any], None]:
         """Return the callback for queries on ``key``: it puts them into the queue. Once ``ended`` none is answered."""
 
         def enqueue(query: Any) -> None:
-            self._queries.put((key, query, handler, ended))
+            with self._guard.catch(key):
+                self._put(key, query, handler, ended)
 
         return enqueue
+
+    def _put(self, key: str, query: Any, handler: Answer, ended: threading.Event) -> None:
+        size = len(str(query.parameters)) + sum(
+            len(part) for part in (query.payload, query.attachment) if part is not None
+        )
+        with self._lock:
+            busy = self._waiting[key] >= MAX_QUERIES
+            if not busy and size <= MAX_QUERY:
+                self._waiting[key] += 1
+                self._queries.put((key, query, handler, ended))
+                return
+        why = f"{MAX_QUERIES} queries wait already: ask later" if busy else f"{size} bytes, {MAX_QUERY} at most"
+        query.reply_err(json.dumps({"error": f"{key}: {why}"}), encoding=_JSON)
 
     def run(self) -> None:
         """Answer until :meth:`end`."""
@@ -174,6 +199,8 @@ class Answers:
             if not ended.is_set():
                 with self._guard.catch(key):
                     self._answer(key, query, handler)
+            with self._lock:
+                self._waiting[key] -= 1
             del entry, query  # a query is finished for its sender once no reference is left
 
     def end(self) -> None:

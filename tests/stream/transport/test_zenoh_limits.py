@@ -6,8 +6,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import closing
+from functools import partial
 
 import pytest
 import zenoh
@@ -54,6 +56,34 @@ def test_oversized_message_is_not_copied():
         key_expr, encoding, payload, attachment = "k", "zenoh/bytes", Bytes(), None
 
     assert zenoh_samples.plain(Big(), 1999) == Sample("k", b"", size=2000)
+
+
+def test_queries_beyond_the_bound_and_large_ones_are_refused_at_once_and_other_keys_answered():
+    endpoint = free_endpoint()
+    with closing(open_transport(listen=[endpoint])) as node, closing(open_transport(connect=[endpoint])) as robot:
+        going_on, called, refused, answered = threading.Event(), [], [], []
+        node.answer("r1/rpc/health", lambda parameters: {"ok": True})
+        node.answer("r1/rpc/map_view", lambda parameters: called.append(1) or {"ok": going_on.wait(20.0)})
+        until(lambda: robot.query("r1/rpc/health")["ok"])
+
+        def take(reply):
+            answered.append(1) if reply.ok else refused.append(reply.err.payload.to_bytes().decode())
+
+        ask = partial(robot.session.get, "r1/rpc/map_view", take, timeout=20.0)
+        ask(payload=bytes(2 * zenoh_samples.MAX_QUERY))
+        ask(attachment=bytes(2 * zenoh_samples.MAX_QUERY))
+        robot.session.get(f"r1/rpc/map_view?a={'x' * zenoh_samples.MAX_QUERY}", take, timeout=20.0)
+        until(lambda: len(refused) == 3)
+        assert all("at most" in text for text in refused)
+        assert called == []
+        for _ in range(zenoh_samples.MAX_QUERIES + 30):
+            ask(payload=bytes(1000))
+        until(lambda: len(refused) == 33)
+        assert "ask later" in refused[-1]
+        going_on.set()
+        until(lambda: len(answered) == zenoh_samples.MAX_QUERIES)
+        assert robot.query("r1/rpc/map_view")["ok"]  # there is room again
+        assert len(called) == zenoh_samples.MAX_QUERIES + 1
 
 
 def test_only_reliable_messages_may_block():
