@@ -1,8 +1,9 @@
 """Fleet of nodes that share robots: each robot is served by one node, and another takes over when that one goes.
 
 Every node ranks all nodes that are alive for each robot by a hash of both names (rendezvous hashing), and the first one
-serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. Nodes
-show that they are alive by liveliness tokens, and tell each other the places of their robots.
+serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. A node
+is alive that holds a liveliness token and tells the others the places of its robots once a second: a token goes at once
+with its process, but any session may hold one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -30,6 +32,8 @@ LEASE_MS = 1000
 _MISSED = 2  # looks in a row that do not show a node, before it counts as gone
 _LOOK = 0.1  # seconds between two looks at the tokens
 _TELL = 1.0  # seconds between two messages of the robots' places
+_SILENT = 30  # looks in a row without such a message, 3 s, before a token alone counts for nothing
+_MAX_HEARD = 1024  # messages between two looks
 _MAX_BYTES = 4 << 20  # of such a message that are read
 
 
@@ -43,7 +47,7 @@ def owner(robot: str, nodes: Collection[str]) -> str | None:
 
 
 class FleetMembers:
-    """The nodes of a fleet that are alive, as the network's liveliness tokens show them. Pure.
+    """The nodes of a fleet that are alive: they hold a liveliness token and have been heard in the last 30 looks. Pure.
 
     A look that does not show ``node`` itself tells nothing: this node is cut off.
     """
@@ -51,20 +55,33 @@ class FleetMembers:
     def __init__(self, node: str) -> None:
         self._node = node
         self._missed: dict[str, int] = {node: 0}
+        self._looks = 0  # that showed this node: a clock that stands still with it
+        self._heard: dict[str, int] = {}  # look of the newest message of those who have a token
+        self._tokens: frozenset[str] = frozenset()
 
     @property
     def alive(self) -> frozenset[str]:
         """Names, this node's among them."""
         return frozenset(self._missed)
 
-    def look(self, tokens: Collection[str]) -> bool:
-        """Take in the nodes that have a token now; return True if membership changed."""
+    @property
+    def settled(self) -> bool:
+        """Whether all who hold a token have been heard, or have had the time: until then robots may have a node."""
+        return self._looks > _SILENT or self._tokens <= self.alive
+
+    def look(self, tokens: Collection[str], heard: Collection[str] = ()) -> bool:
+        """Take in who has a token now, and who was heard since the last look; return True if membership changed."""
         if self._node not in tokens:
             return False
         before = self.alive
-        for node in tokens:
+        self._looks += 1
+        self._tokens = frozenset(tokens)
+        self._heard |= dict.fromkeys(heard, self._looks)
+        self._heard = {node: look for node, look in self._heard.items() if node in tokens}
+        here = {node for node, look in self._heard.items() if self._looks - look < _SILENT} | {self._node}
+        for node in here:
             self._missed[node] = 0
-        for node in before - set(tokens):
+        for node in before - here:
             self._missed[node] += 1
             if self._missed[node] >= _MISSED:
                 del self._missed[node]
@@ -87,6 +104,8 @@ class Fleet:
         self._endpoints = endpoints
         self._transport = transport
         self._errors = RateLimitedErrors(log)
+        self._heard: deque[str] = deque(maxlen=_MAX_HEARD)  # nodes that have told something since the last look
+        self._told = float("-inf")  # local time
         self._ranked: frozenset[str] = frozenset()  # nodes by which robots have been shared; none before the first look
         self._places: dict[str, LastPlace] = {}  # of robots of other nodes, as these told
         self._arriving: dict[str, LastPlace] = {}  # of robots that were taken on, and whose odometry has not come yet
@@ -97,12 +116,11 @@ class Fleet:
 
     def run(self, stopping: threading.Event) -> None:
         """Look, and tell, until ``stopping``."""
-        told = float("-inf")
         while not stopping.wait(_LOOK):
             with self._errors.catch("fleet"):
                 self.look()
-                if time.monotonic() - told >= _TELL:
-                    told = time.monotonic()
+                if time.monotonic() - self._told >= _TELL:
+                    self._told = time.monotonic()
                     self.tell()
         with self._errors.catch("fleet"):
             self.tell()
@@ -115,12 +133,14 @@ class Fleet:
         except TransportError:
             return  # cut off: nothing is known
         before = self.members.alive
-        if self.members.look(tokens):
+        if self.members.look(tokens, [self._heard.popleft() for _ in range(len(self._heard))]):
             after = self.members.alive
+            if after - before:
+                self._told = float("-inf")  # one that has come does not know this node yet
             changes = ((after - before, "came"), (before - after, "went"))
             news = "; ".join(f"{', '.join(sorted(nodes))} {verb}" for nodes, verb in changes if nodes)
             log.info("fleet: %s: %d nodes", news, len(after))
-        if self.node in tokens and self._ranked != self.members.alive:
+        if self.node in tokens and self.members.settled and self._ranked != self.members.alive:
             self._ranked = self.members.alive
             self._move({robot for robot in self._endpoints if owner(robot, self._ranked) == self.node})
         for robot, place in list(self._arriving.items()):
@@ -148,19 +168,19 @@ class Fleet:
             )  # fmt: skip
 
     def tell(self) -> None:
-        """Tell the others the places of this node's robots."""
+        """Tell the others that this node is alive, and the places of its robots."""
         places = {}
         for name, robot in self._endpoints.items():
             if robot.serving and (place := robot.session.last_place()) is not None:
                 places[name] = place.to_message()
-        if places:
-            self._publisher.put(Encoded(json.dumps(places, separators=(",", ":")).encode(), "application/json"))
+        self._publisher.put(Encoded(json.dumps(places, separators=(",", ":")).encode(), "application/json"))
 
     def _on_places(self, sample: Sample) -> None:
         if sample.key.endswith(f"/{self.node}") or len(sample.payload) > _MAX_BYTES:
             return
         try:
             places: Any = json.loads(bytes(sample.payload))
+            self._heard.append(sample.key.rpartition("/")[2])
             for name, plain in places.items():
                 if name in self._endpoints and not self._endpoints[name].serving:
                     self._places[name] = LastPlace.from_message(plain)

@@ -37,19 +37,33 @@ def test_robots_are_shared_evenly_and_only_those_of_a_node_that_goes_move():
 
 def test_node_is_gone_after_two_looks_and_a_look_without_oneself_tells_nothing():
     members = FleetMembers("a")
-    assert members.look(["a", "b"])
+    assert members.look(["a", "b"], "b")
     assert not members.look(["a"])
     assert members.alive == {"a", "b"}
     assert members.look(["a"])
     assert members.alive == {"a"}
-    members.look(["a", "b"])
+    members.look(["a", "b"], "b")
     for _ in range(5):
-        assert not members.look([])  # cut off
-        assert not members.look(["b"])
+        assert not members.look([], "b")  # cut off
+        assert not members.look(["b"], "b")
     assert members.alive == {"a", "b"}
     assert not members.look(["a"])
-    assert not members.look(["a", "b"])  # it was slow
+    assert not members.look(["a", "b"], "b")  # it was slow
     assert not members.look(["a"])
+
+
+def test_token_without_messages_counts_for_nothing():
+    members = FleetMembers("a")
+    assert not members.look(["a", "ghost"])
+    assert not members.settled  # it may be a node that serves robots: it has the time to say so
+    for _ in range(100):
+        assert not members.look(["a", "ghost"])
+    assert members.settled
+    members.look(["a", "b"], ["b", "stranger"])
+    assert members.alive == {"a", "b"}
+    looks = [members.look(["a", "b"]) for _ in range(100)]
+    assert looks.index(True) in range(25, 35)  # three seconds after its last message
+    assert members.alive == {"a"}
 
 
 class Member(Site):
@@ -59,6 +73,15 @@ class Member(Site):
         super().__init__(*robots, net=net, shared=True)
         self.node.declare()
         self.fleet = Fleet(PREFIX, name, self.node.endpoints, net)
+
+    @staticmethod
+    def look(*nodes):
+        """All nodes of a fleet tell and look, in turns, until each has heard the others."""
+        for _ in range(3):
+            for node in nodes:
+                node.fleet.tell()
+            for node in nodes:
+                node.fleet.look()
 
     @property
     def serves(self):
@@ -71,9 +94,7 @@ def test_each_robot_is_served_by_one_node_and_moves_with_its_place():
     for node in nodes.values():
         node.node.reporter.publish(time.monotonic())
     assert net.samples("coview/r1/out/status") == []  # nobody serves anybody yet
-    for _ in range(3):
-        for node in nodes.values():
-            node.fleet.look()
+    Member.look(*nodes.values())
     a, b = nodes["a"], nodes["b"]
     assert a.serves | b.serves == set(robots)
     assert not a.serves & b.serves
@@ -100,6 +121,21 @@ def test_each_robot_is_served_by_one_node_and_moves_with_its_place():
     np.testing.assert_allclose(hint, T_MAP_ODOM @ pose(3.0) @ pose(2.0), atol=1e-9)
 
 
+def test_ghosts_with_tokens_take_no_robot():
+    net, robots = MemoryTransport(), ROBOTS[:20]
+    nodes = [Member(net, name, robots) for name in ("a", "b")]
+    Member.look(*nodes)
+    for ghost in range(20):
+        net.announce(f"{PREFIX}/nodes/ghost{ghost}")
+    Member.look(*nodes)
+    assert nodes[0].serves | nodes[1].serves == set(robots)
+    late = Member(net, "c", robots)
+    for _ in range(50):
+        late.fleet.look()  # others do not wait for ghosts for ever
+    Member.look(*nodes, late)
+    assert set.union(*(node.serves for node in (*nodes, late))) == set(robots)
+
+
 def test_node_that_comes_takes_its_robots_with_their_places():
     net, robots = MemoryTransport(), ROBOTS[:4]
     first = Member(net, "a", robots)
@@ -109,9 +145,7 @@ def test_node_that_comes_takes_its_robots_with_their_places():
         first.frame(name, 0.0)
     second = Member(net, "b", robots)
     first.fleet.tell()
-    for _ in range(2):
-        second.fleet.look()
-        first.fleet.look()
+    Member.look(first, second)
     assert second.serves
     assert first.serves == set(robots) - second.serves
     for name in second.serves:
@@ -149,9 +183,7 @@ def test_message_of_a_place_is_read_as_it_was_written():
 def test_only_the_node_that_serves_a_robot_acts_on_its_queries_and_guesses():
     net, robots = MemoryTransport(), ROBOTS[:4]
     nodes = {name: Member(net, name, robots) for name in ("a", "b")}
-    for _ in range(2):
-        for node in nodes.values():
-            node.fleet.look()
+    Member.look(*nodes.values())
     assert all(node.serves for node in nodes.values())
 
     def guesses(robot):
