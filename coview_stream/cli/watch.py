@@ -30,6 +30,8 @@ _SILENCE = 3.0  # seconds without a first message after which the keys and endpo
 _REDRAW_PERIOD = 0.5  # seconds, on a terminal
 _PRINT_PERIOD = 1.0  # seconds, elsewhere
 _MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
+_MAX_BYTES = 16_384  # of one of them: statuses have 3,500
+_LINES_APART = 10.0  # seconds between lines about messages that cannot be read
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +96,8 @@ class _Watch:
         self._queue: LatestQueue[tuple[float, Topic, Sample]] = LatestQueue(_MAX_QUEUED)
         self._terminal = sys.stdout.isatty() and not args.json
         self._lines_drawn = 0  # of the table
-        self._unreadable_keys: set[str] = set()
+        self._unreadable = 0  # messages since the last line about one
+        self._next_line = 0.0  # time of the steady clock
         for topic in topics:
             transport.subscribe(topic.key, functools.partial(self._receive, topic), "all")
 
@@ -119,11 +122,14 @@ class _Watch:
             print(f"{self._queue.dropped} messages were not shown: the output is too slow", file=sys.stderr)
 
     def _receive(self, topic: Topic, sample: Sample) -> None:
+        if len(sample.payload) > _MAX_BYTES:
+            sample = replace(sample, payload=b"", attachment=None)
         self._queue.put((time.monotonic(), topic, sample))
 
     def _show(self, arrived: float, topic: Topic, sample: Sample) -> None:
         from coview_stream.messages import decode_pose
         from coview_stream.messages.json_messages import pose_record, read_status
+        from coview_stream.stream.transport.error_guard import printable
 
         robot = topic.robot or sample.key.split("/")[topic.depth]
         try:
@@ -135,9 +141,11 @@ class _Watch:
                 record = read_status(sample)
                 self._fleet.add_status(robot, record, arrived)
         except MessageError as error:
-            if sample.key not in self._unreadable_keys:  # once per key: it would come ten times a second
-                self._unreadable_keys.add(sample.key)
-                print(f"cannot be read: {error}", file=sys.stderr)
+            self._unreadable += 1
+            if arrived >= self._next_line:
+                more = f" ({self._unreadable - 1} more since the last line)" if self._unreadable > 1 else ""
+                print(f"cannot be read: {printable(error)}{more}", file=sys.stderr)
+                self._unreadable, self._next_line = 0, arrived + _LINES_APART
             return
         if self._args.json:
             print(json.dumps({"key": sample.key, **record}), flush=True)

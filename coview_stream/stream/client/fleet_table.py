@@ -11,10 +11,12 @@ from typing import Any
 from coview_stream.geometry.protection import one_in
 from coview_stream.geometry.transforms import yaw_of
 from coview_stream.messages.types import PoseMessage
+from coview_stream.stream.transport.error_guard import printable
 
 WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown
 SILENT = 5.0  # seconds without any message: a node sends one every second
+MAX_ROBOTS = 1000  # of more, those that were heard least recently are forgotten: strangers may choose names
 _LEAST = 1e-6  # smaller probabilities of a wrong place are not told apart: columns are narrow
 
 _INDENT = " " * 4  # of a reason below its robot
@@ -45,7 +47,7 @@ class RobotView:
     status: dict[str, Any] = field(default_factory=dict)
     status_heard: float = -math.inf
     node: str = ""  # who serves it, in words, if another node did before
-    arrivals: deque[float] = field(default_factory=deque)  # times of the last poses
+    arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=1024))  # times of the last poses
 
     def pose_rate(self, now: float) -> float:
         """Return poses per second over the last :data:`WINDOW` seconds."""
@@ -66,7 +68,7 @@ class FleetTable:
     """Table of all robots that sent a message so far."""
 
     def __init__(self) -> None:
-        self.views: dict[str, RobotView] = {}
+        self.views: dict[str, RobotView] = {}  # the one that was heard last is the last
 
     def add_pose(self, message: PoseMessage, now: float) -> None:
         """Take in a pose that arrived at ``now``."""
@@ -101,14 +103,12 @@ class FleetTable:
         return lines
 
     def _view(self, robot: str, now: float) -> RobotView:
-        view = self.views.setdefault(robot, RobotView(robot, now))
+        view = self.views.pop(robot, None) or RobotView(robot, now)
         view.heard = now
+        if len(self.views) >= MAX_ROBOTS:
+            del self.views[next(iter(self.views))]
+        self.views[robot] = view
         return view
-
-
-def printable(text: object) -> str:
-    """Return text from the network in a form safe for a terminal: no control characters, one line."""
-    return "".join(c if c.isprintable() else " " for c in str(text))
 
 
 def _row(view: RobotView, now: float) -> list[str]:

@@ -10,9 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 
+def printable(text: object) -> str:
+    """Return text from the network in a form safe for a terminal: no control characters, one line."""
+    return "".join(c if c.isprintable() else " " for c in str(text))
+
+
 def is_panic(error: BaseException) -> bool:
     """Tell whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
     return type(error).__name__ == "PanicException"
+
+
+_MAX_PLACES = 256  # of more, those of the oldest lines are forgotten: strangers may choose keys
 
 
 @dataclass
@@ -65,14 +73,19 @@ class RateLimitedErrors:
             if last is not None and now - last < self._interval:
                 self._silent[about] = self._silent.get(about, 0) + 1
                 return
+            self._last.pop(about, None)
+            if len(self._last) >= _MAX_PLACES:
+                oldest = next(iter(self._last))
+                self._last.pop(oldest)
+                self._silent.pop(oldest, None)
             self._last[about] = now
             silent = self._silent.pop(about, 0)
         more = f" ({silent} more since the last line)" if silent else ""
         self._logger.error(
             "%s: %s: %s%s",
-            place,
+            printable(place),
             type(error).__name__,
-            str(error),  # the error itself would keep its frames alive with the record
+            printable(error),  # the error itself would keep its frames alive with the record
             more,
             exc_info=self._logger.isEnabledFor(logging.DEBUG),
         )

@@ -14,7 +14,8 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record, read_status
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.client.fleet_table import SILENT, STALE, FleetTable, printable
+from coview_stream.stream.client.fleet_table import MAX_ROBOTS, SILENT, STALE, FleetTable
+from coview_stream.stream.transport.error_guard import printable
 
 T = pose_from(rot_z(math.radians(30)), [412_000.123, 5_318_000.456, 7.891])
 POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12)
@@ -102,6 +103,21 @@ def test_silent_robot_is_marked(fleet):
 def test_any_status_is_printable(fleet, status):
     fleet.add_status("r1", status, 1.0)
     assert fleet.table(1.5)[1].startswith("r1 ")
+
+
+def test_robots_that_strangers_invent_are_bounded_and_those_heard_stay(fleet):
+    for number in range(3 * MAX_ROBOTS):
+        fleet.add_status(f"x{number}", {}, 1.0)
+        if number % 100 == 0:
+            fleet.add_pose(POSE, 1.0)
+    assert len(fleet.views) == MAX_ROBOTS
+    assert "r1" in fleet.views
+
+
+def test_poses_that_nobody_draws_are_bounded(fleet):
+    for number in range(5000):
+        fleet.add_pose(POSE, 1.0 + 0.1 * number)
+    assert len(fleet.views["r1"].arrivals) < 2000
 
 
 def test_robots_are_sorted_and_network_text_is_escaped(fleet):
