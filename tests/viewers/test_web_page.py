@@ -86,9 +86,26 @@ def test_unknown_paths_methods_and_hosts_are_refused(served, request_of, paths, 
 
 
 def test_hosts_are_known_by_address_by_localhost_and_by_their_own_name():
-    for header in ("127.0.0.1:8642", "[::1]:8642", "localhost", "LOCALHOST:1", "192.168.0.7:80", "rover.lan:8642"):
+    for header in (
+        "127.0.0.1:8642",
+        "[::1]:8642",
+        "localhost",
+        "LOCALHOST:1",
+        "192.168.0.7:80",
+        "rover.lan:8642",
+        "coview:9464",
+    ):
         assert known_host(header, "rover.lan"), header
-    for header in (None, "", "evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "[evil]", "rover.lan"):
+    for header in (
+        None,
+        "",
+        "evil.example",
+        "localhost.evil.example",
+        "127.0.0.1.evil.example",
+        "[evil]",
+        ":80",
+        "rover.lan",
+    ):
         assert not known_host(header, "127.0.0.1"), header
 
 

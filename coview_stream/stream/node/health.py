@@ -127,7 +127,7 @@ def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> Http
         return Reply(f"{json.dumps(plain)}\n".encode(), "application/json", 200 if plain["ready"]["ok"] else 503)
 
     routes = {"/metrics": metrics, "/health": health}
-    server = HttpServer(address, routes, ("--metrics", METRICS_ADDRESS), open_to_names=True)
+    server = HttpServer(address, routes, ("--metrics", METRICS_ADDRESS))
     log.info("metrics at %smetrics", server.url)
     return server
 

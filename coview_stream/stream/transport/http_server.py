@@ -1,8 +1,8 @@
 """HTTP server of a node's page, metrics and health: GET only, with limits on time, size and connections.
 
-Nothing in a request is acted upon. A server that is not ``open_to_names`` refuses requests whose Host is neither its
-own name nor an address, because a page of another site may have its name point here (DNS rebinding), and no other
-origin may read its replies.
+Nothing in a request is acted upon. Requests are refused whose Host is no address, no name without a dot and not the
+server's own, because a page of another site may have its name point here (DNS rebinding), and no other origin may read
+its replies.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 log = logging.getLogger("coview_stream.web")
 
 # limits of a server for people and scrapers: far above their use, far below any harm
-MAX_CONNECTIONS = 32
+MAX_CONNECTIONS = 32  # from other machines, and as many from this one
 _MAX_SECONDS = 2.0  # of receiving a request
 _MAX_BYTES = 8192  # of a request
 _SEND_TIMEOUT = 4.0  # seconds for a reader to take more of a reply
@@ -69,20 +69,17 @@ class HttpServer:
         address: to listen on.
         routes: handlers by path.
         option: command-line option of the address and a valid value, for messages.
-        open_to_names: accept any Host header, as scrapers by host name need.
 
     Raises:
         ConfigError: the address is malformed or cannot be listened on.
     """
 
-    def __init__(
-        self, address: str, routes: Mapping[str, Route], option: tuple[str, str], open_to_names: bool = False
-    ) -> None:
+    def __init__(self, address: str, routes: Mapping[str, Route], option: tuple[str, str]) -> None:
         host, _, port = address.rpartition(":")
         host = host.strip("[]") or "127.0.0.1"
         name, example = option
         try:
-            self._server = _Server((host, int(port)), routes, name.lstrip("-"), open_to_names)
+            self._server = _Server((host, int(port)), routes, name.lstrip("-"))
         except (OSError, ValueError, OverflowError) as error:
             raise ConfigError(f"{name} {address!r}: {error}; give HOST:PORT, such as {example}") from error
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.server_port}/"
@@ -114,6 +111,7 @@ class HttpServer:
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine reaches an address."""
+    host = host.removeprefix("::ffff:")  # of IPv4 on a socket for both
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -121,13 +119,18 @@ def is_loopback(host: str) -> bool:
 
 
 def known_host(header: str | None, own: str) -> bool:
-    """Whether a Host header names this server: by an address, ``localhost`` or its configured name."""
+    """Whether a Host header names this server: by an address, its configured name, or one without a dot.
+
+    Names without a dot (``localhost``, a host or a service of the local network) cannot be registered by a stranger.
+    """
     if not header:
         return False
     name = header.strip().lower()
-    name = name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
-    if name in ("localhost", own.lower()):
-        return True
+    if not name.startswith("["):
+        name = name.partition(":")[0]
+        if name and ("." not in name or name == own.lower()):
+            return True
+    name = name[1:].partition("]")[0] if name.startswith("[") else name
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -166,13 +169,14 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = 16
     timeout = _POLL
 
-    def __init__(self, address: tuple[str, int], routes: Mapping[str, Route], name: str, open_to_names: bool) -> None:
+    def __init__(self, address: tuple[str, int], routes: Mapping[str, Route], name: str) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
-        self.routes, self.host, self.open_to_names = routes, address[0], open_to_names
+        self.routes, self.host = routes, address[0]
         self._name = name
         self._errors = RateLimitedErrors(log)
-        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        # by whether it comes from this machine, whose health check must not wait for the readers elsewhere
+        self._free = {local: threading.BoundedSemaphore(MAX_CONNECTIONS) for local in (True, False)}
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
@@ -181,7 +185,7 @@ class _Server(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve on a thread, or hang up where too many connections are open."""
-        if self._free.acquire(blocking=False):
+        if self._free[is_loopback(str(client_address[0]))].acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -190,7 +194,7 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._free[is_loopback(str(client_address[0]))].release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report our own errors; a reader that leaves or is cut off is none."""
@@ -210,7 +214,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.rfile = io.BufferedReader(_LimitedRequest(self.connection))
 
     def do_GET(self) -> None:
-        if not (self.server.open_to_names or known_host(self.headers.get("Host"), self.server.host)):
+        if not known_host(self.headers.get("Host"), self.server.host):
             reply: Reply | EventStream = Reply(b"this host goes by another name\n", code=421)
         else:
             reply = Reply(b"there is no such page\n", code=404)

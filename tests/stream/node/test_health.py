@@ -15,6 +15,7 @@ from sockets import until
 
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node.health import NodeHealth, metrics_server, prometheus_text
+from coview_stream.stream.transport.http_server import MAX_CONNECTIONS
 from coview_stream.stream.transport.keys import matches, node_keys
 from coview_stream.stream.transport.transport import Connection
 
@@ -138,6 +139,35 @@ def test_slow_endless_and_vanishing_readers_are_cut_off(server):
     assert asked(made, "GET", "/health")[0] == 200
     silent.close()
     flood.close()
+
+
+def test_page_of_another_site_whose_name_points_here_reads_nothing(server):
+    made, _ = server
+    connection = http.client.HTTPConnection(made.url[7:-1], timeout=10.0)
+    for page in ("/health", "/metrics"):
+        connection.request("GET", page, headers={"Host": "rebound.evil.example:9464"})
+        answer = connection.getresponse()
+        assert b"ready" not in answer.read()
+        assert answer.status == 421
+
+
+@pytest.mark.slow
+def test_slow_readers_elsewhere_leave_room_for_the_health_check_of_this_machine():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            pytest.skip("this machine has no address but loopback")
+        own = probe.getsockname()[0]
+    made = metrics_server("0.0.0.0:0", lambda: {"ready": {"ok": True}})
+    port = int(made.url.rstrip("/").rpartition(":")[2])
+    with running(made.run), contextlib.ExitStack() as stack:
+        for _ in range(MAX_CONNECTIONS + 16):
+            slow = stack.enter_context(socket.create_connection((own, port), timeout=5))
+            slow.sendall(b"GET /health HTTP/1.0\r\nX:")
+        local = stack.enter_context(contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=1.5)))
+        local.request("GET", "/health")  # less than they are given to send a request
+        assert local.getresponse().status == 200
 
 
 @pytest.mark.parametrize("address", ["", "nonsense", "127.0.0.1:", "127.0.0.1:99999999", "192.0.2.7:9464"])
