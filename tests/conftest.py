@@ -28,9 +28,10 @@ def state_home(tmp_path_factory):
 
 @pytest.fixture
 def no_pauses(monkeypatch):
-    """No pause before a second try to fetch; a map server looks for changes every 0.05 s, its clients wait for 5 s."""
+    """No pause before a second try to fetch; slow answers end after 3 s, of zenoh 5 s; map servers look each 0.05 s."""
     for name, seconds in {
         "basemap.site.fetch._WAIT": 0.0,
+        "basemap.site.fetch._PATIENCE": 3.0,
         "clouds.fetch._WAIT": 0.0,
         "stream.maps.map_server._LOOK": 0.05,
         "stream.maps.zenoh_source._TIMEOUT": 5.0,

@@ -144,6 +144,8 @@ def open_web_file(request: urllib.request.Request) -> Any:
                 return error
             if error.code not in _BUSY or not left:
                 raise CloudError(f"{address}: the server answers {error.code} {error.reason}; check it") from error
+        except ValueError as error:  # of an address, perhaps one that the server sends us to
+            raise CloudError(f"{address}: leads to an address that is none ({error}); check it") from error
         except _FAILURES as error:
             if not left:
                 why = getattr(error, "reason", error)

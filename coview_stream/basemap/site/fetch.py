@@ -9,18 +9,30 @@ import logging
 import os
 import time
 import urllib.request
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import VerifyKey
-from coview_stream.basemap.site.manifest import FILE, MAX_MANIFEST, Around, Manifest, part_file, tiles_around
+from coview_stream.basemap.site.manifest import (
+    FILE,
+    MAX_MANIFEST,
+    Around,
+    LayerEntry,
+    Manifest,
+    TileEntry,
+    part_file,
+    tiles_around,
+)
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
-from coview_stream.errors import CloudError, MapError, TransportError, require_library, warn
+from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
 
 _PIECE = 1 << 20
+_PATIENCE, _SLOWEST = 30.0, 10_000.0  # seconds that an answer may take, and bytes per second of one that takes longer
 
 log = logging.getLogger("coview_stream.maps")
 _TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
@@ -119,12 +131,19 @@ def is_site_address(name: object) -> bool:
 
 
 def _body(answer: Any, limit: int, address: str) -> bytes:
-    raw = bytearray()
+    """Return the body of an answer, at most ``limit`` + 1 bytes; TransportError if it is cut off, or drips."""
+    raw, begin = bytearray(), time.monotonic()
+    promised = answer.length
+    wanted = limit + 1 if promised is None else min(limit + 1, promised)
     try:
-        while len(raw) <= limit and (piece := answer.read(min(_PIECE, limit + 1 - len(raw)))):
+        while len(raw) < wanted and (piece := answer.read1(min(_PIECE, wanted - len(raw)))):
             raw += piece
-    except OSError as error:
+            if time.monotonic() - begin > _PATIENCE + len(raw) / _SLOWEST:
+                raise TransportError(f"{address}: is too slow, {len(raw)} bytes in {time.monotonic() - begin:.0f} s")
+    except (OSError, ValueError, http.client.HTTPException) as error:
         raise TransportError(f"{address}: broke off ({error})") from error
+    if promised is not None and len(raw) < wanted:
+        raise TransportError(f"{address}: broke off after {len(raw)} of {promised} bytes")
     return bytes(raw)
 
 
@@ -138,7 +157,7 @@ class Mirror:
         source: of the site.
         directory: of the mirror, itself a site.
         around: circle of the tiles that are fetched; None fetches all.
-        offline: reason why the source could not be reached the last time, else empty.
+        offline: reason why the source could not be used the last time, else empty.
     """
 
     def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
@@ -160,24 +179,49 @@ class Mirror:
         return part_file(self.directory, keys, str(self.around))
 
     def open(self, progress: Progress | None = None) -> Path:
-        """Bring the mirror up to date if the source can be reached, and return :attr:`map_path`.
+        """Bring the mirror up to date, or keep a good cached copy, with a warning; return :attr:`map_path`.
 
         Raises:
             TransportError: the source cannot be reached, and nothing is in the cache.
-            MapError: the source gave no site, damaged layers, or a manifest that is not signed with the key.
+            MapError: the source gave no site, damaged layers, or a manifest that is not signed with the key, and
+                neither is a whole and signed copy in the cache.
         """
         try:
             self.refresh(progress, check=True)
-        except TransportError as error:
+        except (TransportError, MapError) as error:
             try:
                 cached = Manifest.load(self.directory)
+                wanted = self._wanted(cached)
             except MapError:
                 raise error from None
             if self._verify_key is not None:
                 cached.check_signature(self._verify_key, str(self.directory))
+            if isinstance(error, MapError) and not all(
+                self._store.is_whole(layer.sha256, layer.bytes) for layer, _ in wanted.values()
+            ):
+                raise
             self.offline = str(error)
             warn(f"{error}; going on with what was fetched before, manifest {cached.sha256[:12]}")
         return self.map_path
+
+    def _wanted(self, manifest: Manifest) -> dict[str, tuple[LayerEntry, TileEntry]]:
+        """Return the layers of the tiles in the circle, and the tile of each, by hash."""
+        keys = None if self.around is None else tiles_around(manifest, self.around)
+        return {
+            layer.sha256: (layer, tile)
+            for tile in manifest.tiles
+            if keys is None or (tile.column, tile.row) in keys
+            for layer in tile.layers.values()
+        }
+
+    def _asked(self, ask: Callable[[], bytes]) -> bytes:
+        """Return an answer of the source; TransportError for any failure."""
+        try:
+            return ask()
+        except CoViewError:
+            raise
+        except Exception as error:  # whoever answers there may send anything
+            raise TransportError(f"{self.source.name}: {type(error).__name__}: {_reason(error)}") from error
 
     def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:
         """Ask the source, fetch missing layers, and return whether the site has changed; errors as of :meth:`open`.
@@ -187,7 +231,7 @@ class Mirror:
         self.offline = ""
         with contextlib.suppress(OSError):
             os.utime(self.directory)  # recently used: the cache keeps it
-        raw = self.source.manifest()
+        raw = self._asked(self.source.manifest)
         manifest = Manifest.from_bytes(raw, f"{self.source.name}/{FILE}")
         if self._verify_key is not None:
             manifest.check_signature(self._verify_key, self.source.name)
@@ -195,20 +239,14 @@ class Mirror:
             before = Manifest.load(self.directory)
         except MapError:
             before = None
-        keys = None if self.around is None else tiles_around(manifest, self.around)
-        wanted = {
-            layer.sha256: (layer, tile)
-            for tile in manifest.tiles
-            if keys is None or (tile.column, tile.row) in keys
-            for layer in tile.layers.values()
-        }
+        wanted = self._wanted(manifest)
         exists = self._store.is_whole if check else self._store.holds
         missing = [(layer, tile) for layer, tile in wanted.values() if not exists(layer.sha256, layer.bytes)]
         done, total = 0, sum(layer.bytes for layer, _ in missing)
         for layer, tile in missing:
             for left in reversed(range(_TRIES)):
                 try:
-                    content = self.source.layer(layer.sha256, layer.bytes)
+                    content = self._asked(partial(self.source.layer, layer.sha256, layer.bytes))
                     break
                 except TransportError:
                     if not left:

@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from coview_stream.basemap.signature import SigningKey, VerifyKey
 from coview_stream.basemap.site.store import SHA256, read_record, write_record
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.config import MapConfig
+from coview_stream.config import MapConfig, config_of_map
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.arrays import Floats, Ints, Reals
 
@@ -33,6 +34,7 @@ MAX_MANIFEST = 1 << 28  # bytes: 400,000 tiles
 _MAX_LAYER = 1 << 28  # bytes
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
+_MAX_DEPTH = 32  # of the parameters
 _PURPOSE = b"site manifest\n"
 
 TILE = 320.0  # metres, a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)
@@ -116,7 +118,7 @@ class Manifest:
     signature: str = ""
     version: int = VERSION
 
-    @property
+    @cached_property
     def sha256(self) -> str:
         """Hash of all but the signature."""
         return hashlib.sha256(self._content()).hexdigest()
@@ -167,7 +169,7 @@ class Manifest:
     def from_bytes(cls, raw: bytes, name: str) -> Manifest:
         """Read untrusted bytes of :meth:`to_bytes`; MapError if they are no manifest, or of an unknown version."""
         try:
-            data = json.loads(raw)
+            data = json.loads(raw, parse_float=_finite, parse_constant=_finite)
             if not isinstance(data, dict) or data.get("format") != FORMAT:
                 raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
             if data.get("version") not in (1, VERSION):
@@ -180,12 +182,26 @@ class Manifest:
             tile, crs, parameters = _number(data["tile"]), data["crs"], data["parameters"]
             if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
                 raise ValueError("tile, crs or parameters are invalid")
+            _check_depth(parameters, _MAX_DEPTH)
+            _ = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
             tiles = tuple(TileEntry.of(entry) for entry in data["tiles"])
             if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
                 raise ValueError("a tile is named twice")
             signed = str(data.get("signer", "")), str(data.get("signature", ""))
-            return cls(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+            manifest = cls(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
+            _ = manifest.sha256  # can be written again
+            return manifest
+        except MapError:
+            raise
+        except (
+            ValueError,
+            TypeError,
+            LookupError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+            ConfigError,
+        ) as error:
             reason = " ".join(str(error).split())[:120]
             raise MapError(f"{name}: cannot be read as a manifest ({reason}); fetch or build the site again") from error
 
@@ -228,6 +244,20 @@ def _whole(value: Any, limit: int, signed: bool = False) -> int:
     if type(value) is not int or not (-limit if signed else 0) <= value <= limit:
         raise ValueError(f"{str(value)[:40]} is no whole number up to {limit}")
     return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is no finite number")
+    return value
+
+
+def _check_depth(value: object, left: int) -> None:
+    if not left:
+        raise ValueError("its parameters are nested too deeply")
+    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check_depth(item, left - 1)
 
 
 def _number(value: Any) -> float:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from coview_stream.basemap.site.fetch import Mirror
-from coview_stream.errors import CoViewError, TransportError
+from coview_stream.errors import TransportError
+from coview_stream.stream.transport.error_guard import RateLimitedErrors, is_panic
 
 log = logging.getLogger("coview_stream.maps")
 
@@ -43,6 +44,8 @@ class MapFollower:
         """
         self._mirrors, self._take_over, self._outcome = mirrors, take_over, outcome
         self._period = period
+        self._guard = RateLimitedErrors(log)
+        self._asked, self._again_at, self._tries, self._pending = time.monotonic(), 0.0, 0, False
         self.name = ", ".join(mirror.source.name for mirror in mirrors)
         self.last: dict[str, Any] = {}
         self._note("unreachable" if self._offline else "current", self._offline or None)
@@ -53,29 +56,33 @@ class MapFollower:
 
     def run(self, stopping: threading.Event) -> None:
         """Follow until ``stopping`` is set; an error is logged once, and the present map is kept."""
-        asked, tries, again_at, pending = time.monotonic(), 0, 0.0, False
         try:
             while not stopping.wait(min(_LOOK, self._period)):
-                now, outcome = time.monotonic(), self._outcome()
-                if outcome == "loading":
-                    continue
-                if outcome in _SETTLED:
-                    pending, tries = False, 0
-                changed = False
-                if now - asked >= self._period:
-                    asked = now
-                    changed = self._refresh()
-                if changed:
-                    tries = 0
-                elif not pending or now < again_at:
-                    continue
-                log.info("%s: %s", self.name, "it has changed" if changed else "once more")
-                pending, again_at = True, now + self._period * 2 ** min(tries, _MOST_DOUBLINGS)
-                tries += 1
-                self._take_over()
+                with self._guard.catch(self.name):
+                    self._turn()
         finally:
             for mirror in self._mirrors:
-                mirror.source.close()
+                with self._guard.catch(mirror.source.name):
+                    mirror.source.close()
+
+    def _turn(self) -> None:
+        now, outcome = time.monotonic(), self._outcome()
+        if outcome == "loading":
+            return
+        if outcome in _SETTLED:
+            self._pending, self._tries = False, 0
+        changed = False
+        if now - self._asked >= self._period:
+            self._asked = now
+            changed = self._refresh()
+        if changed:
+            self._tries = 0
+        elif not self._pending or now < self._again_at:
+            return
+        log.info("%s: %s", self.name, "it has changed" if changed else "once more")
+        self._pending, self._again_at = True, now + self._period * 2 ** min(self._tries, _MOST_DOUBLINGS)
+        self._tries += 1
+        self._take_over()
 
     def _refresh(self) -> bool:
         """Fetch changes and return whether there are any."""
@@ -85,10 +92,12 @@ class MapFollower:
                 if mirror.refresh():
                     changed = True
                     _ = mirror.map_path  # chooses the tiles of a part again
-            except (CoViewError, OSError) as error:
-                mirror.offline, failure = str(error), error
+            except BaseException as error:  # of any kind: the thread goes on
+                if not (isinstance(error, Exception) or is_panic(error)):
+                    raise
+                mirror.offline, failure = str(error) or type(error).__name__, error
         if failure is not None and not changed:
-            text = " ".join(str(failure).split())
+            text = " ".join((str(failure) or type(failure).__name__).split())
             if text != self.last["error"]:
                 log.error("%s; the map that is there is kept", text)
             self._note("unreachable" if isinstance(failure, OSError | TransportError) else "refused", text)

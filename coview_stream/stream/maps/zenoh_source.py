@@ -54,7 +54,9 @@ class ZenohSource:
         self, site: str, base: str = "coview", connect: Sequence[str] = (), config: Path | None = None
     ) -> None:
         """Use a site's name and zenoh endpoints; ConfigError if the name cannot be part of a key."""
-        where = ",".join(connect) or ("" if config is None else str(config))
+        # the mirror is named after it: all that chooses the site is in it
+        parts = [*connect, *([] if config is None else [str(config)]), *([] if base == "coview" else [f"base {base}"])]
+        where = ",".join(parts)
         self.name = f"zenoh://{site}" + (f" ({where})" if where else "")
         self._keys = MapKeys.of(site, base)
         self._connect, self._config = connect, config
@@ -91,7 +93,7 @@ class ZenohSource:
             refusal = ""
             for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
                 if reply.ok is None:
-                    refusal = reply.err.payload.to_string()[:300].replace(_NO_ANSWER, "")
+                    refusal = bytes(reply.err.payload)[:300].decode(errors="replace").replace(_NO_ANSWER, "")
                     continue
                 if len(reply.ok.payload) > limit:
                     raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")

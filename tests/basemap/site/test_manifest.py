@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry
 from coview_stream.basemap.site.store import TileStore
+from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
 
 SHA = "ab" * 32
+CONFIG = json.loads(json.dumps(asdict(MapConfig())))
 TILE = TileEntry(-1, 2, 10, 3, 7, -1.5, 20.25, {name: LayerEntry(SHA, 99) for name in ("cloud", "stations")})
-SITE = Manifest((500_000.0, 5_400_000.0, 100.0), 320.0, "EPSG:25832", {"config": {"block": 2.0}}, (TILE,))
+SITE = Manifest((500_000.0, 5_400_000.0, 100.0), 320.0, "EPSG:25832", {"config": CONFIG}, (TILE,))
 
 
 def test_manifest_comes_back_with_the_same_hash(tmp_path):
@@ -41,7 +43,9 @@ def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
         (("tiles", 0, "layers", "cloud", "sha256"), "../../etc/passwd"),
         (("tiles", 0, "layers", "cloud", "bytes"), 1 << 40), (("tiles", 0, "layers"), {}),
         (("tiles", 0, "layers", "other"), {"sha256": SHA, "bytes": 1}), (("tiles",), None), (("parameters",), []),
-        (("tiles", 0, "low"), 1e300), (("crs",), 4),
+        (("tiles", 0, "low"), 1e300), (("crs",), 4), (("tile",), 300.0), (("parameters",), {}),
+        (("parameters", "config"), {"block": 2.0}), (("parameters", "config", "block"), "2"),
+        (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
     ],
 )  # fmt: skip
 def test_manifest_with_something_else_is_refused(path, value):
@@ -52,6 +56,13 @@ def test_manifest_with_something_else_is_refused(path, value):
     at[path[-1]] = value
     with pytest.raises(MapError, match=r"site\.json"):
         Manifest.from_bytes(json.dumps(plain).encode(), "site.json")
+
+
+@pytest.mark.parametrize("value", ["1e999", "[" * 700 + "]" * 700, '{"a":' * 300 + "1" + "}" * 300, "9" * 5000])
+def test_manifest_that_could_not_be_written_again_is_refused(value):
+    raw = SITE.to_bytes().replace(b'"parameters": {', b'"parameters": {"x": ' + value.encode() + b",")
+    with pytest.raises(MapError, match=r"site\.json"):
+        Manifest.from_bytes(raw, "site.json")
 
 
 def test_manifest_names_a_tile_once():

@@ -176,6 +176,51 @@ def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
         assert mirrors[0].offline == "yard: nobody answers"
 
 
+@pytest.mark.parametrize("error", [ValueError("x"), KeyError("x"), RecursionError(), UnicodeError("a..b")])
+def test_follower_survives_any_error_of_a_source_and_of_the_node(site, error):
+    source, failing = Directory(site), [error]
+
+    def take_over():
+        taken.append(1)
+        if len(taken) == 1:
+            raise error
+
+    taken, good = [], source.manifest
+    mirror = Mirror(source)
+    mirror.open()
+    follower, stopping = MapFollower([mirror], take_over, lambda: "refused", period=0.05), threading.Event()
+    thread = threading.Thread(target=follower.run, args=(stopping,))
+
+    def manifest():
+        if failing:
+            raise error
+        return good()
+
+    source.manifest = manifest
+    thread.start()
+    try:
+        until(lambda: follower.last["error"])
+        failing.clear()
+        until(lambda: follower.last["result"] == "current")
+        change(site)
+        until(lambda: len(taken) > 1)
+        assert thread.is_alive()
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_refusal_that_is_no_text_is_one_error(endpoint, source):
+    session = zenoh.open(compose((), [endpoint]))
+    queryable = session.declare_queryable("coview/maps/yard/**", lambda query: query.reply_err(b"\xff\xfe"))
+    try:
+        with pytest.raises(TransportError, match="yard"):
+            source.manifest()
+    finally:
+        queryable.undeclare()
+        session.close()
+
+
 def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):
     mirror = Mirror(Directory(site), None, Around(512_000.0, 5_120_000.0, 30.0))
     with followed([mirror]) as (_, changes):
@@ -209,6 +254,7 @@ def test_addresses(endpoint):
     source = source_of("zenoh://yard", connect=[endpoint])
     assert isinstance(source, ZenohSource)
     assert source.name == f"zenoh://yard ({endpoint})"
+    assert len({source_of("zenoh://yard", base, [endpoint]).name for base in ("coview", "a", "b")}) == 3
     for address in ("zenoh://host/yard", "zenoh://a*b", "ftp://x/y"):
         with pytest.raises(ConfigError):
             source_of(address)
