@@ -35,6 +35,8 @@ _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish their work
 _MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map while the new one has not verified its place
 _STEP = 0.02  # seconds between two looks at a change of the map
+_RELOADS_APART = 1.0  # seconds from the begin of a change to that of the next, however often it is asked for
+_LINES_APART = 60.0  # seconds between two equal lines about changes
 
 Service = Callable[[threading.Event], None]
 """Work on a thread of its own, until the event is set."""
@@ -247,6 +249,7 @@ class MapReloader:
         self._on_change = on_change
         self._asked = threading.Event()
         self._busy = False
+        self._said: dict[int, tuple[str, float]] = {}  # by level: the newest line, and its local time
         self.max_handover = _MAX_HANDOVER
         self.last: dict[str, Any] = {"result": "none", "map_sha256": node.map_sha256, "error": None}
 
@@ -267,6 +270,7 @@ class MapReloader:
                 continue
             self._busy = True
             self._asked.clear()
+            next_at = time.monotonic() + _RELOADS_APART
             self._on_change(True)
             try:
                 self._change(stopping)
@@ -276,13 +280,21 @@ class MapReloader:
             finally:
                 self._busy = False
                 self._on_change(False)
+            stopping.wait(max(0.0, next_at - time.monotonic()))
+
+    def _say(self, level: int, text: str, traceback: bool = False) -> None:
+        before, at = self._said.get(level, ("", 0.0))
+        now = time.monotonic()
+        if text != before or now - at >= _LINES_APART:
+            self._said[level] = text, now
+            log.log(level, "%s", text, exc_info=traceback)
 
     def _note(self, result: str, error: str | None = None) -> None:
         self.last = {"result": result, "map_sha256": self._node.map_sha256, "error": error}
 
     def _change(self, stopping: threading.Event) -> None:
         self._note("loading")
-        log.info("loading the map again")
+        log.debug("loading the map again")
         try:
             opened = self._open_map(self._node.map_sha256, stopping.is_set)
         except CancelledError:
@@ -291,12 +303,13 @@ class MapReloader:
             foreseen = isinstance(error, (CoViewError, DiedError, OSError, MemoryError))
             why = (foreseen and " ".join(str(error).split())) or repr(error)
             self._note("refused", why)
-            log.error("the new map is refused, going on with the one before: %s", why, exc_info=not foreseen)
+            self._say(logging.ERROR, f"the new map is refused, going on with the one before: {why}", not foreseen)
             return
         if opened is None:
             self._note("unchanged")
-            log.info("the map has not changed")
+            self._say(logging.INFO, "the map was asked to be loaded again, and has not changed")
             return
+        log.info("changing to map %s", opened.sha256[:16])
         self._note("handing over")
         begin = time.monotonic()
         try:

@@ -28,7 +28,7 @@ class Change:
     def __init__(self, *names, max_handover=60.0):
         self.engine = Engine()
         self.runners = Runner(self.engine), Runner(self.engine)
-        self.error = None
+        self.error, self.open_as = None, None
         self.notices = []
         self.site = Site(*names, open_map=self.open, on_reload=self.notices.append)
         self.keys = self.site.keys.values()
@@ -40,6 +40,8 @@ class Change:
     def open(self, served, cancelled):
         if self.error is not None:
             raise self.error
+        if self.open_as is not None:
+            return self.open_as()
         sessions = [Session(keys, OTHER, self.site.node.config) for keys in self.keys]
         return OpenedMap(OTHER, dict(zip(("track", "search"), self.runners, strict=True)), sessions)
 
@@ -103,6 +105,23 @@ def test_robots_keep_the_old_map_until_the_new_one_has_verified_their_place(chan
     assert [p.map_sha256 for p in poses] == sorted((p.map_sha256 for p in poses), reverse=old > OTHER)
 
 
+@pytest.mark.slow
+def test_flood_of_reloads_opens_the_map_once_a_second_and_is_one_line(changes, caplog):
+    change = changes("r1")
+    opened = []
+    change.open_as = lambda: opened.append(1)
+    begin = time.monotonic()
+    with caplog.at_level("INFO"):
+        while time.monotonic() < begin + 0.3:
+            assert change.site.node.reload()["ok"]
+            time.sleep(0.001)
+        until(lambda: change.reloader.last["result"] == "unchanged")
+        assert 1 <= len(opened) <= 1.0 + (time.monotonic() - begin)
+        until(lambda: len(opened) > 1)  # that was asked for last is done
+        until(lambda: change.reloader.outcome == "unchanged")
+    assert sum("loaded again" in record.getMessage() for record in caplog.records) == 1
+
+
 def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
     change = changes("r1")
     change.drive_until(lambda: change.states() == ["TRACKING"])
@@ -145,6 +164,7 @@ def test_robot_that_the_new_map_does_not_know_is_searched_for_after_a_while(chan
     assert change.states() != ["TRACKING"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [MapError("it is damaged"), DiedError("it is damaged"), ValueError("it is damaged")])
 def test_map_that_cannot_be_used_changes_nothing(changes, error, caplog):
     change = changes("r1")
