@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.keys import check_chunk, check_prefix
 
 _NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
+_MAX_MESSAGE = MAX_MANIFEST + (1 << 20)  # bytes of an answer and its frame; no layer is larger either
+_MAX_SITES = 100  # that are asked for their names
 _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 
 
@@ -81,7 +84,7 @@ class ZenohSource:
         import zenoh
 
         if self._session is None:
-            configuration = zenoh_config.compose(self._connect, (), self._config)
+            configuration = zenoh_config.compose(self._connect, (), self._config, max_message=_MAX_MESSAGE)
             try:
                 with zenoh_config.zenoh_errors(self.name):
                     self._session = zenoh.open(configuration)
@@ -106,8 +109,9 @@ class ZenohSource:
 
         begin, end = self._keys.prefix.rpartition("/")[0] + "/", "/manifest"
         with zenoh_config.zenoh_errors(self.name):
-            replies = list(self._session.get(f"{begin}*{end}", timeout=_TIMEOUT, target=zenoh.QueryTarget.ALL))
-        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+            replies = self._session.get(f"{begin}*{end}", timeout=_TIMEOUT, target=zenoh.QueryTarget.ALL)
+            # one after the other: each holds a manifest
+            keys = [str(reply.ok.key_expr) for reply in islice(replies, _MAX_SITES) if reply.ok is not None]
         others = sorted({key.removeprefix(begin).removesuffix(end) for key in keys})
         if others and self._keys.manifest not in keys:
             return f"no map server there has it; there are {', '.join(others)[:200]}"

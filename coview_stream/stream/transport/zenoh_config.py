@@ -78,8 +78,9 @@ def zenoh_errors(subject: str) -> Iterator[None]:
 
 
 def compose(
-    connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None, lease_ms: int | None = None
-) -> Any:
+    connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None, lease_ms: int | None = None,
+    max_message: int | None = None,
+) -> Any:  # fmt: skip
     """Build a ``zenoh.Config``.
 
     Settings of the file have precedence over our defaults; ``connect`` and ``listen`` replace its endpoints. Without
@@ -91,6 +92,7 @@ def compose(
         listen: endpoints.
         path: a zenoh configuration, JSON5 or YAML.
         lease_ms: how long others wait for a sign of life before they take us for dead; None leaves it at zenoh's 10 s.
+        max_message: bytes of a message beyond which zenoh receives no more of it; None leaves it at zenoh's 1 GiB.
 
     Raises:
         TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
@@ -130,6 +132,8 @@ def compose(
             _insert(config, key, value)
     if lease_ms is not None and "lease" not in text:
         _insert(config, "transport/link/tx/lease", lease_ms)
+    if max_message is not None and "max_message_size" not in text:
+        _insert(config, "transport/link/rx/max_message_size", max_message)
     if "shared_memory" not in text:  # set or not, it reads the same: ask the file's text
         _insert(config, _SHARED_MEMORY, False)
     if _get(config, "transport/unicast/lowlatency"):

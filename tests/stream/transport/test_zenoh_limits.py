@@ -17,6 +17,7 @@ from sockets import free_endpoint, until
 
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport import zenoh_io as zenoh_samples
+from coview_stream.stream.transport.zenoh_config import compose
 from coview_stream.stream.transport.zenoh_transport import open_transport
 
 
@@ -84,6 +85,25 @@ def test_queries_beyond_the_bound_and_large_ones_are_refused_at_once_and_other_k
         until(lambda: len(answered) == zenoh_samples.MAX_QUERIES)
         assert robot.query("r1/rpc/map_view")["ok"]  # there is room again
         assert len(called) == zenoh_samples.MAX_QUERIES + 1
+
+
+@pytest.mark.slow
+def test_answers_beyond_the_bound_are_not_received_and_the_session_goes_on():
+    endpoint = free_endpoint()
+    with (
+        zenoh.open(compose((), [endpoint])) as server,
+        zenoh.open(compose([endpoint], max_message=1_000_000)) as session,
+    ):
+        sizes = {"a/large": 20_000_000, "a/small": 900_000}
+        queryable = server.declare_queryable("a/*", lambda q: q.reply(q.key_expr, bytes(sizes[str(q.key_expr)])))
+
+        def ask(key):
+            return [len(reply.ok.payload) for reply in session.get(key, timeout=10.0) if reply.ok is not None]
+
+        until(lambda: ask("a/small") == [900_000])
+        assert ask("a/large") == []
+        until(lambda: ask("a/small") == [900_000])
+        queryable.undeclare()
 
 
 def test_only_reliable_messages_may_block():
