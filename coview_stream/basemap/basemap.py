@@ -146,7 +146,8 @@ class BaseMap:
             verify_key = read_verify_key(verify_key)
         trust = Trust(verify_key) if isinstance(verify_key, VerifyKey) else verify_key
         place = Path(path)
-        if place.is_dir() or place.suffix == ".tiles":
+        made_here = place.is_dir() or place.suffix == ".tiles"
+        if made_here:
             from coview_stream.basemap.site.working_file import open_site
 
             place, file = open_site(place, check, None if trust is None else trust.key)
@@ -154,7 +155,7 @@ class BaseMap:
             file = open_file(place, check, trust)
         try:
             loaded = cls(file.arrays, file.parameters, file.sha256)
-            check_arrays(loaded.arrays, loaded.config)
+            check_arrays(loaded.arrays, loaded.config, points=check and not made_here)
         except MapError as error:
             raise MapError(f"{place}: {error}") from error
         loaded.path, loaded.identity = place.absolute(), file.identity

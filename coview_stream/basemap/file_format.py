@@ -18,7 +18,9 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from coview_kernels.crop import MAX_POINTS
 from coview_kernels.mapped import release
+from coview_kernels.reference.field import CELL as FIELD_CELL
 from coview_kernels.reference.field import TILE as FIELD_TILE
 from coview_stream.basemap.signature import (
     FileIdentity,
@@ -79,7 +81,10 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "learned.place_at": ("<f4", ("places", 2)),
 }
 """Type and shape of each array; dimensions of the same name have the same length."""
-_MAX_METRES = 1e7  # of a corner or a station: no map of the Earth is larger
+_MAX_METRES = 1e7  # of a corner, a station or a point: no map of the Earth is larger
+_MAX_AREA = 5.4e8  # square metres of the rectangle that holds a map: more than kernels count in int32
+_BESIDE = 1300.0  # metres: a tile of a site, which the field may cover beside what has been surveyed
+_ROWS = 1 << 18  # points that are checked at a time
 
 
 class Loaded(NamedTuple):
@@ -323,8 +328,12 @@ def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[b
     return total.hexdigest()
 
 
-def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> None:
-    """Check types and shapes of a map's arrays, and values that are used as indices; MapError names a wrong one."""
+def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, points: bool = True) -> None:
+    """Check types and shapes of a map's arrays, and values that are used as indices; MapError names a wrong one.
+
+    Stations, field and ``points``, if they are asked for, must lie on the raster of surveyed cells: all other rasters
+    are as large as it at most, and it is in the file.
+    """
     descriptor = ("<f2", ("stations", config.descriptor.rings, config.descriptor.sectors))
     expected = _EXPECTED | {f"descriptor.{name}": descriptor for name in config.descriptor.channels}
     known: dict[str, int] = {}
@@ -342,14 +351,42 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig) -> N
                 raise _refused(name, f"has the shape {array.shape}, with {actual} where {length} were expected")
     if not np.isfinite(arrays["origin"]).all():
         raise _refused("origin", "is not finite")
-    for name in ("surveyed_corner", "stations"):
-        with np.errstate(invalid="ignore"):
-            # false for NaN as well
-            if not (np.abs(arrays[name]) < _MAX_METRES).all():
-                raise _refused(name, f"is not finite, or beyond {_MAX_METRES:g} m")
-    begin, end = arrays["tile_index"][:, 2], arrays["tile_index"][:, 3]
+    size = config.block * np.array(arrays["surveyed"].shape[::-1], dtype=np.float64)
+    corner = arrays["surveyed_corner"]
+    if not (np.abs(corner) < _MAX_METRES).all():  # false for NaN as well
+        raise _refused("surveyed_corner", f"is not finite, or beyond {_MAX_METRES:g} m")
+    if size.prod() > _MAX_AREA:
+        raise _refused("surveyed", f"covers {size.prod() / 1e6:.0f} km2, {_MAX_AREA / 1e6:.0f} at most")
+    low, high = corner - config.block, corner + size + config.block
+    for name in ("stations", "points") if points else ("stations",):
+        _check_places(name, arrays[name], low, high)
+    if len(field := arrays.get("field.tiles", ())):
+        edge = FIELD_CELL * FIELD_TILE
+        first, last = (
+            edge * np.asarray(each, dtype=np.float64)[1::-1] for each in (field.min(axis=0), field.max(axis=0))
+        )
+        if not ((first >= low - _BESIDE) & (last <= high + _BESIDE)).all():
+            raise _refused("field.tiles", "lies beside the surveyed cells")
+    # of each stretch of points once: nothing that is cut out of the map is larger than the map
+    stretches = arrays["tile_index"][:, 2:]
+    begin, end = stretches[np.lexsort(stretches.T)].T if len(stretches) else stretches.T
+    if len(arrays["points"]) > MAX_POINTS:
+        raise _refused("points", f"has {len(arrays['points'])} rows, {MAX_POINTS} at most")
     if not ((begin >= 0) & (begin <= end) & (end <= len(arrays["points"]))).all():
         raise _refused("tile_index", "names points that are not there")
+    if not (end[:-1] <= begin[1:]).all():
+        raise _refused("tile_index", "names points twice")
+
+
+def _check_places(name: str, places: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any]) -> None:
+    for start in range(0, len(places), _ROWS):
+        part = places[start : start + _ROWS]
+        bottom, top = part.min(axis=0).astype(np.float64), part.max(axis=0).astype(np.float64)
+        release(places)
+        if not (np.abs([bottom, top]) < _MAX_METRES).all():  # NaN comes through min and max
+            raise _refused(name, f"is not finite, or beyond {_MAX_METRES:g} m")
+        if not ((bottom[:2] >= low) & (top[:2] <= high)).all():
+            raise _refused(name, "lies beside the surveyed cells")
 
 
 def _refused(name: str, flaw: str) -> MapError:

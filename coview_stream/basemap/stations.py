@@ -12,6 +12,7 @@ from coview_stream.basemap.ground import ground_mask
 from coview_stream.basemap.progress import Progress
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
+from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Ints, Reals
 from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
@@ -31,6 +32,7 @@ RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its
 _PORTION = 512  # stations at a time: 7 MB of bins
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
+_MAX_LEVELS = 128  # stations above one another: no building has more floors
 LEVEL_GAP = 2.5
 """Metres: stations farther apart in height are on different storeys."""
 
@@ -319,11 +321,18 @@ class StationGrid:
         flat = cells[:, 0] * self._shape[1] + cells[:, 1]
         order = np.lexsort((stations[:, 2], flat))
         unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-        # (L, cells + 1) station of each level and cell, lowest level first, -1 for none; the last cell is off the grid
-        self._levels = np.full((int(count.max()), int(self._shape.prod()) + 1), -1, dtype=np.int32)
-        for level in range(len(self._levels)):
+        if (levels := int(count.max())) > _MAX_LEVELS:
+            raise MapError(f"the map has {levels} stations above one another, {_MAX_LEVELS} at most; build it again")
+        self._off = int(self._shape.prod())  # number of all cells off the grid
+        # (L, U + 1) stations of each level, lowest first, -1 for none, by cells that have any; the last is of others
+        self._levels = np.full((levels, len(unique) + 1), -1, dtype=np.int32)
+        for level in range(levels):
             has = count > level
-            self._levels[level, unique[has]] = order[first[has] + level]
+            self._levels[level, :-1][has] = order[first[has] + level]
+        self._row = np.full(self._off + 1, len(unique), dtype=np.int32)
+        self._row[unique] = np.arange(len(unique))
+        # of one level: its station at once, without a second look-up
+        self._single = self._levels[0, self._row] if levels == 1 else None
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -332,9 +341,9 @@ class StationGrid:
     def at(self, positions: Reals) -> Indices:
         """Return the station (N,) at each of (N, 3) positions, of several the nearest within 2.5 m; -1 for none."""
         cell = self.cell(positions)
-        if len(self._levels) == 1:
-            return np.asarray(self._levels[0].take(cell), dtype=np.intp)
-        levels = self._levels[:, cell]
+        if self._single is not None:
+            return np.asarray(self._single.take(cell), dtype=np.intp)
+        levels = self._levels[:, self._row[cell]]
         gap = np.abs(self.stations[levels, 2] - np.asarray(positions[:, 2], dtype=np.float32))
         gap[levels < 0] = np.inf
         best = gap.argmin(axis=0)
@@ -343,7 +352,7 @@ class StationGrid:
 
     def levels_at(self, positions: Reals) -> Indices:
         """Return the stations (L, N) of all levels, lowest first, at (N, 2 or 3) positions; -1 for none."""
-        return np.asarray(self._levels[:, self.cell(positions)], dtype=np.intp)
+        return np.asarray(self._levels[:, self._row[self.cell(positions)]], dtype=np.intp)
 
     def cells_of(self, chosen: Indices | slice) -> Ints:
         """Return column and row (N, 2) of the cells of stations, counted from the map's zero."""
@@ -351,13 +360,11 @@ class StationGrid:
 
     def storeys(self, station: int) -> list[int]:
         """Return the stations of a station's cell, lowest first, with itself."""
-        if len(self._levels) == 1:
-            return [station]
-        return [k for k in self._levels[:, self.cell(self.stations[station][None])[0]].tolist() if k >= 0]
+        return [k for k in self.levels_at(self.stations[station][None])[:, 0].tolist() if k >= 0]
 
     def cell(self, positions: Reals) -> Indices:
         """Return the number of the cell (N,) that holds each of (N, 2 or 3) positions; off the grid, the last."""
         index = np.floor(np.asarray(positions[:, :2], dtype=np.float64) * (1.0 / self.block)).astype(np.int64)
         index -= self._low
         inside = (index >= 0).all(axis=1) & (index < self._shape).all(axis=1)
-        return np.where(inside, index[:, 0] * self._shape[1] + index[:, 1], self._levels.shape[1] - 1)
+        return np.where(inside, index[:, 0] * self._shape[1] + index[:, 1], self._off)

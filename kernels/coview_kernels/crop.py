@@ -21,6 +21,9 @@ from coview_kernels.warm_up import compiled_by
 
 __all__ = ["Crop", "Cut", "crop_points"]
 
+MAX_POINTS = (1 << 31) // 3 - 1
+"""Points of a map: kernels count its coordinates in int32."""
+
 
 def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Crop | None:
     """Cut the points around a place out of a map; None where there is no point.
@@ -28,19 +31,23 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
     Args:
         points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
         normals: (N, 3) int8, contiguous, normals as long as the planarity around each point, times 127.
-        spans: (S, 2) first row of each stretch of the map to look at, and the row after the last.
+        spans: (S, 2) first row of each stretch of the map to look at, and the row after the last; no row twice.
         cut: the circle to cut out.
 
     Raises:
-        ValueError: an array has the wrong shape or type, a span leaves the map, or a setting is out of its range.
+        ValueError: an array has the wrong shape or type, a span leaves the map, the spans hold more rows than the map,
+            the map more than ``MAX_POINTS``, or a setting is out of its range.
     """
     for name, array, kind in (("points", points, np.float32), ("normals", normals, np.int8)):
         if array.shape != (len(points), 3) or array.dtype != kind or not array.flags.c_contiguous:
             raise ValueError(f"{name} must be a contiguous ({len(points)}, 3) array of {np.dtype(kind)}")
-    stretches = np.ascontiguousarray(spans, dtype=np.int32).reshape(-1, 2)
-    begin, end = stretches.T
-    if not ((begin >= 0) & (begin <= end) & (end <= len(points))).all():
-        raise ValueError(f"spans must lie in the map's {len(points)} points and not end before they begin")
+    if len(points) > MAX_POINTS:
+        raise ValueError(f"{len(points)} points, {MAX_POINTS} at most")
+    wide = np.asarray(spans, dtype=np.int64).reshape(-1, 2)
+    begin, end = wide.T
+    if not ((begin >= 0) & (begin <= end) & (end <= len(points))).all() or (end - begin).sum() > len(points):
+        raise ValueError(f"spans must lie in the map's {len(points)} points, once, and not end before they begin")
+    stretches = np.ascontiguousarray(wide, dtype=np.int32)
     if not (all(math.isfinite(v) for v in cut) and cut.radius > 0):
         raise ValueError(f"cut must be finite with a positive radius, got {cut}")
     return runtime.dispatch_here(

@@ -70,6 +70,55 @@ def test_values_that_would_be_used_as_places_are_checked(small: Any, tmp_path: P
         BaseMap.load(tmp_path / "a.coview")
 
 
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e30, 3e6, -5e3])
+@pytest.mark.parametrize("name", ["points", "stations"])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_points_and_stations_are_finite_and_on_the_surveyed_cells(
+    small: Any, tmp_path: Path, value: float, name: str, column: int
+) -> None:
+    changed = small[0][name].copy()
+    changed[-1, column] = value
+    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
+    if column == 2 and abs(value) < 1e7:
+        BaseMap.load(tmp_path / "a.coview")  # a height alone makes no raster larger
+        return
+    with pytest.raises(MapError, match=f"the map's {name} (is not finite|lies beside)"):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused(small: Any, tmp_path: Path) -> None:
+    tiles = small[0]["field.tiles"].copy()
+    tiles[0, 1] += 1400
+    file_format.save(tmp_path / "a.coview", small[0] | {"field.tiles": tiles}, small[1])
+    with pytest.raises(MapError, match=r"field\.tiles lies beside"):
+        BaseMap.load(tmp_path / "a.coview")
+    wide = np.zeros((1, 140_000_000), dtype=np.uint8)
+    with pytest.raises(MapError, match="surveyed covers 560 km2"):
+        file_format.check_arrays(small[0] | {"surveyed": wide}, BaseMap(*small).config)
+
+
+@pytest.mark.parametrize("rows", [[[0, 5], [0, 5]], [[0, 5], [4, 9]], [[5, 9], [0, 6]], [[0, 12], [3, 4], [4, 5]]])
+def test_points_are_named_once(small: Any, tmp_path: Path, rows: list[list[int]]) -> None:
+    index = np.array([[0, k, *row] for k, row in enumerate(rows)])
+    file_format.save(tmp_path / "a.coview", small[0] | {"tile_index": index}, small[1])
+    with pytest.raises(MapError, match="tile_index names points twice"):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+def test_empty_stretches_are_none_twice(small: Any, tmp_path: Path) -> None:
+    index = np.array([[0, 0, 3, 3], [0, 1, 0, 3], [0, 2, 3, 9], [0, 3, 0, 0], [0, 4, 3, 3]])
+    file_format.save(tmp_path / "a.coview", small[0] | {"tile_index": index}, small[1])
+    assert len(BaseMap.load(tmp_path / "a.coview").points) == len(small[0]["points"])
+
+
+def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path) -> None:
+    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
+    arrays["stations"] = np.repeat(arrays["stations"][:1], 200, axis=0)
+    file_format.save(tmp_path / "a.coview", arrays, small[1])
+    with pytest.raises(MapError, match="200 stations above one another"):
+        _ = BaseMap.load(tmp_path / "a.coview").station_grid
+
+
 @pytest.mark.parametrize(
     "parameters",
     [

@@ -60,6 +60,8 @@ def test_bad_arguments_are_named():
         ((cloud, normals[:2], [[0, 3]], good), "normals"),
         ((cloud, normals, [[0, 4]], good), "spans"),
         ((cloud, normals, [[0, 3], [3, 0]], good), "spans"),
+        ((cloud, normals, [[0, 3], [1, 2]], good), "once"),
+        ((cloud, normals, [[0, 3]] * 1000, good), "once"),
         ((cloud, normals, [[0, 3]], good._replace(radius=0.0)), "radius"),
     ]:
         with pytest.raises(ValueError, match=name):
