@@ -1,7 +1,8 @@
 """Store of a site's layers, files named by their sha256; and the cache of working files and mirrors.
 
 The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. Least recently used files are deleted
-to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted: nobody else can write them.
+to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, for ``--verify-key`` as well: nobody else can reach
+them. A folder that others may write is refused, and one that they may read is closed to them.
 """
 
 from __future__ import annotations
@@ -100,14 +101,23 @@ class TileStore:
 
 
 def cache_folder() -> Path:
-    """Return the folder of the cache, made if it does not exist; only its user can write it."""
+    """Return the folder of the cache, made if it does not exist; MapError unless it is its user's alone."""
     named = os.environ.get("COVIEW_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
     folder = Path(named) if named else Path(base) / "coview-stream"
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
-            raise MapError(f"{folder}: belongs to another user; name a folder of your own in COVIEW_CACHE")
+        if hasattr(os, "getuid"):
+            state = folder.stat()
+            if state.st_uid != os.getuid():
+                raise MapError(f"{folder}: belongs to another user; name a folder of your own in COVIEW_CACHE")
+            if state.st_mode & 0o022:
+                raise MapError(
+                    f"{folder}: others may write to it, so its maps may be theirs; delete it and make it again with "
+                    "'mkdir -m 700', or name another folder in COVIEW_CACHE"
+                )
+            if state.st_mode & 0o077:  # files in it are made by the umask, which may let others write them
+                folder.chmod(0o700)
     except OSError as error:
         raise MapError(f"{folder}: cannot be used ({error.strerror}); name a folder in COVIEW_CACHE") from error
     return folder

@@ -9,6 +9,7 @@ import pytest
 
 from coview_stream.basemap import file_format
 from coview_stream.basemap.site.store import cache_folder, evict, hold
+from coview_stream.errors import MapError
 
 
 @pytest.fixture
@@ -23,6 +24,30 @@ def made(folder, name, age):
     file_format.save(path, {"a": np.arange(1250, dtype=np.int64)}, {})
     os.utime(path, (age, age))
     return path
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
+def test_folder_that_others_may_write_is_refused(tmp_path, monkeypatch, mode):
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    folder.chmod(mode)
+    monkeypatch.setenv("COVIEW_CACHE", str(folder))
+    with pytest.raises(MapError, match="others may write to it"):
+        cache_folder()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
+def test_others_do_not_reach_the_folder_with_any_umask(tmp_path, monkeypatch):
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b").chmod(0o755)
+    before = os.umask(0)
+    try:
+        for name in "ab":
+            monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / name))
+            assert cache_folder().stat().st_mode & 0o777 == 0o700
+    finally:
+        os.umask(before)
 
 
 def test_what_was_not_used_for_longest_goes(folder):
