@@ -20,6 +20,7 @@ from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.manifest import (
     FILE,
     MAX_MANIFEST,
+    OPENED,
     Around,
     LayerEntry,
     Manifest,
@@ -151,7 +152,7 @@ class Mirror:
     """Cached copy of a site, whole or in part; maps are opened from it, with or without a network.
 
     Layers are compared with their hashes before they are written, the manifest with its signature if there is a key.
-    The manifest is written last: the mirror always holds one state of the site.
+    The manifest is written last: the mirror always holds one state of the site, and the last one that was opened.
 
     Attributes:
         source: of the site.
@@ -261,12 +262,14 @@ class Mirror:
             done += layer.bytes
             if progress:
                 progress(done, total)
-        changed = before is None or before.sha256 != manifest.sha256
+        changed, opened = before is None or before.sha256 != manifest.sha256, set[str]()
         if changed or before != manifest:
             self.directory.mkdir(parents=True, exist_ok=True)
             manifest.save(self.directory)
         if changed and before is not None:  # a process may still use the state before
-            self._store.prune(manifest.hashes() | before.hashes())
+            with contextlib.suppress(MapError):  # none was opened
+                opened = Manifest.load(self.directory, OPENED).hashes()
+            self._store.prune(manifest.hashes() | before.hashes() | opened)
         elif changed:
             evict(cache_folder(), self.directory)
         return changed or bool(missing)

@@ -29,6 +29,7 @@ from coview_stream.geometry.arrays import Floats, Ints, Reals
 FORMAT = "coview-site"
 VERSION = 2  # is written; sites of version 1, with layers compressed otherwise, can be read
 FILE = "manifest.json"
+OPENED = "opened.json"  # in a mirror: the last manifest that a map was opened from
 LAYERS = ("cloud", "stations", "features")  # of a tile; features are optional
 MAX_MANIFEST = 1 << 28  # bytes: 400,000 tiles
 _MAX_LAYER = 1 << 28  # bytes
@@ -205,24 +206,24 @@ class Manifest:
             reason = " ".join(str(error).split())[:120]
             raise MapError(f"{name}: cannot be read as a manifest ({reason}); fetch or build the site again") from error
 
-    def save(self, directory: Path) -> None:
+    def save(self, directory: Path, name: str = FILE) -> None:
         """Write it into a site's directory, complete or not at all; MapError if it cannot be written."""
         try:
-            with atomic_file(directory / FILE, sync=True) as file:
+            with atomic_file(directory / name, sync=True) as file:
                 file.write(self.to_bytes())
         except OSError as error:
-            raise MapError(f"{directory / FILE}: cannot be written ({error.strerror})") from error
+            raise MapError(f"{directory / name}: cannot be written ({error.strerror})") from error
 
     @classmethod
-    def load(cls, directory: Path) -> Manifest:
+    def load(cls, directory: Path, name: str = FILE) -> Manifest:
         """Read the manifest of a site's directory; MapError if it is missing, or cannot be read."""
-        path = directory / FILE
+        path = directory / name
         try:
             with path.open("rb") as file:
                 raw = file.read(MAX_MANIFEST + 1)
         except OSError as error:
             raise MapError(
-                f"{directory}: is no site, {FILE} cannot be read ({error.strerror}); give a .coview file, or a "
+                f"{directory}: is no site, {name} cannot be read ({error.strerror}); give a .coview file, or a "
                 "directory that 'build -o DIRECTORY/' made"
             ) from error
         if len(raw) > MAX_MANIFEST:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,7 +15,7 @@ from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, VERSION, assemble, field_layers
-from coview_stream.basemap.site.manifest import Manifest, read_part
+from coview_stream.basemap.site.manifest import OPENED, Manifest, read_part
 from coview_stream.basemap.site.store import (
     TileStore,
     cache_folder,
@@ -29,7 +30,7 @@ from coview_stream.basemap.site.store import (
 )
 from coview_stream.basemap.tiles import Key
 from coview_stream.config import Channel, config_of_map
-from coview_stream.errors import MapError
+from coview_stream.errors import MapError, warn
 
 log = logging.getLogger("coview_stream.maps")
 
@@ -68,7 +69,8 @@ def working_file(
 ) -> Path:
     """Return the working file of a site, or of some tiles, and write it if it does not exist, some seconds a tile.
 
-    Tiles that the earlier working file has are copied. ``progress`` None shows a bar on a terminal.
+    Tiles that the earlier working file has are copied. ``progress`` None shows a bar on a terminal. Of a mirror in a
+    state that no map can be made of, the state that was opened last is used, with a warning.
 
     Raises:
         MapError: no site, a layer is missing or damaged, not signed with the key, or no room in the cache.
@@ -76,6 +78,26 @@ def working_file(
     manifest = Manifest.load(directory)
     if verify_key is not None:
         manifest.check_signature(verify_key, str(directory))
+    if directory.resolve().parent != (cache_folder() / "sites").resolve():
+        return _written(directory, manifest, progress, keys)
+    opened = None
+    with contextlib.suppress(MapError):  # none yet
+        opened = Manifest.load(directory, OPENED)
+    try:
+        path = _written(directory, manifest, progress, keys)
+    except MapError as error:
+        if opened is None or opened == manifest:
+            raise
+        if verify_key is not None:
+            opened.check_signature(verify_key, str(directory))
+        warn(f"{error}; going on with the map that was opened before, manifest {opened.sha256[:12]}")
+        return _written(directory, opened, progress, keys)
+    if opened != manifest:
+        manifest.save(directory, OPENED)
+    return path
+
+
+def _written(directory: Path, manifest: Manifest, progress: bool | None, keys: Collection[Key] | None) -> Path:
     folder, path = cache_folder(), working_path(manifest, keys)
     with lock(path):
         if path.is_file():

@@ -16,7 +16,7 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, read_verify_key
 from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, SiteSource, WebSource, is_site_address
-from coview_stream.basemap.site.manifest import FILE, Around, Manifest, part_file, read_part, tiles_around
+from coview_stream.basemap.site.manifest import FILE, Around, LayerEntry, Manifest, part_file, read_part, tiles_around
 from coview_stream.basemap.site.store import TileStore, layer_path
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
@@ -151,6 +151,27 @@ def test_changed_site_is_fetched_and_what_is_no_longer_named_goes_with_the_next_
     replace(whole, tiles=whole.tiles[2:]).save(place)
     assert mirror.refresh()
     assert not any(TileStore(path).path(sha256).exists() for sha256 in gone)
+
+
+def test_state_that_no_map_can_be_made_of_does_not_replace_the_one_that_was_opened(site, tmp_path):
+    place = shutil.copytree(site, tmp_path / "broken")
+    mirror = Mirror(Directory(place))
+    stations = len(BaseMap.load(mirror.open()))
+    good = Manifest.load(place)
+    store, tile = TileStore(place), good.tiles[0]
+    for content in (b"no layer", b"nor this one", b"nor that one"):  # older states are pruned
+        layer = LayerEntry(store.put(content), len(content))
+        bad = replace(good, tiles=(replace(tile, layers=tile.layers | {"cloud": layer}), *good.tiles[1:]))
+        bad.save(place)
+        assert mirror.refresh()
+    for file in mirror.directory.parent.parent.glob("*.coview"):
+        file.unlink()  # as if evicted
+    with pytest.warns(CoViewWarning, match="is no layer of a tile .* going on with the map that was opened before"):
+        base_map = BaseMap.load(mirror.map_path)
+    assert (len(base_map), base_map.parameters["site"]) == (stations, good.sha256)
+    mirror.source.gone = True
+    with pytest.warns(CoViewWarning, match="going on with"):
+        assert len(BaseMap.load(Mirror(mirror.source).open())) == stations
 
 
 def test_only_tiles_around_a_place_are_fetched(site):
