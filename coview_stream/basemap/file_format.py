@@ -360,7 +360,7 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     low, high = corner - config.block, corner + size + config.block
     for name in ("stations", "points") if points else ("stations",):
         _check_places(name, arrays[name], low, high)
-    if len(field := arrays.get("field.tiles", ())):
+    if (field := arrays.get("field.tiles")) is not None and len(field):
         edge = FIELD_CELL * FIELD_TILE
         first, last = (
             edge * np.asarray(each, dtype=np.float64)[1::-1] for each in (field.min(axis=0), field.max(axis=0))
