@@ -82,7 +82,7 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
 }
 """Type and shape of each array; dimensions of the same name have the same length."""
 _MAX_METRES = 1e7  # of a corner, a station or a point: no map of the Earth is larger
-_MAX_AREA = 5.4e8  # square metres of the rectangle that holds a map: more than kernels count in int32
+MAX_AREA = 5.4e8  # square metres of the rectangle that holds a map: more than kernels count in int32
 _BESIDE = 1300.0  # metres: a tile of a site, which the field may cover beside what has been surveyed
 _ROWS = 1 << 18  # points that are checked at a time
 
@@ -355,8 +355,8 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     corner = arrays["surveyed_corner"]
     if not (np.abs(corner) < _MAX_METRES).all():  # false for NaN as well
         raise _refused("surveyed_corner", f"is not finite, or beyond {_MAX_METRES:g} m")
-    if size.prod() > _MAX_AREA:
-        raise _refused("surveyed", f"covers {size.prod() / 1e6:.0f} km2, {_MAX_AREA / 1e6:.0f} at most")
+    if size.prod() > MAX_AREA:
+        raise _refused("surveyed", f"covers {size.prod() / 1e6:.0f} km2, {MAX_AREA / 1e6:.0f} at most")
     low, high = corner - config.block, corner + size + config.block
     for name in ("stations", "points") if points else ("stations",):
         _check_places(name, arrays[name], low, high)

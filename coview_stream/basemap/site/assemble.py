@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.basemap.file_format import Arrays
+from coview_stream.basemap.file_format import MAX_AREA, Arrays
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, layers_arrays
 from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, map_arrays
 from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.site.array_files import ArrayFiles
-from coview_stream.basemap.site.layers import decode, read_cloud_layer, read_stations_layer
+from coview_stream.basemap.site.layers import decode, most_bytes, read_cloud_layer, read_stations_layer
 from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEntry
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.stations import Described, describe_storeys
@@ -65,6 +65,12 @@ def assemble(
 
     if not sum(entry.stations for entry in entries):
         raise MapError("the site has no stations there; build it again, or ask for other tiles")
+    across, down = (
+        1 + max(numbers) - min(numbers) for numbers in zip(*((e.column, e.row) for e in entries), strict=True)
+    )
+    if across * down * manifest.tile**2 > MAX_AREA:
+        area = across * down * manifest.tile**2 / 1e6
+        raise MapError(f"tiles in a rectangle of {area:.0f} km2, {MAX_AREA / 1e6:.0f} at most: {TOO_LARGE}")
     tiles = SiteTiles(manifest, store, entries, into, step)
     states = tiles.states(manifest)
     arrays, rows = map_arrays(tiles, into, None if earlier is None else earlier(states), step)
@@ -74,7 +80,7 @@ def assemble(
     if learned is None or not all("features" in entry.layers for entry in entries):
         learned = None
     else:
-        layers = [layer_of(entry, "features", store) for entry in entries]
+        layers = [layer_of(entry, "features", store, tiles.grid) for entry in entries]
         try:
             arrays |= {f"learned.{name}": np.concatenate([layer[name] for layer in layers]) for name in _LEARNED}
         except (KeyError, ValueError) as error:
@@ -108,6 +114,7 @@ class SiteTiles:
     Attributes:
         config: settings of the map.
         stations: (M, 3) stations of each tile, relative to the origin.
+        grid: of the site.
     """
 
     def __init__(
@@ -121,7 +128,7 @@ class SiteTiles:
         # MapError where a layer is missing or damaged, or does not match the manifest
         self.config = config_of_map(manifest.parameters["config"])
         self.stations: dict[Key, Floats32] = {}
-        self._grid = SiteGrid(manifest.origin, manifest.tile, self.config)
+        self.grid = SiteGrid(manifest.origin, manifest.tile, self.config)
         self._entries, self._files = entries, into
         self._clouds: dict[Key, str] = {}  # hash
         self._spans: dict[Key, tuple[int, int]] = {}
@@ -129,12 +136,16 @@ class SiteTiles:
         self._index: list[Ints] = []
         for entry in entries:
             self._add(entry, store)
-            stations = read_stations_layer(layer_of(entry, "stations", store), self.config.block)
+            stations = read_stations_layer(layer_of(entry, "stations", store, self.grid), self.config.block)
             if len(stations) != entry.stations:
                 raise MapError(f"tile {entry.column}, {entry.row}: its stations are not those that the manifest counts")
+            low = self.grid.corner((entry.column, entry.row))[:2] - self.config.block
+            high = low + self.grid.tile + 2.0 * self.config.block
+            if not ((stations[:, :2] >= low) & (stations[:, :2] <= high)).all():
+                raise MapError(f"tile {entry.column}, {entry.row}: its stations lie beside it; fetch or build it again")
             self.stations[entry.column, entry.row] = stations
             step()
-        neighbours = {key for own in self._spans for key in self._grid.around(own)} - self._spans.keys()
+        neighbours = {key for own in self._spans for key in self.grid.around(own)} - self._spans.keys()
         for entry in manifest.tiles:
             cloud = entry.layers["cloud"]
             if (entry.column, entry.row) in neighbours and store.holds(cloud.sha256, cloud.bytes):
@@ -162,7 +173,7 @@ class SiteTiles:
         states = {}
         for entry in self._entries:
             key = entry.column, entry.row
-            around = [[*other, self._clouds[other]] for other in self._grid.around(key) if other in self._clouds]
+            around = [[*other, self._clouds[other]] for other in self.grid.around(key) if other in self._clouds]
             text = json.dumps([settings, key, entry.layers["stations"].sha256, around])
             states[key] = hashlib.sha256(text.encode()).hexdigest()[:32]
         return states
@@ -182,10 +193,10 @@ class SiteTiles:
 
     def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
         """Return the likelihood field of a tile; no arrays where nothing is surveyed."""
-        block, tile = self.config.block, self._grid.tile
+        block, tile = self.config.block, self.grid.tile
         first = np.rint(corner / block).astype(np.int64)
-        low = np.rint((self._grid.corner(key)[:2] - _FIELD_MARGIN) / block).astype(np.int64)
-        high = np.rint((self._grid.corner(key)[:2] + tile + _FIELD_MARGIN) / block).astype(np.int64)
+        low = np.rint((self.grid.corner(key)[:2] - _FIELD_MARGIN) / block).astype(np.int64)
+        high = np.rint((self.grid.corner(key)[:2] + tile + _FIELD_MARGIN) / block).astype(np.int64)
         begin = np.clip(low - first, 0, surveyed.shape[::-1])
         end = np.clip(high - first, begin, surveyed.shape[::-1])
         window = surveyed[begin[1] : end[1], begin[0] : end[0]]
@@ -202,10 +213,10 @@ class SiteTiles:
 
     def _around(self, key: Key, margin: float) -> tuple[Points, Int8s]:
         """Return points and packed normals within ``margin`` metres of a tile."""
-        low = self._grid.corner(key)[:2] - margin
-        high = low + self._grid.tile + 2.0 * margin
+        low = self.grid.corner(key)[:2] - margin
+        high = low + self.grid.tile + 2.0 * margin
         clouds = []
-        for other in self._grid.around(key):
+        for other in self.grid.around(key):
             if other in self._spans:
                 points, normals = (self._files.rows(name, *self._spans[other]) for name in ("points", "normals"))
                 near = ((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1)
@@ -214,8 +225,8 @@ class SiteTiles:
 
     def _add(self, entry: TileEntry, store: TileStore) -> None:
         key = entry.column, entry.row
-        cloud = layer_of(entry, "cloud", store)
-        points, packed = read_cloud_layer(cloud, self._grid.corner(key), self._grid.tile, self.config.voxel)
+        cloud = layer_of(entry, "cloud", store, self.grid)
+        points, packed = read_cloud_layer(cloud, self.grid.corner(key), self.grid.tile, self.config.voxel)
         if len(points) != entry.points:
             raise MapError(f"tile {key[0]}, {key[1]}: its cloud is not the one that the manifest counts")
         index = np.zeros((0, 4), dtype=np.int64)
@@ -230,7 +241,8 @@ class SiteTiles:
         self._clouds[key] = entry.layers["cloud"].sha256
 
 
-def layer_of(entry: TileEntry, name: str, store: TileStore) -> Arrays:
-    """Return the arrays of a tile's layer; MapError where it is missing or damaged."""
+def layer_of(entry: TileEntry, name: str, store: TileStore, grid: SiteGrid) -> Arrays:
+    """Return the arrays of a tile's layer; MapError where it is missing, damaged, or larger than the entry says."""
     layer = entry.layers[name]
-    return decode(store.get(layer.sha256, layer.bytes), str(store.path(layer.sha256)))
+    most = most_bytes(name, entry.points, entry.stations, grid.tile, grid.config.voxel)
+    return decode(store.get(layer.sha256, layer.bytes), str(store.path(layer.sha256)), most)

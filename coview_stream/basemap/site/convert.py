@@ -94,7 +94,7 @@ def lighten(source: Path, target: Path, key: SigningKey | None = None, progress:
     voxel, step = grid.config.voxel, 2.0 * grid.config.voxel / STEPS
     for done, entry in enumerate(manifest.tiles, start=1):
         # about the tile's corner, which lies on the cubes
-        points, packed = read_cloud_layer(layer_of(entry, "cloud", store), np.zeros(3), grid.tile, voxel)
+        points, packed = read_cloud_layer(layer_of(entry, "cloud", store, grid), np.zeros(3), grid.tile, voxel)
         chosen = one_of_each_cube(points)
         rounded = ((np.floor(points[chosen].astype(np.float64) / step) + 0.5) * step).astype(np.float32)
         cloud = put_layer(light_store, "cloud", cloud_layer(rounded, *_unpacked(packed[chosen]), grid.tile, voxel))

@@ -43,6 +43,9 @@ _CELLS = 64  # of the octahedral map, along each edge
 _PLANARITY = 15  # steps
 _MAX_LEVEL = 30_000  # voxels above or below zero
 _MAX_COLUMNS = 1 << 24
+_PER_COLUMN = 16  # points of a column of voxels in the mean: nothing is as dense as a wall of 4 m everywhere
+_POINT, _STATION = 10, 12  # bytes of each in the arrays of a layer
+_ROWS = 1 << 18  # points that are unpacked at a time
 Layer = dict[str, npt.NDArray[Any]]
 _MAX_BLOCK = 1 << 26  # blocks from the origin: 100,000 km
 
@@ -68,8 +71,22 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
     return b"".join([_MAGIC, len(header).to_bytes(4, "little"), header, *parts])
 
 
-def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of untrusted bytes of :func:`encode`; MapError, with the layer's ``name``, if they are none."""
+def most_points(tile: float, voxel: float) -> int:
+    """Return the greatest number of points, or stations, that a tile may count."""
+    return _PER_COLUMN * columns_of(tile, voxel) ** 2
+
+
+def most_bytes(layer: str, points: int, stations: int, tile: float, voxel: float) -> int:
+    """Return the bytes that a tile's layer may unpack to."""
+    of = {"cloud": 2 * columns_of(tile, voxel) ** 2 + _POINT * points, "stations": _STATION * stations}
+    return of.get(layer, _MAX_BYTES)
+
+
+def decode(raw: bytes, name: str, most: int = _MAX_BYTES) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays, read-only, of untrusted bytes of :func:`encode`.
+
+    MapError, with the layer's ``name``, if they are none, or unpack to more than ``most`` bytes.
+    """
     try:
         size = int.from_bytes(raw[8:12], "little")
         if raw[:8] != _MAGIC or size > _MAX_HEADER or 12 + size > len(raw):
@@ -84,7 +101,7 @@ def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
                 raise ValueError("a shape is impossible")
             wanted = math.prod(shape) * dtype.itemsize
             total += wanted
-            if total > _MAX_BYTES or at + length > len(raw):
+            if total > min(most, _MAX_BYTES) or at + length > len(raw):
                 raise ValueError("it is too large or cut off")
             content = _unpacked(raw[at : at + length], entry.get("packing", "lzma"), wanted, dtype.itemsize)
             arrays[str(entry["name"])] = content.view(dtype).reshape(shape)
@@ -102,7 +119,7 @@ def _unpacked(part: bytes, packing: object, wanted: int, itemsize: int) -> npt.N
     decoder: bz2.BZ2Decompressor | lzma.LZMADecompressor = bz2.BZ2Decompressor()
     if packing == "lzma":
         decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
-    content = np.frombuffer(bytearray(decoder.decompress(part, max_length=wanted + 1)), dtype=np.uint8)
+    content = np.frombuffer(decoder.decompress(part, max_length=wanted + 1), dtype=np.uint8)
     if len(content) != wanted:
         raise ValueError(f"an array has {len(content)} bytes or more, not {wanted}")
     return content if packing == "bz2" else np.ascontiguousarray(content.reshape(itemsize, -1).T).reshape(-1)
@@ -156,16 +173,21 @@ def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) ->
     level = np.cumsum(levels, dtype=np.int64)
     if int(counts.sum(dtype=np.int64)) != number or (number and np.abs(level).max() > _MAX_LEVEL):
         raise MapError("a tile's cloud does not fit together; fetch or build it again")
-    column = np.repeat(np.arange(across * across), counts.reshape(-1))
-    cell = np.stack([column % across, column // across, level])
-    places = (cell + (inside.astype(np.float64) + 0.5) / STEPS) * voxel
-    points = (places.T + np.asarray(corner, dtype=np.float64)).astype(np.float32)
-    a, b = normals.astype(np.float64).T / (_CELLS - 1) * 2.0 - 1.0
-    x, y = (a + b) * 0.5, (a - b) * 0.5
-    unit = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
-    unit /= np.maximum(np.linalg.norm(unit, axis=1), 1e-9)[:, None]
-    length = np.maximum(planarity.astype(np.float32) * np.float32(127.0 / _PLANARITY), np.float32(8.0))
-    return points, np.rint(unit.astype(np.float32) * length[:, None]).astype(np.int8)
+    columns = np.repeat(np.arange(across * across, dtype=np.int32), counts.reshape(-1))
+    points, packed = np.empty((number, 3), np.float32), np.empty((number, 3), np.int8)
+    for start in range(0, number, _ROWS):
+        part = slice(start, start + _ROWS)
+        column = columns[part]
+        cell = np.stack([column % across, column // across, level[part]])
+        places = (cell + (inside[:, part].astype(np.float64) + 0.5) / STEPS) * voxel
+        points[part] = places.T + np.asarray(corner, dtype=np.float64)
+        a, b = normals[part].astype(np.float64).T / (_CELLS - 1) * 2.0 - 1.0
+        x, y = (a + b) * 0.5, (a - b) * 0.5
+        unit = np.stack([x, y, 1.0 - np.abs(x) - np.abs(y)], axis=1)
+        unit /= np.maximum(np.linalg.norm(unit, axis=1), 1e-9)[:, None]
+        length = np.maximum(planarity[part].astype(np.float32) * np.float32(127.0 / _PLANARITY), np.float32(8.0))
+        packed[part] = np.rint(unit.astype(np.float32) * length[:, None])
+    return points, packed
 
 
 def square_metres(points: Points) -> int:

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.signature import SigningKey, VerifyKey
+from coview_stream.basemap.site.layers import most_points
 from coview_stream.basemap.site.store import SHA256, read_record, write_record
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
@@ -184,10 +185,13 @@ class Manifest:
             if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
                 raise ValueError("tile, crs or parameters are invalid")
             _check_depth(parameters, _MAX_DEPTH)
-            _ = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
+            grid = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
             tiles = tuple(TileEntry.of(entry) for entry in data["tiles"])
             if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
                 raise ValueError("a tile is named twice")
+            most = most_points(tile, grid.config.voxel)
+            if any(max(entry.points, entry.stations) > most for entry in tiles):
+                raise ValueError(f"a tile counts more than {most} points or stations")
             signed = str(data.get("signer", "")), str(data.get("signature", ""))
             manifest = cls(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
             _ = manifest.sha256  # can be written again

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from coview_stream.basemap.file_format import Loaded, open_file, save
+from coview_stream.basemap.file_format import Loaded, check_arrays, open_file, save
 from coview_stream.basemap.map_arrays import EarlierMap
 from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
@@ -104,13 +104,14 @@ def _written(directory: Path, manifest: Manifest, progress: bool | None, keys: C
             write_record(_record_name(directory), path.name)
             return path
 
-        channels = config_of_map(manifest.parameters["config"]).descriptor.channels
-        earlier = partial(_open_earlier, earlier_file(directory), channels)
+        config = config_of_map(manifest.parameters["config"])
+        earlier = partial(_open_earlier, earlier_file(directory), config.descriptor.channels)
         with (
             progress_bar(f"{directory}: made ready for this machine", progress, "step") as step,
             ArrayFiles(folder) as into,
         ):
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
+            check_arrays(arrays, config, points=False)  # points are where their tiles are
             save(path, arrays | field_layers(arrays, into), parameters)
         remember_written(path)
         write_record(_record_name(directory), path.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from coview_stream.basemap.site.layers import (
     cloud_layer,
     decode,
     encode,
+    most_bytes,
     read_cloud_layer,
     read_stations_layer,
     stations_layer,
@@ -141,3 +143,34 @@ def test_stations_come_back_to_the_centimetre():
     assert np.abs(found[:, 2] - stations[order, 2]).max() <= 0.0051
     with pytest.raises(MapError, match="stations"):
         read_stations_layer({"steps": np.zeros((2, 5), dtype=np.int32)}, 2.0)
+
+
+def test_layer_unpacks_to_no_more_than_it_may(packing):
+    size = sum(array.nbytes for array in ARRAYS.values())
+    assert len(decode(encode(ARRAYS, packing), "tile", size)) == len(ARRAYS)
+    with pytest.raises(MapError, match="too large"):
+        decode(encode(ARRAYS, packing), "tile", size - 1)
+    zeros = encode({"levels": np.zeros(1 << 22, dtype=np.int32)}, "bz2")  # 17 MB of a few bytes
+    tracemalloc.start()
+    with pytest.raises(MapError, match="too large"):
+        decode(zeros, "tile", most_bytes("cloud", 1000, 10, 20.0, 0.25))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
+def test_cloud_is_unpacked_in_little_more_memory_than_it_takes():
+    number, across = 1 << 20, 64
+    layer = {
+        "counts": np.full((across, across), number // across**2, dtype=np.uint16),
+        "levels": np.zeros(number, dtype=np.int32),
+        "inside": np.zeros((3, number), dtype=np.uint8),
+        "normals": np.zeros((number, 2), dtype=np.uint8),
+        "planarity": np.zeros(number, dtype=np.uint8),
+    }
+    tracemalloc.start()
+    points, _ = read_cloud_layer(layer, np.zeros(3), 16.0, 0.25)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(points) == number
+    assert peak < 80 * number  # was 190: 15 are the result

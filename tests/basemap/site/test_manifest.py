@@ -45,6 +45,7 @@ def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
         (("tiles", 0, "layers", "other"), {"sha256": SHA, "bytes": 1}), (("tiles",), None), (("parameters",), []),
         (("tiles", 0, "low"), 1e300), (("crs",), 4), (("tile",), 300.0), (("parameters",), {}),
         (("parameters", "config"), {"block": 2.0}), (("parameters", "config", "block"), "2"),
+        (("tiles", 0, "points"), 30_000_000), (("tiles", 0, "stations"), 30_000_000),
         (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
     ],
 )  # fmt: skip

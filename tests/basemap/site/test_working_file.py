@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS
-from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.layers import encode
+from coview_stream.basemap.site.manifest import LayerEntry, Manifest
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import earlier_file, working_file
+from coview_stream.errors import MapError
 
 
 @pytest.fixture
@@ -99,3 +104,27 @@ def test_damaged_or_foreign_file_is_as_good_as_none(site, cache, taken):
     assert earlier_file(site) != first
     next((cache / "parts").glob("*.last")).write_text('"../../elsewhere.coview"')
     assert earlier_file(site) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "flaw"),
+    [
+        (lambda tile, put: replace(tile, column=1 << 20), r"tiles in a rectangle of \d+ km2, 540 at most"),
+        (lambda tile, put: replace(tile, column=tile.column + 5), "its stations lie beside it"),
+        (lambda tile, put: with_layer(tile, put, "stations", np.full((3, tile.stations), 999, "<i4")), "beside it"),
+        (lambda tile, put: with_layer(tile, put, "stations", np.zeros((3, 10**6), "<i4")), "too large"),
+    ],
+)
+def test_tiles_that_would_need_more_memory_than_their_site_are_refused(site, cache, tmp_path, change, flaw):
+    place = shutil.copytree(site, tmp_path / "copy")
+    manifest = Manifest.load(place)
+    tile = change(manifest.tiles[0], TileStore(place).put)
+    replace(manifest, tiles=(tile, *manifest.tiles[1:])).save(place)
+    with pytest.raises(MapError, match=flaw):
+        working_file(place)
+
+
+def with_layer(tile, put, name, steps):
+    content = encode({"steps": steps})
+    return replace(tile, layers=tile.layers | {name: LayerEntry(put(content), len(content))})
