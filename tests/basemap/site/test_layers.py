@@ -145,6 +145,7 @@ def test_stations_come_back_to_the_centimetre():
         read_stations_layer({"steps": np.zeros((2, 5), dtype=np.int32)}, 2.0)
 
 
+@pytest.mark.slow
 def test_layer_unpacks_to_no_more_than_it_may(packing):
     size = sum(array.nbytes for array in ARRAYS.values())
     assert len(decode(encode(ARRAYS, packing), "tile", size)) == len(ARRAYS)
@@ -159,6 +160,7 @@ def test_layer_unpacks_to_no_more_than_it_may(packing):
     assert peak < 1 << 20
 
 
+@pytest.mark.slow
 def test_cloud_is_unpacked_in_little_more_memory_than_it_takes():
     number, across = 1 << 20, 64
     layer = {
