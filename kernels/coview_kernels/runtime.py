@@ -25,6 +25,7 @@ import importlib
 import importlib.util
 import os
 import shutil
+import stat
 import sys
 import tempfile
 import threading
@@ -89,7 +90,7 @@ def _import(name: str) -> ModuleType:
     if os.name == "posix" and not os.environ.get("HOME"):  # as in a service: Taichi would end the process
         os.environ.pop("HOME", None)  # an empty one would hide the password database's
         home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
-        os.environ["HOME"] = home if os.access(home, os.W_OK) else tempfile.gettempdir()
+        os.environ["HOME"] = home if os.access(home, os.W_OK) else str(_folder_for_this_process())
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
     os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # else Taichi asks over the network, once a day
@@ -126,23 +127,60 @@ def _cache_folder(library: Any) -> Path:
     """Return the folder of compiled kernels: quadrants' own, as one finds a kernel by its source (see :func:`kernel`).
 
     That hash knows the functions of a kernel but not the constants that these use, so all our sources name the folder.
+    Its native code is loaded as it is: where others may write, all is compiled anew in a folder of this process.
     """
-    own = library.lang.impl.default_cfg().offline_cache_file_path
-    if library.__name__ != "quadrants":
-        return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or own)
-    warnings.filterwarnings("ignore", message=r"\[PURE\.VIOLATION\]", category=UserWarning)  # of those constants
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    folder = Path(os.environ.get("QD_OFFLINE_CACHE_FILE_PATH") or own) / f"coview-{digest.hexdigest()[:16]}"
+    quadrants = library.__name__ == "quadrants"
+    named = os.environ.get(f"{'QD' if quadrants else 'TI'}_OFFLINE_CACHE_FILE_PATH")
+    folder = Path(named or library.lang.impl.default_cfg().offline_cache_file_path).absolute()
+    if quadrants:
+        warnings.filterwarnings("ignore", message=r"\[PURE\.VIOLATION\]", category=UserWarning)  # of those constants
+        digest = hashlib.sha256()
+        for path in sorted(Path(__file__).parent.rglob("*.py")):
+            digest.update(path.read_bytes())
+        folder /= f"coview-{digest.hexdigest()[:16]}"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for each in (*reversed(folder.parents), folder):
+            if not each.exists():
+                each.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(1 << 16))
     except OSError:  # a full disk, or one that only reads: quadrants would raise
-        folder = Path(tempfile.mkdtemp(prefix="coview-kernels."))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return _folder_for_this_process()
+    return folder if is_private(folder) else _folder_for_this_process()
+
+
+def _folder_for_this_process() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="coview-kernels."))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+def is_private(folder: Path) -> bool:
+    """Tell whether this user, or root, alone may put files into a folder, or another folder into its place."""
+    if os.name != "posix":
+        return True
+    folder = folder.resolve()
+    for each in (folder, *folder.parents):
+        status = each.stat()
+        if status.st_uid not in (0, os.geteuid()):
+            return False
+        if each != folder and status.st_mode & stat.S_ISVTX and status.st_uid == 0:
+            continue  # as /tmp: only owners rename there
+        if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_own_group(status.st_gid)):
+            return False
+    return True
+
+
+def _is_own_group(number: int) -> bool:
+    """Tell whether a group is of this user alone, as on systems where files have mode 664."""
+    import grp
+    import pwd
+
+    try:
+        group, name = grp.getgrgid(number), pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return False
+    return group.gr_name == name and not set(group.gr_mem) - {name}
 
 
 def kernel(function: Callable[..., Any]) -> Any:

@@ -54,10 +54,14 @@ def test_environment_without_home(known, tmp_path):
         begin += f"pwd.getpwuid = lambda user: {home}\n"
     else:
         begin += "def unknown(user): raise KeyError(user)\npwd.getpwuid = unknown\n"
-    said = succeeds(begin + "use(); print(ck.backend(), os.environ['HOME'])", TMPDIR=str(tmp_path / ".."))
+    said = succeeds(begin + "use(); print(ck.backend(), os.environ['HOME'])", TMPDIR=str(tmp_path))
     name, home = said.split()
     assert name in LIBRARIES
-    assert Path(home).samefile(tmp_path if known else tmp_path.parent)
+    if known:
+        assert Path(home).samefile(tmp_path)
+    else:  # a folder of this process alone, not /tmp, where others may have put compiled kernels
+        assert Path(home).parent.samefile(tmp_path)
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_only_runtime_imports_taichi():
@@ -268,3 +272,39 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path):
     done = run_python(USE + "use()", TMPDIR=str(tmp_path), **environment)
     assert (done.returncode, done.stderr) == (0, "")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.slow
+@needs_library
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX")
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_compiled_kernels_are_kept_only_where_this_user_alone_may_write(name, tmp_path):
+    shared, own = tmp_path / "shared", tmp_path / "own"
+    shared.mkdir()
+    shared.chmod(0o777)
+    variable = {"quadrants": "QD", "taichi": "TI"}[name] + "_OFFLINE_CACHE_FILE_PATH"
+    for folder in (shared, shared / "below", own):
+        succeeds("use()", COVIEW_KERNELS=name, TMPDIR=str(tmp_path), **{variable: str(folder)})
+    assert [path for path in shared.rglob("*") if path.is_file()] == []
+    assert [path for path in own.rglob("*") if path.is_file()] != []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX")
+def test_folderis_private_unless_others_may_write_it_or_exchange_it(tmp_path):
+    deep = tmp_path / "a" / "b"
+    deep.mkdir(parents=True)
+    assert runtime.is_private(deep)
+    for each in (deep, deep.parent):
+        each.chmod(0o777)
+        assert not runtime.is_private(deep)
+        each.chmod(0o755)
+    deep.parent.chmod(0o1777)
+    assert runtime.is_private(deep) == (os.geteuid() == 0)  # as in /tmp, which is root's
+    deep.parent.chmod(0o755)
+    (tmp_path / "link").symlink_to(deep)
+    deep.chmod(0o757)
+    assert not runtime.is_private(tmp_path / "link")
+    if os.geteuid() == 0:
+        deep.chmod(0o755)
+        os.chown(deep.parent, 12345, -1)
+        assert not runtime.is_private(deep)
