@@ -74,6 +74,7 @@ class NodeHealth:
             "uptime_s": round(now - node.started, 1),
             "live": {"ok": not live, "reasons": live},
             "ready": {"ok": not (live or ready), "reasons": live + ready},
+            "faults": dict(node.faults),
             "map": {"sha256": node.map_sha256, "reload": dict(node.reloader.last) if node.reloader else None}
             | ({"source": dict(self._follower.last)} if self._follower else {}),
             "memory_bytes": _memory(os.getpid()),

@@ -24,7 +24,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
-from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.error_guard import RateLimitedErrors, printable
 from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Transport
 
@@ -34,6 +34,8 @@ _MAX_POSE_TICKS = 200.0  # of the pose clock, per second
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish their work
 _MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map while the new one has not verified its place
+_AGAIN = 0.5  # seconds from an exception of a service to its next begin
+_MAX_FAULT = 200  # characters
 _STEP = 0.02  # seconds between two looks at a change of the map
 _RELOADS_APART = 1.0  # seconds from the begin of a change to that of the next, however often it is asked for
 _LINES_APART = 60.0  # seconds between two equal lines about changes
@@ -93,6 +95,7 @@ class Node:
         self._errors = RateLimitedErrors(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
+        self.faults: dict[str, str] = {}  # newest exception of each service that was begun again after one
         self._ending: threading.Thread | None = None
         self.reporter = Reporter(self.sessions, transport, self._errors, self.identity)
         # of the map, and of one that is to follow it
@@ -115,9 +118,19 @@ class Node:
         if self.reloader is not None:
             running["reload"] = self.reloader.run
         for name, run in running.items():
-            thread = threading.Thread(target=run, name=f"coview-{name}", args=(self._stopping,), daemon=True)
+            thread = threading.Thread(target=self._keep_running, name=f"coview-{name}", args=(name, run), daemon=True)
             thread.start()
             self._threads.append(thread)  # now, for one that has not started counts as one that has ended
+
+    def _keep_running(self, name: str, run: Service) -> None:
+        """Run a service, again after any exception: it is logged, shown in :attr:`faults`, and ends no thread."""
+        while not self._stopping.is_set():
+            with self._errors.catch(name) as caught:
+                run(self._stopping)
+            if caught.error is None:
+                return
+            self.faults[name] = printable(repr(caught.error))[:_MAX_FAULT]
+            self._stopping.wait(_AGAIN)
 
     def declare(self) -> None:
         """Declare publishers, subscriptions, queryables and liveliness tokens of all robots."""

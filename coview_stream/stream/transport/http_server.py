@@ -185,8 +185,13 @@ class _Server(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve on a thread, or hang up where too many connections are open."""
-        if self._free[is_loopback(str(client_address[0]))].acquire(blocking=False):
-            super().process_request(request, client_address)
+        free = self._free[is_loopback(str(client_address[0]))]
+        if free.acquire(blocking=False):
+            try:
+                super().process_request(request, client_address)
+            except BaseException:  # no thread can be started
+                free.release()
+                raise
         else:
             self.shutdown_request(request)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from types import SimpleNamespace
 
@@ -18,6 +19,40 @@ from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.engine_process import DiedError
 from coview_stream.stream.node.engine_queue import FrameResult
+from coview_stream.stream.node.health import NodeHealth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [ValueError("a\x1b[2J"), RecursionError("deep"), MemoryError(), LookupError("utf")])
+def test_service_goes_on_after_any_exception_which_health_shows(error):
+    site, calls = Site("r1"), []
+
+    def service(stopping):
+        calls.append(1)
+        if len(calls) < 3:
+            raise error
+        stopping.wait()
+
+    site.node.start({"map source": service})
+    try:
+        until(lambda: len(calls) == 3)
+        document = NodeHealth(site.node).document()
+        assert document["live"] == {"ok": True, "reasons": []}
+        assert type(error).__name__ in document["faults"]["map source"]
+        assert document["faults"]["map source"].isprintable()
+    finally:
+        site.node.close(5.0)
+
+
+def test_statuses_of_strangers_silence_no_robot(site):
+    claims = {"id": "0", "period_s": 60.0, "term": 1e9, "ending": False, "host": "elsewhere"}
+    stranger = {"robot": "r1", "state": "TRACKING", "stamp_ns": 2**62, "node": claims}
+    for k in range(5):
+        site.net.publish(Sample("coview/r1/out/status", json.dumps(stranger).encode(), "application/json"))
+        site.frame("r1", STEP * k)
+        assert len(site.poses("r1")) == k + 1
+    assert site.status("r1")["state"] == "TRACKING"
+    assert NodeHealth(site.node).document()["ready"]["ok"]
 
 
 def test_failures_of_one_robot_do_not_affect_others(pair):
