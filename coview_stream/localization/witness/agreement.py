@@ -52,6 +52,7 @@ class Step:
     fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
     apart: bool = False  # the clouds fit each other much less than usual
     copied: bool = False  # the clouds are the same bytes
+    same: float | None = None  # share of points that stand where they stood, if the clouds hardly moved
     unsure: Floats | None = None  # (2, L) seconds^2 by which odometry at these poses misses accelerations in holes
     stamps: StepStamps | None = None  # of the clouds
     start: Floats | None = None  # (3,) from which the clouds' registration began beside odometry's motion

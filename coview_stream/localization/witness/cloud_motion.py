@@ -11,12 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.errors import InputError
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.planar import planar_covariance, planar_motion
 from coview_stream.geometry.transforms import Pose, Poses, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
@@ -40,6 +41,8 @@ _STARTS = 2  # registered of those, the best
 ALIKE = 0.03
 """Difference of fits that counting so many points does not resolve (one sigma)."""
 _STAYS = 0.06  # metres: three sigmas of a motion
+_NEAR_ZERO = 0.3  # metres and radians of a motion that a copy may show
+_SAME = 0.05  # metres within which a lidar's noise leaves a point of a copy
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
 
 
@@ -51,6 +54,7 @@ class CloudMotion(NamedTuple):
     fit: float  # share of the structure that lies on the earlier surfaces
     usual: float  # the same, of the motions before
     T: Pose | None  # (4, 4) in the axes of the earlier body; None where none can be registered
+    same: float | None = None  # share of the structure's points that stand where they stood, of a motion near zero
 
 
 class CloudMotionMeter:
@@ -100,7 +104,12 @@ class CloudMotionMeter:
         self._usual = usual + _LEARNS * (best[2] - usual)
         T_now = pose_from(best[0][:3, :3] @ now.T_odom_body[:3, :3], before.position + best[0][:3, 3])
         motion, covariance = _in_plane(T_now, best[1], before.T_odom_body)
-        return CloudMotion(motion, covariance, best[2], usual, inverse(before.T_odom_body) @ T_now)
+        same: float | None = None
+        if float(np.abs(motion).max()) < _NEAR_ZERO:
+            rows = _some_structure(scan)
+            points = before.levelled(calibration) - before.position.astype(np.float32)
+            same = float((cKDTree(points).query(transform(none, scan.points[rows]))[0] < _SAME).mean())
+        return CloudMotion(motion, covariance, best[2], usual, inverse(before.T_odom_body) @ T_now, same)
 
     def _registered(
         self, scan: RegistrationCloud, target: LocalMap, T_start: Pose
@@ -121,14 +130,20 @@ class CloudMotionMeter:
 
 def fit_of(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float = _ON_SURFACE) -> float:
     """Return the share of the scan's structure that lies on the target's surfaces at a pose; 0 of none."""
-    rows = np.flatnonzero(scan.above)
+    rows = _some_structure(scan)
     if not len(rows):
         return 0.0
-    points = transform(T, scan.points[rows[:: max(1, len(rows) // _SAMPLE)]])
+    points = transform(T, scan.points[rows])
     distance, nearest = kernels.nearest(target.grid, points, _REACH)
     seen = distance < _REACH
     gaps = points[seen] - target.points[nearest[seen]]
     return float((np.abs((gaps * target.normals[nearest[seen]]).sum(axis=1)) < across).sum() / len(points))
+
+
+def _some_structure(scan: RegistrationCloud) -> Ints:
+    """Return rows of about 300 points of a scan's structure."""
+    rows = np.flatnonzero(scan.above)
+    return rows[:: max(1, len(rows) // _SAMPLE)]
 
 
 def _starts(odometry: Pose) -> Poses:

@@ -66,6 +66,9 @@ _SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
 )
 _INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleration of a body, metres and radians per s^2
 _COPY = 1e-6  # probability that another cloud has the same bytes
+# points of a copy with noise stand where they stood, 0.9 of them, on a town, a campus and two real runs; of clouds that
+# moved on 0.01, also where rings or a corridor draw their registration to no motion. Neighbours err alike
+_SAME_POINTS, _SAME_BY_CHANCE, _INDEPENDENT = 0.8, 0.05, 10.0
 _CHANGES = (  # sigmas of C: a mount gives way, a frame of another origin, one of other axes
     np.array([0.1, 0.1, math.radians(10.0)]),
     np.array([3.0, 3.0, math.radians(3.0)]),
@@ -205,7 +208,7 @@ class FaultPosterior:
         smoother = self._smoother(step)
         slips = smoother * sum(share * float(like(o, noise + spread)) for share, spread in kinds)
         stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
-        copy = like(o) if stands else like(np.zeros(3)) / (_COPY if step.copied else 1.0)
+        copy = like(o) if stands else like(np.zeros(3)) * _copy_odds(step)
 
         # faults that come from a good state or a slip, stay and go
         farther = (
@@ -393,6 +396,15 @@ _LONGER_OF = np.arange(len(LAGS))[None] - np.arange(len(LAGS))[:, None] + len(LA
 
 def _scale_density(scale: float) -> float:
     return math.exp(-0.5 * ((scale - 1.0) / _SCALES) ** 2) / (_SCALES * math.sqrt(2.0 * math.pi))
+
+
+def _copy_odds(step: Step) -> float:
+    """Return how much more probable the points of a step's clouds are if they are copies of each other."""
+    if step.copied or step.same is None:
+        return 1.0 / _COPY if step.copied else 1.0
+    share = step.same * math.log(_SAME_POINTS / _SAME_BY_CHANCE)
+    share += (1.0 - step.same) * math.log((1.0 - _SAME_POINTS) / (1.0 - _SAME_BY_CHANCE))
+    return math.exp(_INDEPENDENT * share)
 
 
 def _grid_spread(o: Floats, dt: float) -> Floats:

@@ -257,6 +257,7 @@ class Witness:
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
             fails=fails, apart=misfit > _APART, copied=now.copied, parts=parts,
+            same=None if seen is None else seen.same,
             unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), stamps=stamps,
             start=guess, tilting=self._tilting,
         )  # fmt: skip
