@@ -26,7 +26,7 @@ def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0
     tree = cKDTree(points)
     blocks = (points[i : i + _BLOCK] for i in range(0, len(points), _BLOCK))
     mean = np.concatenate([tree.query(block, neighbours, workers=-1)[0].mean(axis=1) for block in blocks])
-    mask = np.asarray(mean < mean.mean() + std_ratio * mean.std(ddof=1))
+    mask = np.asarray(mean <= mean.mean() + std_ratio * mean.std(ddof=1))
     return points[mask], mask
 
 

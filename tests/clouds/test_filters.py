@@ -25,6 +25,11 @@ def test_outliers_are_removed_and_plane_is_kept() -> None:
     assert mask[:4000].mean() > 0.99
 
 
+def test_points_that_are_all_as_far_apart_are_kept() -> None:
+    points = np.zeros((30, 3), dtype=np.float32)
+    assert len(remove_outliers(points)[0]) == 30
+
+
 @pytest.mark.parametrize("count", [0, 1, 20])
 def test_too_few_points_for_outliers_are_kept(count: int) -> None:
     kept, mask = remove_outliers(np.zeros((count, 3), np.float32))

@@ -40,7 +40,7 @@ HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 
 """Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
 _RANGES = {
     **dict.fromkeys(("roll", "pitch"), math.radians(45.0)), "heading": math.pi,
-    "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 0.95, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
+    "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 3.0, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
     **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "ground", "changed"), MAX_LEVER),
     **dict.fromkeys(("delay", "stated_delay", "sigma_delay"), 2.0 * MAX_DELAY),
 }  # fmt: skip
@@ -199,8 +199,8 @@ class Calibration:
         if abs(self.delay - self.stated_delay) >= max(_LATE, _TOLD * self.sigma_delay):
             late, early = ("clouds are", "odometry") if self.delay > 0 else ("odometry is", "clouds")
             size = f"{abs(self.delay):.3f} +- {self.sigma_delay:.3f} s"
-            stated = f"set --cloud-delay={self.delay:.2f} to silence this"
-            clauses.append(f"{late} {size} later than {early}: corrected; {stated}")
+            stated = f"; set --cloud-delay={self.delay:.2f} to silence this" if abs(self.delay) <= MAX_DELAY else ""
+            clauses.append(f"{late} {size} later than {early}: corrected{stated}")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"
             clauses.append(f"odometry measures {abs(self.scale):.1%} too {size}: corrected")

@@ -278,6 +278,10 @@ class FaultPosterior:
         longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing: neither gains nor loses
         steady[-1] += longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         total = others + longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
+        self._before = None
+        if step.clouds is not None:
+            self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
+        self._speed = np.abs(o) / dt + [0.0, 0.0, step.tilting]
         if not (math.isfinite(total) and total > 0.0):
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
@@ -292,10 +296,6 @@ class FaultPosterior:
             metres = float(np.linalg.norm(step.clouds.motion[:2]))
             moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still: they agree
             self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
-        self._speed = np.abs(o) / dt + [0.0, 0.0, step.tilting]
-        self._before = None
-        if step.clouds is not None:
-            self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
 
     def corrected(self, D: Floats, delay: float, factor: float = 1.0) -> None:
         """Follow a calibration that has turned and shifted clouds by ``D`` (3,) and now takes them for later.

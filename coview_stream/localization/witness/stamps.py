@@ -15,6 +15,7 @@ from coview_stream.geometry.arrays import Floats
 
 _RATE = 0.01  # share by which a lidar's turns differ: spinning ones hold their rate to a per cent
 _PARTS = np.arange(1.0, 11.0)  # turns between two frames, at most ten: a frame a second of a lidar of 10 Hz
+_FASTEST = 0.02  # seconds: no lidar turns faster, drivers that send parts of a turn do
 _SHORT = 0.1  # quantile of the distances that is a short one: shorter ones may be jitter
 _BEYOND = 1.5  # times the usual distance: a frame at least is missing
 _FEWEST = 50.0  # distances that an unseen share of them counts as: no rarer event is known at first
@@ -81,7 +82,7 @@ def step_stamps(stamps: Floats, begin: float, end: float) -> StepStamps:
 
 def _period(seconds: Floats) -> tuple[float, float]:
     """Return the period of which distances (N,) are multiples, and the sigma of one from a multiple, seconds."""
-    periods = float(np.quantile(seconds, _SHORT)) / _PARTS
+    periods = max(float(np.quantile(seconds, _SHORT)) / _PARTS[0], _FASTEST) / _PARTS
     turns = np.maximum(np.round(seconds / periods[:, None]), 1.0)
     periods = np.median(seconds / turns, axis=1)
     off = np.median(np.abs(seconds - turns * periods[:, None]), axis=1)

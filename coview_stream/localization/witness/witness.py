@@ -43,6 +43,7 @@ _SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
 _FAR = 5.0  # metres
 _MANY = 5  # frames of a step, which one more makes hardly longer
 _RECENT = 3  # frames of odometry of which the velocities are taken
+_SHORT = 0.05  # seconds: stamps nearer to each other are of one moment
 _HISTORY = 600  # frames of odometry
 _HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
 _APART = 2.0  # times worse than usual: clouds do not fit each other
@@ -101,12 +102,13 @@ class Witness:
 
     def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
         """Add a frame: its cloud (N, 3) as it came (its array may be filled anew), scan, and odometry (4, 4)."""
-        calibration = self._estimator.calibration
+        calibration = self._calibration  # the path is resized when a newer one is followed
         pose = np.zeros(3)
         if self._odometry is not None:
-            if stamp > self._path[-1][0]:
+            seconds = stamp - self._path[-1][0]
+            if seconds > 0.0:
                 tilted = float(np.arccos(np.clip(self._odometry[2, :3] @ T_odom_raw[2, :3], -1.0, 1.0)))
-                self._tilting += (tilted / (stamp - self._path[-1][0]) - self._tilting) / _RECENT
+                self._tilting += (tilted / max(seconds, _SHORT) - self._tilting) / _RECENT
             step = planar_motion(self._odometry, T_odom_raw)
             step[:2] *= 1.0 + calibration.scale
             step[2] += calibration.turn * float(np.linalg.norm(step[:2]))

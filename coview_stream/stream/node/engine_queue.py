@@ -334,6 +334,9 @@ class EngineQueue:
         if request.epoch != self._search_epoch:
             self._search_epoch, self._requested_at = request.epoch, None
             self._searches = self._support = 0
+        waiting = self._request
+        if waiting is not None and waiting.epoch == request.epoch and not request.earlier:
+            request = replace(request, earlier=waiting.earlier)  # keyframes of before the search began anew
         self._request = request
         self._requested_at = now if self._requested_at is None else self._requested_at
 

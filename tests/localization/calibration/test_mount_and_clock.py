@@ -154,6 +154,19 @@ def test_stated_delay_is_the_prior_and_is_not_remarked():
     assert own.delay == own.stated_delay == 0.0
 
 
+def test_stated_delay_replaces_one_that_was_learnt_before_it_was_stated():
+    earlier = Drive(WINDING, 0.1).learnt().calibration
+    for stated, known in ((0.0, 0.1), (0.5, 0.5)):
+        estimator = CalibrationEstimator(cloud_delay=stated)
+        estimator.learn(earlier.doubted())
+        assert estimator.calibration.delay == pytest.approx(known, abs=0.01)
+
+
+def test_delay_that_cannot_be_stated_is_not_to_be_set():
+    (clause,) = Calibration(delay=1.3, sigma_delay=0.01).describe()
+    assert clause.endswith("corrected")
+
+
 def test_stated_delay_that_is_wrong_is_found_out():
     estimator = Drive(WINDING, 0.2).learnt(stated=-0.1)
     assert estimator.calibration.delay == pytest.approx(0.2, abs=0.005)

@@ -22,6 +22,11 @@ def test_period_is_found_where_frames_are_left_out():
     assert stamps([0.5], usual).period == pytest.approx(0.1, rel=0.01)
 
 
+def test_parts_of_a_turn_that_come_together_are_no_turns():
+    usual = np.tile([1e-4, 0.2], 50)
+    assert stamps([0.2], usual).period > 0.001
+
+
 @pytest.mark.parametrize("usual", [np.full(100, 0.1), 0.1 * RNG.integers(3, 8, 100)])
 def test_stretched_distances_are_of_a_lag_that_grows(usual):
     seen = stamps(1.1 * usual[-6:], usual)

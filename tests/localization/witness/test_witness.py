@@ -77,15 +77,29 @@ class Steps(FaultPosterior):
         self.steps.append(step)
 
 
-def compared(clouds):
-    """Return the steps that a witness compares: a cloud each metre and second, with too few points to register."""
-    witness, drift = Witness(RegistrationConfig(), CalibrationEstimator()), Drift.of(TrackingConfig())
+def compared(clouds, scaled_at=None):
+    """Return the steps that a witness compares: a cloud each metre and second, with too few points to register.
+
+    At one of them it becomes known that odometry measures half of the way.
+    """
+    estimator, drift = CalibrationEstimator(), Drift.of(TrackingConfig())
+    witness = Witness(RegistrationConfig(), estimator)
     witness.faults = Steps()
     for k, cloud in enumerate(clouds):
+        if k == scaled_at:
+            estimator.rescale(2.0, 0.01)
         T = pose_from(np.eye(3), [float(k), 0.0, 0.0])
         witness.add(float(k), cloud, RawScan(np.zeros((1, 3), dtype=np.float32), T), T)
         witness.while_searching(drift)
     return witness.faults.steps
+
+
+@pytest.mark.parametrize("scaled_at", [0, 3])
+def test_scale_of_odometry_is_applied_once(scaled_at):
+    steps = compared([np.full((20, 3), k, dtype=np.float32) for k in range(6)], scaled_at)
+    driven = [step.odometry.motion[0] for step in steps]
+    metre = 2.0 if scaled_at == 0 else 1.0  # seen until then
+    assert driven[1:-1] == pytest.approx([metre if k < scaled_at else 2.0 for k in range(2, len(driven))], rel=0.01)
 
 
 def test_clouds_in_an_array_that_is_filled_anew_are_no_copies():
