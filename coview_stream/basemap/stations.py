@@ -289,8 +289,8 @@ def rasterise(
     width, height = (np.floor((far - corner) / cell).astype(int) + 1 + margin).tolist()
     flat = row * width + column
     # one sort by (cell, level) gives the voxels; the last point of a sorted cell is not its highest, hence maximum
-    level -= level.min()
-    _, first = np.unique(flat * (int(level.max()) + 1) + level, return_index=True)
+    level -= level.min(initial=np.iinfo(level.dtype).max)  # there may be no point
+    _, first = np.unique(flat * (int(level.max(initial=0)) + 1) + level, return_index=True)
     size = height * width
     count = np.bincount(flat[first], minlength=size)
     top = np.full(size, -np.inf, dtype=np.float32)

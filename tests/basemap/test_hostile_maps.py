@@ -111,6 +111,15 @@ def test_empty_stretches_are_none_twice(small: Any, tmp_path: Path) -> None:
     assert len(BaseMap.load(tmp_path / "a.coview").points) == len(small[0]["points"])
 
 
+def test_stations_of_storeys_without_points_are_described_as_empty(small: Any, tmp_path: Path) -> None:
+    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
+    arrays["stations"] = arrays["stations"].copy()
+    arrays["stations"][1:, :2], arrays["stations"][:, 2] = arrays["stations"][:1, :2], 900.0
+    arrays["stations"][0, 2] = -900.0
+    file_format.save(tmp_path / "a.coview", arrays, small[1])
+    assert np.isfinite(BaseMap.load(tmp_path / "a.coview").descriptors("coview")).all()
+
+
 def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path) -> None:
     arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
     arrays["stations"] = np.repeat(arrays["stations"][:1], 200, axis=0)
