@@ -127,7 +127,11 @@ def stamps_finding(run: Run) -> Finding:
 
 
 def seen_frames(run: Run) -> list[SeenFrame]:
-    """Read frames about a metre apart, in a few stretches of a long run, without damaged ones."""
+    """Read frames about a metre apart, in a few stretches of a long run, without damaged ones.
+
+    Raises:
+        CloudError: none of them can be read.
+    """
     steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
     step = float(np.median(steps)) if len(steps) else 0.0
     stride = _STANDING_STRIDE if len(run) > 2 * _FRAMES else 1
@@ -138,13 +142,16 @@ def seen_frames(run: Run) -> list[SeenFrame]:
         window = _FRAMES // _WINDOWS
         begins = np.linspace(0, len(indices) - window, _WINDOWS).astype(int)
         indices = indices[np.unique((begins[:, None] + np.arange(window)).ravel())]
-    frames = []
+    frames, damage = [], None
     for index in indices:
         try:
             frame = run.read(int(index))
-        except CloudError:
+        except CloudError as error:
+            damage = damage or error
             continue
         frames.append(SeenFrame(frame.stamp, frame.points, frame.T_odom_body))
+    if not frames and damage is not None:
+        raise damage
     return frames
 
 

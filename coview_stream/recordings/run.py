@@ -144,7 +144,7 @@ class Run:
         if len(self) > 1 and cloud.origin.any():
             raise CloudError(
                 f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
-                "write frames relative to the sensor"
+                "write frames relative to the sensor, in metres"
             )
         points = cloud.points
         if self.mount is not None and self.source is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from nightly import nightly
 from coview_stream.config.mount import parse_mount
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.map_checks import seen_frames
+from coview_stream.errors import CloudError
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
 from coview_stream.localization.witness.conventions import RIVALS
 from coview_stream.recordings.open_run import open_run
@@ -105,6 +107,14 @@ def test_remedy_of_an_upside_down_lidar_is_its_mount(frames):
     for f in frames[:3]:
         back = mount.to_body(spoil(f).points)
         assert np.linalg.norm(back - f.points, axis=1).max() < 0.1 * np.linalg.norm(f.points, axis=1).max()
+
+
+def test_run_of_which_no_frame_can_be_read_is_not_ok(world_drive, tmp_path):
+    """Millimetres: beyond what a body frame holds."""
+    drive = replace(world_drive, clouds=[1000.0 * cloud + 5000.0 for cloud in world_drive.clouds])
+    run = open_run(small_world.write_run(tmp_path / "run", drive, 3))
+    with pytest.raises(CloudError, match=r"in metres"):
+        seen_frames(run)
 
 
 @pytest.fixture(scope="module")

@@ -98,14 +98,12 @@ def test_demand_lasts_from_the_first_keyframe_that_waits_to_its_search(queue):
     assert queue.longest_search_wait == pytest.approx(2.5)
 
 
-def test_request_that_replaces_a_waiting_one_keeps_the_keyframes_that_the_search_goes_on_with(queue):
-    first = replace(search_request(0.0), epoch=(queue.epoch, 2), earlier=("a keyframe",))
-    queue.put_search_request(first, NOW)
-    queue.ask(0.1, restart=2)
-    assert queue.take_search_request().request.earlier == first.earlier
-    queue.put_search_request(first, NOW)
-    queue.ask(0.1, restart=3)
-    assert queue.take_search_request().request.earlier == ()
+@pytest.mark.parametrize(("restart", "earlier"), [(2, ("a keyframe",)), (3, ())])
+def test_request_that_replaces_a_waiting_one_goes_on_with_its_keyframes(queue, restart, earlier):
+    waits = replace(search_request(0.0), epoch=(queue.epoch, 2), earlier=("a keyframe",))
+    queue.put_search_request(waits, NOW)
+    queue.ask(0.1, restart=restart)
+    assert queue.take_search_request().request.earlier == earlier
 
 
 def test_support_is_of_searches_in_a_row(queue):
