@@ -109,7 +109,7 @@ def test_calibration_is_silent_beside_a_fault_that_may_have_spoilt_it(world_map)
         found = RunResult(2, [posed, Fix(1.0, State.DOUBTED, evidence=evidence, calibration=late)])
         assert len(found.to_json(world_map)["calibration"]["says"]) == count
         assert len(found.fixes[1].to_json()["calibration"]["says"]) == count
-        assert summary(found).count("set --cloud-delay=0.30, as the first poses are off by it") == count
+        assert summary(found).count("set --cloud-delay=0.30: the first poses are off by it") == count
 
 
 def test_damaged_frames_are_skipped_and_listed(world_map, world_run, world_drive, tmp_path):

@@ -199,11 +199,8 @@ class Calibration:
         if abs(self.delay - self.stated_delay) >= max(_LATE, _TOLD * self.sigma_delay):
             late, early = ("clouds are", "odometry") if self.delay > 0 else ("odometry is", "clouds")
             size = f"{abs(self.delay):.3f} +- {self.sigma_delay:.3f} s"
-            stated = (
-                f"; set --cloud-delay={self.delay:.2f}, as the first poses are off by it"
-                if abs(self.delay) <= MAX_DELAY
-                else ""
-            )
+            can_be_set = abs(self.delay) <= MAX_DELAY
+            stated = f"; set --cloud-delay={self.delay:.2f}: the first poses are off by it" if can_be_set else ""
             clauses.append(f"{late} {size} later than {early}: corrected{stated}")
         if abs(self.scale) >= _SCALE:
             size = "short" if self.scale > 0 else "long"

@@ -148,7 +148,7 @@ def test_stated_delay_is_the_prior_and_is_not_remarked():
     assert stated.sigma_delay == CalibrationEstimator().calibration.sigma_delay
     assert stated.describe() == []
     assert replace(stated, delay=0.2, sigma_delay=0.005).describe() == [
-        "clouds are 0.200 +- 0.005 s later than odometry: corrected; set --cloud-delay=0.20, as the first poses are off by it"
+        "clouds are 0.200 +- 0.005 s later than odometry: corrected; set --cloud-delay=0.20: the first poses are off by it"
     ]
     own = CalibrationEstimator(sensor_leans=False).calibration
     assert own.delay == own.stated_delay == 0.0
