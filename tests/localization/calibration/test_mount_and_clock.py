@@ -148,7 +148,8 @@ def test_stated_delay_is_the_prior_and_is_not_remarked():
     assert stated.sigma_delay == CalibrationEstimator().calibration.sigma_delay
     assert stated.describe() == []
     assert replace(stated, delay=0.2, sigma_delay=0.005).describe() == [
-        "clouds are 0.200 +- 0.005 s later than odometry: corrected; set --cloud-delay=0.20: the first poses are off by it"
+        "clouds are 0.200 +- 0.005 s later than odometry: corrected; "
+        "set --cloud-delay=0.20: the first poses are off by it"
     ]
     own = CalibrationEstimator(sensor_leans=False).calibration
     assert own.delay == own.stated_delay == 0.0
@@ -211,7 +212,7 @@ def test_mount_is_said_beyond_the_one_given():
     text = turned.describe(Mount(roll=np.pi))
     assert text[0].startswith("sensor is turned 3.0 +- 0.1 deg to the left on the body beyond its mount: corrected")
     assert "--mount=180,0,3 " in text[0]
-    assert text[1].startswith("clouds are 0.120 +- 0.004 s later than odometry: corrected; set --cloud-delay=0.12 ")
+    assert text[1].startswith("clouds are 0.120 +- 0.004 s later than odometry: corrected; set --cloud-delay=0.12: ")
     assert "odometry is 0.300" in Calibration(delay=-0.3).describe()[0]
 
 
