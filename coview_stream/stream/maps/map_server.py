@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
+from queue import Empty, Full, Queue
 from typing import Any
 
 from coview_stream.basemap.site.manifest import Manifest
@@ -18,13 +21,14 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 log = logging.getLogger("coview_stream.maps")
 
 _LOOK = 1.0  # seconds between two looks at the manifest's file
-_QUEUE = 64  # waiting queries; more are dropped, and clients repeat them
+_QUEUE = 256  # waiting queries; more are refused, and clients repeat them
+_READERS = 8  # answers at once: a reader that has stopped holds up the thread of each until zenoh drops it
 
 
 class MapServer:
     """Serves one site: its manifest, and the layers in the present and the last manifest; no other file.
 
-    One thread answers the queries; another looks for changes of the manifest.
+    Some threads answer the queries; another looks for changes of the manifest.
     """
 
     def __init__(
@@ -53,15 +57,17 @@ class MapServer:
         self._layers = _sizes(self.manifest)
         self._guard = RateLimitedErrors(log)
         self._stopping = threading.Event()
+        self._queries: Queue[Any] = Queue(_QUEUE)
+        self._counting = threading.Lock()
         with zenoh_config.zenoh_errors("zenoh session"):
             self._session: Any = zenoh.open(zenoh_config.compose(connect, listen, config))
             self._queryable: Any = self._session.declare_queryable(
-                keys.all, zenoh.handlers.FifoChannel(_QUEUE), complete=True
+                keys.all, zenoh.handlers.Callback(self._put, indirect=False), complete=True
             )
             self._publisher = self._session.declare_publisher(keys.changed)
         self._threads = [
             threading.Thread(target=work, name=f"coview {name}", daemon=True)
-            for name, work in (("maps", self._answer_all), ("manifest", self._look))
+            for name, work in (*[("maps", self._answer_all)] * _READERS, ("manifest", self._look))
         ]
         for thread in self._threads:
             thread.start()
@@ -71,14 +77,26 @@ class MapServer:
         self._stopping.set()
         with self._guard.catch("closing"):
             self._session.close()  # and all that was declared on it
+        with contextlib.suppress(Empty):
+            while True:
+                self._queries.get_nowait()
+        for _ in range(_READERS):
+            self._queries.put(None)
+        end = time.monotonic() + 2.0
         for thread in self._threads:
-            thread.join(2.0)
+            thread.join(max(0.0, end - time.monotonic()))
+
+    def _put(self, query: Any) -> None:
+        try:
+            self._queries.put_nowait(query)
+        except Full:
+            with self._guard.catch("refusing"):
+                query.reply_err(b"too many queries wait: ask again")
 
     def _answer_all(self) -> None:
         while not self._stopping.is_set():
-            try:
-                query = self._queryable.recv()
-            except Exception:  # the channel's end has no class of its own
+            query = self._queries.get()
+            if query is None:
                 return
             with self._guard.catch("answering"), query:
                 if query.key_expr.intersects(self._keys.manifest):
@@ -94,8 +112,9 @@ class MapServer:
 
     def _reply(self, query: Any, key: str, raw: bytes) -> None:
         query.reply(key, raw)
-        self.answered += 1
-        self.sent += len(raw)
+        with self._counting:
+            self.answered += 1
+            self.sent += len(raw)
 
     def _look(self) -> None:
         refused = ""

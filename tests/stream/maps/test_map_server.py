@@ -273,3 +273,38 @@ def test_command_says_what_it_serves_and_ends_with_a_signal(site, endpoint):
         finally:
             process.send_signal(signal.SIGTERM)
         assert process.wait(10.0) == 0
+
+
+STOPPED = """
+import os, signal, sys, zenoh
+session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
+for _ in range(5):
+    session.get(sys.argv[2], lambda reply: None)  # more than the link holds, by one or two
+print("up", flush=True)
+os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP")
+def test_readers_that_stopped_hold_up_no_other(site, endpoint):
+    layer = max((x for tile in Manifest.load(site).tiles for x in tile.layers.values()), key=lambda x: x.bytes)
+    keys = MapKeys.of("yard")
+    server = MapServer(site, keys, listen=[f"{endpoint}#so_sndbuf=8192"])
+    client = f'{{mode: "client", connect: {{endpoints: ["{endpoint}#so_rcvbuf=8192"]}}}}'
+    readers = []
+    try:
+        for _ in range(3):
+            command = [sys.executable, "-c", STOPPED, client, keys.layer(layer.sha256)]
+            readers.append(subprocess.Popen(command, stdout=subprocess.PIPE))
+            assert readers[-1].stdout.readline() == b"up\n"
+        begin = time.monotonic()
+        source = ZenohSource("yard", connect=[endpoint])
+        assert source.manifest() == server.manifest.to_bytes()
+        assert len(source.layer(layer.sha256, layer.bytes)) == layer.bytes
+        assert time.monotonic() - begin < 4.0  # zenoh waits five seconds for each of the others
+        source.close()
+    finally:
+        for reader in readers:
+            reader.kill()
+            reader.wait()
+        server.close()
