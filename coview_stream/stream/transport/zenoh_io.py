@@ -134,8 +134,7 @@ def plain(sample: Any, max_payload: int | None = None) -> Sample:
     """
     key, encoding = str(sample.key_expr), str(sample.encoding)
     encoding = "" if encoding == _UNSET else encoding
-    attachment = sample.attachment
-    size = len(sample.payload) + (0 if attachment is None else len(attachment))
+    attachment, size = sample.attachment, size_of(sample)
     if max_payload is not None and size > max_payload:
         return Sample(key, b"", encoding, size=size)
     return Sample(key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes())
@@ -257,23 +256,40 @@ THREADS = 4
 """Handlers that run at once, of different subscriptions: they decode and rarely wait."""
 
 
+MAX_INBOX = 1 << 27
+"""Bytes of the samples that wait on one subscription, the newest apart: two of the largest."""
+
+
+def size_of(sample: Any) -> int:
+    """Return the bytes of a zenoh sample's payload and attachment, without copying them."""
+    return len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
+
+
 class Inbox:
-    """Samples of one subscription; the oldest is dropped where they are too many. At most one is handled at a time."""
+    """Samples of one subscription; the oldest are dropped where they are too many, or too large together.
+
+    At most one is handled at a time.
+    """
 
     def __init__(self, name: str, handle: Callable[[Any], None], size: int, ready: SimpleQueue[Inbox | None]) -> None:
         self.name = name
         self._handle = handle
-        self._waiting: deque[Any] = deque(maxlen=size)
+        self._waiting: deque[tuple[Any, int]] = deque()
+        self._size, self._bytes = size, 0
         self._ready = ready
         self._lock = threading.Lock()
         self._scheduled = self._closed = False
 
     def put(self, sample: Any) -> None:
         """Keep a sample for its handler; called on zenoh's thread, and back at once."""
+        weight = size_of(sample)
         with self._lock:
             if self._closed:
                 return
-            self._waiting.append(sample)
+            self._waiting.append((sample, weight))
+            self._bytes += weight
+            while len(self._waiting) > self._size or (self._bytes > MAX_INBOX and len(self._waiting) > 1):
+                self._bytes -= self._waiting.popleft()[1]
             if not self._scheduled:
                 self._scheduled = True
                 self._ready.put(self)
@@ -283,11 +299,13 @@ class Inbox:
         with self._lock:
             self._closed = True
             self._waiting.clear()
+            self._bytes = 0
 
     def work(self) -> None:
         """Handle the oldest sample; the next one waits for its turn behind other subscriptions."""
         with self._lock:
-            sample = self._waiting.popleft() if self._waiting else None
+            sample, weight = self._waiting.popleft() if self._waiting else (None, 0)
+            self._bytes -= weight
         try:
             if sample is not None:
                 self._handle(sample)

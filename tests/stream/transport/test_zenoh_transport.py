@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Transport
 from coview_stream.stream.transport.zenoh_config import compose, reason
-from coview_stream.stream.transport.zenoh_io import THREADS, Inboxes
+from coview_stream.stream.transport.zenoh_io import MAX_INBOX, THREADS, Inboxes
 from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
 
 ROOT = Path(__file__).parents[3]
@@ -38,16 +39,37 @@ def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
 def test_closed_inbox_handles_nothing() -> None:
     inboxes = Inboxes(RateLimitedErrors(logging.getLogger("test")))
     worker = threading.Thread(target=inboxes.run)
-    handled: list[int] = []
+    handled: list[Any] = []
     closed = inboxes.open("a", handled.append, 10)
     closed.close()
-    closed.put(1)
-    inboxes.open("b", handled.append, 10).put(2)
+    first, second = SimpleNamespace(payload=b"1", attachment=None), SimpleNamespace(payload=b"2", attachment=None)
+    closed.put(first)
+    inboxes.open("b", handled.append, 10).put(second)
     worker.start()
     until(lambda: bool(handled))
     inboxes.end()
     worker.join(5.0)
-    assert handled == [2]
+    assert handled == [second]
+
+
+def test_large_samples_that_wait_are_bounded_and_the_newest_is_kept() -> None:
+    inboxes = Inboxes(RateLimitedErrors(logging.getLogger("test")))
+    handled: list[Any] = []
+    inbox = inboxes.open("a", handled.append, 1000)
+    samples = [SimpleNamespace(payload=range(MAX_INBOX // 4), attachment=None) for _ in range(50)]
+    samples += [
+        SimpleNamespace(payload=b"", attachment=range(2 * MAX_INBOX)),
+        SimpleNamespace(payload=b"", attachment=b""),
+    ]
+    for sample in samples[:-2]:
+        inbox.put(sample)
+    inbox.work()
+    assert handled == [samples[46]]  # four remain of fifty, the oldest is the first
+    inbox.put(samples[-2])  # larger than all of the room
+    inbox.put(samples[-1])
+    for _ in range(10):
+        inbox.work()
+    assert handled == [samples[46], samples[-1]]
 
 
 @pytest.mark.parametrize("selector", ["**", "coview/**", "coview/*/rpc/*", "coview/@node/**", "*/r1/rpc/reset"])
