@@ -18,6 +18,7 @@ DELAYS: Floats = RESOLUTION * np.arange(-20.0, 21.0)
 """Delays that are compared, seconds."""
 _FADES = 100.0  # metres over which evidence for a delay is forgotten, as clocks drift
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
+_STEPS = math.log(1e-6)  # of the probability that a clock has just taken a step: once in twelve days
 _TILT = 2.0  # ratio of a registration's errors of roll and pitch to that of its heading
 
 
@@ -58,10 +59,11 @@ class DelaySearch:
 
     Attributes:
         evidence: (D,) log-likelihoods of DELAYS, up to a constant.
+        shaking: (D,) the part of it that roll and pitch of the body tell.
     """
 
     def __init__(self) -> None:
-        self.evidence = np.zeros(len(DELAYS))
+        self.evidence, self.shaking = np.zeros((2, len(DELAYS)))
         self._waiting: deque[SeenMotion] = deque(maxlen=30)
 
     def add(self, seen: SeenMotion) -> None:
@@ -101,9 +103,12 @@ class DelaySearch:
         squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat)
         shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2])
         evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM)
-        evidence -= 0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
+        tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
+        evidence += tilted
         fade = math.exp(-float(np.linalg.norm(seen.motion[:3, 3])) / _FADES)
         self.evidence = fade * self.evidence + evidence - evidence.max()
+        shaking = fade * self.shaking + tilted
+        self.shaking = np.maximum(shaking - shaking.max(), _STEPS)
 
     def better_than(self, delay: float, sigma: float, surprise: float) -> float | None:
         """Return the delay with the most evidence, if it is beyond the applied ``delay`` with its ``sigma``, seconds.

@@ -35,7 +35,7 @@ from coview_stream.localization.calibration.calibration import (
     LEVER_TOLERANCE,
     Calibration,
 )
-from coview_stream.localization.calibration.delay_search import RESOLUTION, DelaySearch, SeenMotion
+from coview_stream.localization.calibration.delay_search import DELAYS, RESOLUTION, DelaySearch, SeenMotion
 from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
 
 Moments = tuple[Moment | None, Moment | None]
@@ -121,6 +121,7 @@ class CalibrationBelief:
     Attributes:
         x: (10,) mean.
         P: (10, 10) covariance.
+        shaking: (D,) log-likelihoods of DELAYS by the shaking of the body; see :class:`DelaySearch`.
     """
 
     def __init__(self, sensor_leans: bool, cloud_delay: float = 0.0) -> None:
@@ -131,6 +132,7 @@ class CalibrationBelief:
         self._exact = {group.sigma: group.exact for group in _GROUPS}
         self._shares = {group.sigma: group.share for group in _GROUPS}
         self._sensor_leans = sensor_leans
+        self.shaking = np.zeros(len(DELAYS))
         self._stand_straight()
 
     def learn(self, earlier: Calibration, same_run: bool) -> None:
@@ -239,6 +241,8 @@ class CalibrationBelief:
             pull = np.linalg.solve(spread, np.column_stack([x / wide, P / np.outer(wide, wide)])[None])
             fit = np.linalg.slogdet(spread)[1] - (free * math.log(_FREE)).sum(axis=1) + pull[:, :, 0] @ (x / wide)
             prior = np.where(faulty, np.log(shares), np.log1p(-shares)).sum(axis=1)
+            if _CLOCK in groups:
+                prior += self._by_shaking() * faulty[:, groups.index(_CLOCK)]
             weights = np.exp(prior - 0.5 * fit - (prior - 0.5 * fit).max())
             weights /= weights.sum()
             means = x - pull[:, :, 0] @ (P / wide).T  # (M, K)
@@ -254,6 +258,17 @@ class CalibrationBelief:
                 values |= dict(zip(group.names, (self._centre[group.axes] + mean[own]).tolist(), strict=True))
                 values[group.sigma] = math.sqrt(max(float(variance[own].mean()), 0.0))
         return Calibration(**values, stated_delay=self._stated_delay)
+
+    def _by_shaking(self) -> float:
+        """Return the log-odds of the filter's delay against the expected one, by the shaking of the body.
+
+        The filter itself learns from x, y and heading, where an error of odometry in a turn looks like a delay.
+        """
+        sigma = math.sqrt(float(self.P[_CLOCK.axes, _CLOCK.axes][0, 0]))
+        likely = np.exp(np.interp(self.x[_CLOCK.axes] + sigma * np.array([-1.0, 0.0, 1.0]), DELAYS, self.shaking))
+        return math.log(max(float(likely @ [0.25, 0.5, 0.25]), 1e-300)) - float(
+            np.interp(self._centre[_CLOCK.axes], DELAYS, self.shaking)[0]
+        )
 
     def _stand_straight(self) -> None:
         """Fix mount and clock at zero for odometry that is made of the clouds: then odometry's gravity leans."""
@@ -381,6 +396,8 @@ class CalibrationEstimator:
         now, as until then odometry at the clouds' moments was not known.
         """
         judged = self._delays.judge(self.history)
+        for belief in filter(None, (self._known, self._supposed)):
+            belief.shaking = self._delays.shaking
         for seen, step, rates in judged:
             if _waits(seen.applied):
                 step[:3, 3] *= 1.0 + seen.applied.scale

@@ -18,8 +18,8 @@ from coview_stream.localization.calibration.calibration import (
     LEVER_TOLERANCE,
     Calibration,
 )
-from coview_stream.localization.calibration.delay_search import DelaySearch, SeenMotion
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.delay_search import DELAYS, DelaySearch, SeenMotion
+from coview_stream.localization.calibration.estimator import SIZE, CalibrationBelief, CalibrationEstimator
 from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
 from coview_stream.localization.frame import OdometryCorrection
 
@@ -244,3 +244,16 @@ def test_delay_is_searched_again_after_a_stop_that_is_longer_than_the_history():
     for begin, end in ((0.0, 31.0), (35.0, 36.0)):
         search.add(SeenMotion(step, begin, end, Calibration(), 1e-4 * np.eye(3), np.zeros((3, 6))))
     assert [seen.begin for seen, *_ in search.judge(history)] == [35.0]
+
+
+def test_shaking_speaks_against_a_delay_that_errors_of_heading_look_like():
+    """As at the end of a turn in which odometry slipped."""
+    belief = CalibrationBelief(sensor_leans=True)
+    H = np.zeros((1, SIZE))
+    H[0, 6] = 1.0
+    belief.update(np.array([0.1]), H, np.array([[0.02**2]]))
+    assert belief.applied().delay > 0.05
+    belief.shaking = -0.5 * (DELAYS / 0.02) ** 2
+    assert belief.applied().delay < 0.001
+    belief.shaking = -0.5 * ((DELAYS - 0.1) / 0.02) ** 2
+    assert belief.applied().delay == pytest.approx(0.1, abs=0.005)
