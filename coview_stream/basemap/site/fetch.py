@@ -221,7 +221,7 @@ class Mirror:
             return ask()
         except CoViewError:
             raise
-        except Exception as error:  # whoever answers there may send anything
+        except Exception as error:  # a server may send anything
             raise TransportError(f"{self.source.name}: {type(error).__name__}: {_reason(error)}") from error
 
     def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:

@@ -5,9 +5,9 @@ All three agree where nothing is wrong. A fault makes them disagree in a way of 
 
 * good: l = o; m = l in all cases, as the map sees the same clouds.
 * slip: o is wrong (wheels slip, odometry jumps), l is right, and smooth, as bodies have inertia.
-* stopped: o = 0, whatever l is, which is smooth.
+* stopped: o = 0 at any l; l is smooth.
 * scaled: l = s o along the way, with the heading as it was; l is right.
-* repeated: l = 0, whatever o is.
+* repeated: l = 0 at any o.
 * late: l = o at an earlier time. The lag is constant, or grows: by and by, or steadily.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
   body does, and from then on l = C^-1 o C.
@@ -214,7 +214,7 @@ class FaultPosterior:
         farther = (
             driven if step.clouds is None else max(driven, min(dt * _FAST, float(np.hypot(*step.clouds.motion[:2]))))
         )
-        grips = math.exp(-_SLIPS * farther)  # whatever else is wrong
+        grips = math.exp(-_SLIPS * farther)  # under every hypothesis
         begins = 1.0 - grips
         new_slip = (begins * good + _SLIPS_ON * slip) * slips
         new_repeated = (come * (good + slip) + (1.0 - ends) * self.repeated) * float(copy)

@@ -1,4 +1,4 @@
-"""Stamps of clouds against the turns of the lidar, which go on evenly whatever the stamps say.
+"""Stamps of clouds against the turns of the lidar, which are even also where the stamps are wrong.
 
 Clouds that become late are stamped further apart than the lidar turns: by a hole where their lag jumps, by stretched
 distances where it grows. So a step's stamps say how probable it is that clouds have become later by so many seconds.
