@@ -92,7 +92,7 @@ def places(count: int) -> Iterator[Place]:
     """Spread ``count`` places over a run through a simulated town."""
     config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
     base_map, run, (stamps, poses) = opened(config)
-    maps, frames = LocalMaps(base_map, 60.0, crops=1000), list(run)
+    maps, frames = LocalMaps(base_map, 60.0, max_bytes=10**10), list(run)
     wanted = set(np.linspace(0, len(frames) - 1, count + 1).astype(int)[1:].tolist())
     recent: list[tuple[Floats, Floats32]] = []
     for index, frame in enumerate(frames):

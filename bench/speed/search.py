@@ -39,7 +39,6 @@ WORLDS = {
 
 P50_MS, P95_MS, LEAST_RIVALS = 60.0, 100.0, 200  # the targets
 KEYFRAMES, DRIVES = 12, 9  # of a drive, where the consensus has a window of ten; of a world
-_CROPS = 24  # of the map, as the search engine has it
 _STARTS = 7  # a run's starts lie this share of it apart, then between those
 
 
@@ -73,7 +72,7 @@ def searched(site: Path, run_folder: Path, drives: int) -> dict[str, Any]:
     rule = AcceptanceConfig()
     object.__setattr__(rule, "risk", sys.float_info.min)  # no place meets it, and no user may ask for it
     config, base_map, run = LocalizerConfig(acceptance=rule), BaseMap.load(site), open_run(run_folder)
-    maps = LocalMaps(base_map, config.registration.source_range, _CROPS)
+    maps = LocalMaps(base_map, config.registration.source_range)
     index = SearchIndex.of(base_map, config)
     coview_kernels.warm_up()
     index.prepare()

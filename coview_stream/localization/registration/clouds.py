@@ -7,6 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -132,11 +133,12 @@ def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Point
     return kernels.transform_unique(cloud, T_odom_body, config.voxel, config.range_min)[0]
 
 
-_MAX_CROPS = 12  # cached
+MAX_CROP_BYTES = 64_000_000
+"""Bytes of crops that are kept though nobody holds them: six of a dense survey, at 10 MB."""
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalMap:
     """A crop of the base map; its search structures are made at first use."""
 
@@ -158,6 +160,12 @@ class LocalMap:
         unit = np.asarray(normals / np.maximum(length, np.float32(1e-6))[:, None], dtype=np.float32)
         return unit, np.minimum(length, np.float32(1.0))
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the points, their normals and their order by cell."""
+        order = self.points.nbytes if self.cells is None else self.cells.starts.nbytes + self.cells.rows.nbytes
+        return order + self.normals.nbytes  # sorted points are a view of the rows
+
     def prepare(self) -> None:
         """Sort the points now."""
         if "grid" not in vars(self):
@@ -165,25 +173,31 @@ class LocalMap:
 
 
 class LocalMaps:
-    """Crops of a base map by place; the recently used ones are cached."""
+    """Crops of a base map by place; those that somebody holds and the recently used ones are cached."""
 
-    def __init__(self, base_map: BaseMap, radius: float, crops: int = _MAX_CROPS) -> None:
+    def __init__(self, base_map: BaseMap, radius: float, max_bytes: int = MAX_CROP_BYTES) -> None:
         self._map = base_map
         self._radius = radius
-        self._max_crops = crops
-        self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
+        self._max_bytes = max_bytes
+        self._crops: WeakValueDictionary[tuple[int, int], LocalMap] = WeakValueDictionary()
+        self._recent: OrderedDict[LocalMap, None] = OrderedDict()  # the last one is the newest
 
     def around(self, position: Floats) -> LocalMap | None:
         """Return the map within at least ``radius`` metres of ``position`` (3,); None if it is (nearly) empty there."""
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
-        if key not in self._crops:
-            centre = np.array([key[0], key[1]]) * _CROP_STEP
-            radius = self._radius + 0.75 * _CROP_STEP
-            cut = kernels.Cut(float(centre[0]), float(centre[1]), radius)
-            crop = cut_points(self._map.arrays, self._map.config.tile, cut)
-            few = crop is None or len(crop.points) < MIN_PAIRS
-            self._crops[key] = None if crop is None or few else LocalMap(*crop)
-            if len(self._crops) > self._max_crops:
-                self._crops.popitem(last=False)
-        self._crops.move_to_end(key)
-        return self._crops[key]
+        crop = self._crops.get(key) or self._cut(key)
+        if crop is None:
+            return None
+        if crop in self._recent:
+            self._recent.move_to_end(crop)
+            return crop
+        self._crops[key], self._recent[crop] = crop, None
+        while len(self._recent) > 1 and sum(kept.nbytes for kept in self._recent) > self._max_bytes:
+            self._recent.popitem(last=False)
+        return crop
+
+    def _cut(self, key: tuple[int, int]) -> LocalMap | None:
+        centre = np.array(key) * _CROP_STEP
+        cut = kernels.Cut(float(centre[0]), float(centre[1]), self._radius + 0.75 * _CROP_STEP)
+        crop = cut_points(self._map.arrays, self._map.config.tile, cut)
+        return None if crop is None or len(crop.points) < MIN_PAIRS else LocalMap(*crop)

@@ -75,6 +75,7 @@ class Tracker:
         self._shared_error = SharedErrorModel(config.registration)
         self._learned_at = -math.inf  # metres driven at the newest lesson about the place
         self._disputed = False  # the last match contradicted odometry
+        self._held: LocalMap | None = None  # newest crop: robots that share a cache do not drop each other's
         self._doubt = 1.0  # how many times the usual evidence exceeds the newest believed one
 
     def add_scan(self, scan: RawScan) -> None:
@@ -236,7 +237,8 @@ class Tracker:
         return protection_level(self.reported_covariance(), self._doubt, others=self.change.others)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
-        return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
+        self._held = self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
+        return self._held
 
     def _restart(self, T_map_cloud: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         self._matcher.dispute.clear()

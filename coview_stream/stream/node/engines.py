@@ -28,8 +28,6 @@ from coview_stream.odometry.lidar_odometry import KissRegistration, LidarOdometr
 from coview_stream.stream.node.engine_queue import FrameJob, FrameResult, Job, Result, SearchJob
 from coview_stream.stream.node.inputs import OdometryJob, OdometryResult
 
-_CROPS = 24  # of the map with their search grids, shared by all robots
-
 
 class Engine(ABC):
     """Works through jobs one at a time; an exception concerns the job's robot only.
@@ -67,7 +65,7 @@ class TrackEngine(Engine):
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
-        self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
+        self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
         self._robots: dict[str, tuple[int, int, Localizer]] = {}  # first epoch, epoch
         # without its weights: it only lists the contents of requests, for the search engine
         self._index = SearchIndex.of(base_map, self.config, load=False)
@@ -128,7 +126,7 @@ class SearchEngine(Engine):
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
-        self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
+        self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
         self._searches: dict[str, GlobalSearch] = {}
         self._index = SearchIndex.of(base_map, self.config)
 

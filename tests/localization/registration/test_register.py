@@ -136,10 +136,33 @@ def test_local_maps_hold_all_points_within_radius_and_are_cached(world_map):
     assert 1 < len(crops) <= 9
 
 
-def test_local_map_cache_drops_the_oldest(world_map):
-    maps = LocalMaps(world_map, radius=6.0, crops=2)
-    refs = [weakref.ref(maps.around(np.array([x, 0.0, 0.0]))) for x in (-16.0, 0.0, 16.0)]
+PLACES = np.array([[x, 0.0, 0.0] for x in (-16.0, 0.0, 16.0)])
+
+
+def test_local_map_cache_drops_the_oldest_beyond_its_bytes(world_map):
+    sizes = [LocalMaps(world_map, radius=6.0).around(place).nbytes for place in PLACES]
+    maps = LocalMaps(world_map, radius=6.0, max_bytes=sum(sizes) - 1)
+    refs = [weakref.ref(maps.around(place)) for place in PLACES]
     assert [ref() is not None for ref in refs] == [False, True, True]
+
+
+def test_local_map_larger_than_the_cache_is_kept_until_the_next(world_map):
+    maps = LocalMaps(world_map, radius=6.0, max_bytes=1)
+    refs = [weakref.ref(maps.around(place)) for place in PLACES]
+    assert [ref() is not None for ref in refs] == [False, False, True]
+    assert maps.around(PLACES[-1]) is refs[-1]()
+
+
+def test_local_maps_in_use_are_not_cut_again(world_map):
+    maps = LocalMaps(world_map, radius=6.0, max_bytes=1)
+    held = [maps.around(place) for place in PLACES]
+    assert [maps.around(place) is crop for place, crop in zip(PLACES, held, strict=True)] == [True] * 3
+
+
+def test_local_map_counts_all_bytes_it_keeps(world_map):
+    crop = LocalMaps(world_map, radius=6.0).around(PLACES[1])
+    bases = [array if array.base is None else array.base for array in (crop.points, crop.normals)]
+    assert crop.nbytes == pytest.approx(sum({id(base): base.nbytes for base in bases}.values()), rel=0.1)
 
 
 def test_local_map_without_points_is_none(world_map):
