@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recorded.add_argument(
         "--run", type=Path, dest="run_path", metavar="RUN", help="recorded run to judge, and to search for on the map"
     )
-    recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry, as for locate (auto)")
+    recorded.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as for locate (auto)")
     add_shared(recorded, "--mount", "--cloud-delay", "--cloud-topic", "--odometry-topic")
     add_network(parser, "not checked, but with --robot --connect tcp/127.0.0.1:7447")
     parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="seconds to listen to robots (3)")
@@ -81,7 +81,7 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
 
 def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
     from coview_stream.config import LocalizerConfig
-    from coview_stream.doctor.finding import from_error
+    from coview_stream.doctor.finding import Finding, from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory
     from coview_stream.doctor.map_checks import map_findings, open_map, run_findings
     from coview_stream.recordings.open_run import open_run
@@ -116,6 +116,8 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
         except CoViewError as error:
             yield from_error("run", error)
         else:
+            notes = (note.removeprefix(f"{recorded.path}: ") for note in recorded.notes)
+            yield from (Finding("ok", "recording", note) for note in notes)
             yield from run_findings(recorded, base_map, LocalizerConfig(cloud_delay=args.cloud_delay or 0.0))
     if connect is not None and zenoh:
         yield from _network(args, connect, keys, sha256)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
-from coview_stream.cli.options import add_shared, check_picture, lidar_config
+from coview_stream.cli.options import add_shared, check_picture, lidar_config, mount_of
 
 HELP = "merge localized runs with the base map: one cloud, tagged by source and change"
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.config.mount import Mount, parse_mount
+    from coview_stream.config.mount import Mount
     from coview_stream.errors import require_library
     from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
     from coview_stream.fusion.fused_file import check_name, summary, write_fused, write_trajectories
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         require_library("gtsam", "gtsam>=4.3", "--joint")
     if args.picture is not None:
         require_library("matplotlib", "matplotlib>=3.8", "--picture")
-    given = None if args.mount is None else parse_mount(args.mount)
+    given = mount_of(args)
     lidar_options = lidar_config(args.odometry, args.gravity)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     config = FuseConfig(

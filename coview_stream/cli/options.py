@@ -182,7 +182,7 @@ SHARED: dict[str, dict[str, Any]] = {
     },
     "--mount": {
         "metavar": "R,P,Y[,X,Y,Z]",
-        "help": "pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down",
+        "help": "pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down (of a bag: /tf_static)",
     },
     "--cloud-delay": {
         "type": float,
@@ -323,11 +323,11 @@ def check_picture(option: str, path: Path | None) -> None:
         raise ConfigError(f"{option} {path}: {path.parent} is no directory; make it first")
 
 
-def mount_of(args: argparse.Namespace) -> Mount:
-    """Return ``--mount``; ConfigError if it is not three or six numbers in range."""
-    from coview_stream.config.mount import Mount, parse_mount
+def mount_of(args: argparse.Namespace) -> Mount | None:
+    """Return ``--mount``, None where it is not given; ConfigError if it is not three or six numbers in range."""
+    from coview_stream.config.mount import parse_mount
 
-    return Mount() if args.mount is None else parse_mount(args.mount)
+    return None if args.mount is None else parse_mount(args.mount)
 
 
 def lidar_config(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:

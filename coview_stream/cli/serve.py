@@ -224,7 +224,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node,
         **{name: value for name in _LIMITS if (value := getattr(args, name)) is not None},
         deskew=node.deskew and not args.no_deskew,
-        mount=node.mount if args.mount is None else mount_of(args),
+        mount=mount_of(args) or node.mount,
     )
     if "max_gap" not in tables["node"]:  # a pause that keeps the pose up keeps its frames as well
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))

@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the world and print its counts."""
+    from coview_stream.config.mount import Mount
     from coview_stream.sim import OdometryConfig, SimulationConfig, parse_dirt, simulate
 
     if args.utm and args.origin:
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             tilt_noise=args.drift * drift.tilt_noise,
         ),
         dirt=parse_dirt(args.dirt, args.dirt_seed),
-        mount=mount_of(args),
+        mount=mount_of(args) or Mount(),
     )
     progress = args.progress or sys.stderr.isatty()
     world = simulate(args.out, config, progress=progress, overwrite=args.overwrite)

@@ -26,10 +26,12 @@ _MIMES: dict[str, tuple[str, ...]] = {
 }
 _MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # meaningless without a schema
 _WITHOUT_SCHEMA = ("application/json", "text/json")  # parameters are a charset or the like
+_LIVOX = ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
 _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "xyz": ("xyz", ("cloud",)),
     "xyzi": ("xyzi", ("cloud",)),
     "sensor_msgs.pointcloud2": ("cdr", ("cloud",)),
+    **{f"{package}.custommsg": ("cdr", ("cloud",)) for package in _LIVOX},
     "nav_msgs.odometry": ("cdr", ("odometry",)),
     "geometry_msgs.posewithcovariancestamped": ("cdr", ("pose",)),
     "foxglove.pointcloud": ("foxglove", ("cloud",)),

@@ -13,6 +13,7 @@ import numpy as np
 
 from coview_stream.errors import MessageError, require_library
 from coview_stream.geometry.transforms import Pose, pose_to_tum
+from coview_stream.messages import livox
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
 from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
@@ -84,7 +85,9 @@ def _refuse_many_fields(payload: bytes) -> None:
 
 
 def decode_cloud(sample: Sample) -> CloudMessage:
-    """Read a PointCloud2 of any layout; packed little-endian float32 x y z stay a view on the payload."""
+    """Read a PointCloud2 of any layout, or Livox' CustomMsg; packed little-endian float32 x y z stay a view."""
+    if livox.is_custom(sample.payload):
+        return livox.decode(sample.payload)
     _refuse_many_fields(sample.payload)
     cloud = _read(sample.payload, CLOUD)
     order = ">" if cloud.is_bigendian else "<"

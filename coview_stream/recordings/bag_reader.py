@@ -18,8 +18,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from coview_stream.errors import CoViewError, InputError, MessageError, RunError
-from coview_stream.messages import ros2
+from coview_stream.messages import livox, ros2
 from coview_stream.messages.validation import stamp_join
+from coview_stream.recordings import frame_tree
 
 LIMIT = 1 << 29
 """Bytes of an unpacked chunk or message; recorders begin a new chunk after a few MB."""
@@ -91,8 +92,14 @@ class BagReader:
         """
         connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
         for connection, arrived, data in self._reader.messages(connections, start=start):
-            payload = ros2.store().ros1_to_cdr(data, connection.msgtype) if self._ros1 else data
+            payload = _cdr_from_ros1(data, connection.msgtype) if self._ros1 else data
             yield connection.topic, arrived, bytes(payload)
+
+
+def _cdr_from_ros1(data: bytes, kind: str) -> bytes:
+    if kind in livox.TYPES:
+        return livox.cdr_from_ros1(data)
+    return bytes(ros2.store().ros1_to_cdr(data, frame_tree.TYPES[0] if kind in frame_tree.TYPES else kind))
 
 
 def header_stamp(payload: bytes) -> int:

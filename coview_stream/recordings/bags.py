@@ -1,5 +1,6 @@
-"""Runs from ROS recordings: PointCloud2 frames, each with the odometry at its stamp.
+"""Runs from ROS recordings: PointCloud2 or Livox frames, each with the odometry at its stamp.
 
+Odometry is a topic's, or that of ``/tf``; the mount of the lidar is that of ``/tf_static``, unless it is given.
 Messages go through the decoders and the deskewing of the live stream. Clouds are read on demand, and deskewed if their
 points have times.
 """
@@ -16,17 +17,19 @@ import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.config.mount import Mount
+from coview_stream.config.mount import MAX_LEVER, Mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import CloudError, MessageError, RunError
 from coview_stream.geometry.arrays import Bools, Floats, Ints
-from coview_stream.geometry.transforms import Points, Poses, interpolate
+from coview_stream.geometry.transforms import Points, Poses, interpolate, inverse, transform
 from coview_stream.geometry.validation import MAX_COORDINATE
-from coview_stream.messages import ros2
+from coview_stream.messages import livox, ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import SweepCorrection, deskew
+from coview_stream.recordings import frame_tree
 from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stamp, readable
+from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.recordings.run import Run
 
 SAME_NS = 1000
@@ -82,6 +85,10 @@ class Track:
         return Segment(self.stamps[chosen], self.poses[chosen])
 
 
+_CLOUDS = (ros2.CLOUD, *livox.TYPES)
+_Topic = tuple[str, str]
+"""Type and name."""
+
 OdometryFromClouds = Callable[["BagClouds"], Track]
 """Makes odometry from the clouds alone, which are not deskewed."""
 
@@ -102,33 +109,42 @@ def open_bag(
         path: as returned by :func:`~coview_stream.recordings.layouts.find_bag`.
         explicit: TUM file of the odometry, with any stamps; None takes the recording's.
         cloud_topic: required if several topics have PointCloud2.
-        odometry_topic: required if several topics have Odometry.
+        odometry_topic: required if several topics have Odometry; ``/tf`` takes the odometry from there.
         from_clouds: makes the odometry, even if the recording has some.
-        mount: pose of the lidar; clouds are read into the body frame.
+        mount: pose of the lidar; clouds are read into the body frame. None takes it from ``/tf_static``.
 
     Raises:
         RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
     """
-    mount = mount or Mount()
     reader = BagReader(path)
     counts = reader.counts()
-    clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
-    topics = {clouds: ros2.CLOUD}
+    kinds = (ros2.CLOUD,) if any(kind == ros2.CLOUD for kind, _ in counts) and cloud_topic is None else _CLOUDS
+    clouds = _choose(path, counts, kinds, cloud_topic, "--cloud-topic")
+    topics = {topic: kind for kind, topic in counts if kind in frame_tree.TYPES} | {clouds[1]: clouds[0]}
     if from_clouds is not None:
         survey = _survey(reader, topics)
         stamps, arrivals, fresh, _ = _in_order(path, survey)
         identities = np.tile(np.eye(4), (int(fresh.sum()), 1, 1))
         still = Track(stamps[fresh], identities)
-        bare = BagClouds(reader, clouds, stamps[fresh], arrivals[fresh], still, identities, mount)
-        return _pair(reader, clouds, survey, from_clouds(bare), mount)
+        placed = _mounted(path, survey, mount)
+        bare = BagClouds(reader, clouds, stamps[fresh], arrivals[fresh], still, identities, placed)
+        return _pair(reader, clouds, survey, from_clouds(bare), placed)
     if explicit is not None and odometry_topic is not None:
         raise RunError(f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them")
     # a single scan needs no odometry, as among files
-    lone = counts[ros2.CLOUD, clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
-    if explicit is None and not lone:
-        topics[_choose(path, counts, ros2.ODOMETRY, odometry_topic, "--odometry-topic")] = ros2.ODOMETRY
+    lone = counts[clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
+    in_topic = any(count and kind == ros2.ODOMETRY for (kind, _), count in counts.items())
+    if odometry_topic is not None:
+        in_topic = topics.get(odometry_topic) not in frame_tree.TYPES
+    by_tree = explicit is None and not lone and not in_topic and len(topics) > 1
+    if explicit is None and not lone and not by_tree:
+        kind, topic = _choose(path, counts, (ros2.ODOMETRY,), odometry_topic, "--odometry-topic")
+        topics[topic] = kind
     survey = _survey(reader, topics)
-    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone), mount)
+    if by_tree:
+        _take_odometry(path, counts, survey)
+    track = _track(path, survey, explicit, lone)
+    return _pair(reader, clouds, survey, track, _mounted(path, survey, mount, explicit))
 
 
 class BagClouds:
@@ -138,9 +154,17 @@ class BagClouds:
     """
 
     def __init__(
-        self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses, mount: Mount
+        self,
+        reader: BagReader,
+        topic: _Topic,
+        stamps: Ints,
+        arrivals: Ints,
+        track: Track,
+        poses: Poses,
+        mount: _Mounted,
     ) -> None:
-        self.reader, self.topic, self.track, self.mount = reader, topic, track, mount
+        self.reader, self.track, self.mount = reader, track, mount
+        self.kind, self.topic = topic
         self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
         self._lock = threading.Lock()  # a replay reads on another thread
         self._pending: Iterator[tuple[str, int, bytes]] = iter(())
@@ -168,7 +192,10 @@ class BagClouds:
             message = ros2.decode_cloud(Sample(self.topic, payload))
         except MessageError as error:
             raise CloudError(f"{name}: {error}; skip it, or repair the recording") from error
-        return replace(message, points=self.mount.to_body(message.points))
+        if self.mount.registered:
+            points = transform(inverse(self.poses[index]), message.points.astype(np.float64)).astype(np.float32)
+            return replace(message, points=points, times=None)
+        return replace(message, points=self.mount.mount.to_body(message.points))
 
     def _name(self, index: int) -> str:
         return f"{self.reader.path}: cloud of {self.topic} at {_NS * int(self.stamps[index]):.6f}"
@@ -179,7 +206,7 @@ class BagClouds:
         for _ in range(2):
             if not reads_on:
                 start = int(self.arrivals[index])
-                self._pending = self.reader.messages({self.topic: ros2.CLOUD}, start)
+                self._pending = self.reader.messages({self.topic: self.kind}, start)
             for _, arrived, payload in self._pending:
                 with contextlib.suppress(MessageError):
                     if arrived == self.arrivals[index] and header_stamp(payload) == self.stamps[index]:
@@ -207,7 +234,11 @@ class _Survey:
     odometry: list[tuple[int, Floats]] = field(default_factory=list)  # stamp in ns, pose (4, 4)
     damaged: int = 0  # messages
     lidar: str = ""  # frame id of the clouds
+    frame: str = ""  # frame id of the odometry
     body: str = ""  # child frame id of the odometry
+    tree: FrameTree = field(default_factory=FrameTree)
+    notes: list[str] = field(default_factory=list)  # for the user
+    source: str = ""  # topic of the tree's static transforms, if it has any
 
 
 def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
@@ -215,13 +246,18 @@ def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
     with readable(reader.path):
         for topic, arrived, payload in reader.messages(topics):
             try:
-                if topics[topic] == ros2.CLOUD:
+                if topics[topic] in frame_tree.TYPES:
+                    static = "static" in topic
+                    survey.tree.add(payload, static)
+                    survey.source = topic if static or not survey.source else survey.source
+                elif topics[topic] in _CLOUDS:
                     survey.stamps.append(header_stamp(payload))
                     survey.arrivals.append(arrived)
-                    survey.lidar = survey.lidar or frame_id(payload)
+                    survey.tree.lidar = survey.lidar = survey.lidar or frame_id(payload)
                 else:
                     sample = ros2.decode_odometry(Sample(topic, payload))
                     survey.odometry.append((sample.stamp_ns, sample.T_odom_body))
+                    survey.frame = survey.frame or frame_id(payload)
                     survey.body = survey.body or frame_id(payload, 1)
             except MessageError:
                 survey.damaged += 1
@@ -230,22 +266,88 @@ def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
     return survey
 
 
-def _choose(path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: str | None, option: str) -> str:
-    """Return the only topic of the type, or the wanted one."""
-    all_of_kind = {topic: count for (name, topic), count in counts.items() if name == kind}
+def _choose(path: Path, counts: dict[_Topic, int], kinds: tuple[str, ...], wanted: str | None, option: str) -> _Topic:
+    """Return the only topic of these types, or the wanted one."""
+    all_of_kind = {topic: count for topic, count in counts.items() if topic[0] in kinds}
     full = {topic: count for topic, count in all_of_kind.items() if count} or all_of_kind
-    listed = ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(all_of_kind.items()))
+    listed = ", ".join(f"{topic} ({count} messages)" for (_, topic), count in sorted(all_of_kind.items()))
     if wanted is not None:
-        if wanted not in all_of_kind:
-            raise RunError(f"{path}: no topic {wanted!r} with {kind}; {option} may be {listed or 'none'}")
-        return wanted
+        found = next((topic for topic in all_of_kind if topic[1] == wanted), None)
+        if found is None:
+            raise RunError(f"{path}: no topic {wanted!r} with {kinds[0]}; {option} may be {listed or 'none'}")
+        return found
     if len(full) > 1:
-        raise RunError(f"{path}: {len(full)} topics with {kind}; choose by {option}: {listed}")
+        raise RunError(f"{path}: {len(full)} topics with {kinds[0]}; choose by {option}: {listed}")
     if not full:
         others = ", ".join(f"{topic} ({name})" for name, topic in sorted(counts)[:8]) or "no topics at all"
-        remedy = "give --odometry FILE, or " if kind == ros2.ODOMETRY else ""
-        raise RunError(f"{path}: no topic with {kind}; {remedy}record one: it has {others}")
+        remedy = _NO_ODOMETRY if kinds[0] == ros2.ODOMETRY else "record one"
+        raise RunError(f"{path}: no topic with {kinds[0]}; {remedy}: it has {others}")
     return next(iter(full))
+
+
+_NO_ODOMETRY = "make it of the clouds: --odometry kiss-icp, or give --odometry FILE"
+
+
+def _take_odometry(path: Path, counts: dict[_Topic, int], survey: _Survey) -> None:
+    """Take the odometry of the tree of frames."""
+    found = survey.tree.odometry()
+    if found is None:
+        others = ", ".join(f"{topic} ({name})" for name, topic in sorted(counts)[:8])
+        above = " <- ".join(reversed(survey.tree.above(survey.lidar)))
+        raise RunError(
+            f"{path}: no topic with {ros2.ODOMETRY}, and nothing moves in /tf above the lidar ({above}); "
+            f"{_NO_ODOMETRY}: it has {others}"
+        )
+    survey.frame, survey.body, survey.odometry = found
+    survey.notes.append(f"{path}: odometry is read from /tf: {survey.frame} <- {survey.body}")
+
+
+@dataclass(frozen=True)
+class _Mounted:
+    """How clouds come into the body frame."""
+
+    mount: Mount
+    registered: bool = False  # they are in odometry's frame already
+    notes: tuple[str, ...] = ()
+
+
+def _mounted(path: Path, survey: _Survey, given: Mount | None, explicit: Path | None = None) -> _Mounted:
+    """Return how clouds come into the body frame: as ``given``, else as the frames of the recording say.
+
+    ``explicit`` odometry may be that of any frame.
+    """
+    lidar, tree = survey.lidar, survey.tree
+    body = survey.body or tree.body()
+    T = tree.mount(body) if lidar and body else None
+    known = T is not None and float(np.linalg.norm(T[:3, 3])) <= MAX_LEVER
+    stated = Mount().moved(T) if T is not None and known else Mount()
+    where = f"{survey.source} has the lidar {lidar!r} on {body!r}: --mount={stated.option}"
+    if given is not None:
+        overridden = known and given.option != stated.option
+        return _Mounted(given, notes=(f"{path}: --mount={given.option} is taken; {where}",) * overridden)
+    if lidar and lidar == survey.frame != body:
+        note = (
+            f"{path}: clouds are in odometry's frame {lidar!r}, as FAST-LIO registers them: taken back into the body "
+            "by it; if they are the lidar's own, say so: --mount=0,0,0"
+        )
+        return _Mounted(Mount(), True, (note,))
+    if explicit is not None and stated.option != Mount().option:
+        return _Mounted(Mount(), notes=(f"{path}: {where}; give it if {explicit} has the poses of {body!r}",))
+    if known:
+        note = f"{path}: {where} is taken; another --mount would override it"
+        return _Mounted(stated, notes=(note,) * (stated.option != Mount().option))
+    if lidar and lidar in tree.above(survey.frame):
+        note = (
+            f"{path}: clouds are in {lidar!r}, in which odometry itself moves; choose those of the lidar: --cloud-topic"
+        )
+        return _Mounted(Mount(), notes=(note,))
+    if lidar and survey.body and lidar != survey.body:
+        note = (
+            f"{path}: clouds are in frame {lidar!r}, odometry moves {survey.body!r}: taken for one; "
+            "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
+        )
+        return _Mounted(Mount(), notes=(note,))
+    return _Mounted(Mount())
 
 
 def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Track:
@@ -257,7 +359,7 @@ def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Tr
     if lone:
         return Track(np.array(survey.stamps, np.int64), np.tile(np.eye(4), (len(survey.stamps), 1, 1)))
     if not survey.odometry:
-        raise RunError(f"{path}: not one usable odometry message; give --odometry FILE")
+        raise RunError(f"{path}: not one usable odometry message; {_NO_ODOMETRY}")
     stamps = np.array([stamp for stamp, _ in survey.odometry], np.int64)
     steady = _steady(path, stamps, "odometry")
     return Track(stamps[steady], np.array([T for _, T in survey.odometry])[steady])
@@ -291,7 +393,7 @@ def _in_order(path: Path, survey: _Survey) -> tuple[Ints, Ints, Bools, Bools]:
     return in_order, arrivals[steady][order], fresh, steady
 
 
-def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: Mount) -> Run:
+def _pair(reader: BagReader, topic: _Topic, survey: _Survey, track: Track, mount: _Mounted) -> Run:
     """Return the run of the clouds in order of their stamps, without those that have no odometry."""
     path = reader.path
     stamps, arrivals, fresh, steady = _in_order(path, survey)
@@ -313,13 +415,9 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: M
         notes.append(f"{path}: {len(steady) - int(chosen.sum())} of {len(steady)} clouds left out: {text}")
     if survey.damaged:
         notes.append(f"{path}: {survey.damaged} damaged messages left out")
-    if survey.lidar and survey.body and survey.lidar != survey.body and mount == Mount():
-        notes.append(
-            f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
-            "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
-        )
+    notes += (*survey.notes, *mount.notes)
     source = BagClouds(reader, topic, stamps[chosen], arrivals[chosen], track, poses[chosen], mount)
-    return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes), mount)
+    return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes), mount.mount)
 
 
 def _span(stamps: Ints) -> str:

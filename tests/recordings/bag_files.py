@@ -7,13 +7,22 @@ from pathlib import Path
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+LIVOX = "livox_ros_driver2/msg/CustomMsg"
+_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+_CUSTOM = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+)
+for store in (STORE, ROS1):
+    store.register(get_types_from_msg(_POINT, LIVOX.replace("Msg", "Point")) | get_types_from_msg(_CUSTOM, LIVOX))
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
 KINDS = {"f4": 7, "u4": 6, "f8": 8}
 LATE = 777_000_000_000  # ns: the recorder's clock is another one
 
@@ -73,6 +82,31 @@ def odometry(stamp_ns: int, T: np.ndarray, child: str = "body"):
             covariance=np.zeros(36),
         ),
     )
+
+
+def transforms(stamp_ns: int, *edges: tuple[str, str, np.ndarray]):
+    """TFMessage of (parent, child, T_parent_child)."""
+    messages = []
+    for parent, child, T in edges:
+        x, y, z = T[:3, 3]
+        qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
+        moved = message(
+            "geometry_msgs/msg/Transform",
+            translation=message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+        values = {"header": header(stamp_ns, parent), "child_frame_id": child, "transform": moved}
+        messages.append(message("geometry_msgs/msg/TransformStamped", **values))
+    return message(TRANSFORMS, transforms=messages)
+
+
+def livox(stamp_ns: int, points: np.ndarray, times: np.ndarray, frame: str = "livox_frame"):
+    rows = [
+        message(LIVOX.replace("Msg", "Point"), offset_time=int(t), x=x, y=y, z=z, reflectivity=9, tag=0, line=k % 4)
+        for k, ((x, y, z), t) in enumerate(zip(points, times, strict=True))
+    ]
+    head = {"header": header(stamp_ns, frame), "timebase": stamp_ns, "point_num": len(rows), "lidar_id": 1}
+    return message(LIVOX, **head, rsvd=np.zeros(3, np.uint8), points=rows)
 
 
 def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compression: str = "") -> Path:

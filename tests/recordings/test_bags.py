@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_files import LATE, cloud, odometry, write_bag
+from bag_files import LATE, cloud, livox, odometry, transforms, write_bag
 
 from coview_stream.cli import main
 from coview_stream.clouds import write_tum
@@ -204,6 +204,101 @@ def test_different_lidar_and_odometry_frames_are_noted(tmp_path):
     assert "clouds are in frame 'velodyne', odometry moves 'body': taken for one" in run.notes[0]
 
 
+MOUNT = parse_mount("180,0,30,0.2,0,0.5")
+ON_PLATE = parse_mount("0,0,90,0.1,0,0.3").T_body_sensor
+
+
+def mounted_bag(path, *, odom=True, tree=(), frame="livox_frame"):
+    """A lidar on a plate on the body, as ``/tf_static`` has it, whose clouds are POINTS in the body's frame."""
+    points = transform(inverse(MOUNT.T_body_sensor), POINTS.astype(np.float64)).astype(np.float32)
+    lidar = ("plate", "livox_frame", inverse(ON_PLATE) @ MOUNT.T_body_sensor)
+    topics = {"/points": [cloud(ns, points, frame=frame) for ns in CLOUD_NS],
+              "/tf_static": [transforms(START, ("base_link", "plate", ON_PLATE), lidar)]}  # fmt: skip
+    if odom:
+        topics["/odom"] = [odometry(ns, T_at(ns), "base_link") for ns in ODOMETRY_NS]
+    if tree:
+        topics["/tf"] = [transforms(ns, *tree(ns)) for ns in ODOMETRY_NS]
+    return write_bag(path, topics)
+
+
+@pytest.mark.parametrize("name", ["bag", "ros1.bag"])
+def test_mount_is_read_from_static_transforms(tmp_path, name):
+    run = open_run(mounted_bag(tmp_path / name))
+    assert "/tf_static has the lidar 'livox_frame' on 'base_link': --mount=180,0,30,0.2,0,0.5 is taken" in run.notes[0]
+    assert len(run.notes) == 1
+    np.testing.assert_allclose(run.mount.T_body_sensor, MOUNT.T_body_sensor, atol=1e-12)
+    np.testing.assert_allclose(run.read(3).points, POINTS + 0, atol=1e-4)
+
+
+def test_given_mount_overrides_static_transforms_and_says_so(tmp_path):
+    bag = mounted_bag(tmp_path / "bag")
+    run = open_run(bag, mount=parse_mount("180,0,0"))
+    says = "--mount=180,0,0 is taken; /tf_static has the lidar 'livox_frame' on 'base_link': --mount=180,0,30,0.2,0,0.5"
+    assert run.notes == (f"{bag}: {says}",)
+    assert np.abs(run.read(0).points - POINTS).max() > 1.0
+    assert open_run(bag, mount=MOUNT).notes == ()
+
+
+def test_mount_is_told_and_not_taken_where_a_file_has_the_odometry(tmp_path):
+    write_tum(tmp_path / "a.tum", [1e-9 * ns for ns in CLOUD_NS], [T_at(ns) for ns in CLOUD_NS])
+    run = open_run(mounted_bag(tmp_path / "bag"), tmp_path / "a.tum")
+    assert run.mount.option == "0,0,0"
+    assert "--mount=180,0,30,0.2,0,0.5; give it if" in run.notes[0]
+
+
+def test_odometry_is_read_from_transforms_where_no_topic_has_it(tmp_path):
+    def tree(ns):
+        wheel = pose_from(rot_z(1e-9 * (ns - START)), (0.3, 0.2, 0.0))
+        T_map_odom = pose_from(np.eye(3), (1e-9 * (ns - START), 5.0, 0.0))
+        return ("base_link", "wheel", wheel), ("odom", "base_link", T_at(ns)), ("map", "odom", T_map_odom)
+
+    run = open_run(mounted_bag(tmp_path / "bag", odom=False, tree=tree))
+    assert len(run.notes) == 2
+    assert "odometry is read from /tf: odom <- base_link" in run.notes[0]
+    assert "--mount=180,0,30,0.2,0,0.5 is taken" in run.notes[1]
+    for T, ns in zip(run.poses, CLOUD_NS, strict=True):
+        np.testing.assert_allclose(T, T_at(ns), atol=1e-4)
+    both = open_run(mounted_bag(tmp_path / "both", tree=tree), odometry_topic="/tf")
+    np.testing.assert_allclose(both.poses, run.poses)
+
+
+def test_recording_whose_transforms_do_not_move_offers_lidar_odometry(tmp_path):
+    with pytest.raises(RunError, match=r"in /tf above the lidar \(base_link <- plate <- livox_frame\); make.*kiss-icp"):
+        open_run(mounted_bag(tmp_path / "bag", odom=False))
+
+
+def test_clouds_in_odometrys_frame_are_taken_back_into_the_body(tmp_path):
+    """As FAST-LIO's /cloud_registered."""
+    seen = [transform(T_at(ns), POINTS.astype(np.float64)).astype(np.float32) for ns in CLOUD_NS]
+    registered = [cloud(ns, points, frame="odom") for ns, points in zip(CLOUD_NS, seen, strict=True)]
+    bag = write_bag(tmp_path / "bag", {"/cloud_registered": registered, "/Odometry": driven()})
+    run = open_run(bag)
+    assert "clouds are in odometry's frame 'odom'" in run.notes[0]
+    assert "say so: --mount=0,0,0" in run.notes[0]
+    np.testing.assert_allclose(run.read(5).points, POINTS, atol=2e-3)
+    own = open_run(bag, mount=parse_mount("0,0,0"))
+    np.testing.assert_array_equal(own.read(5).points, seen[5])
+
+
+def test_clouds_in_the_maps_frame_are_named(tmp_path):
+    bag = mounted_bag(tmp_path / "bag", tree=lambda _: [("map", "odom", np.eye(4))], frame="map")
+    assert "clouds are in 'map', in which odometry itself moves" in open_run(bag).notes[0]
+
+
+@pytest.mark.parametrize("name", ["bag", "ros1.bag"])
+def test_livox_clouds_are_read_with_their_times(tmp_path, name):
+    times = np.linspace(0, 99_000_000, len(POINTS)).astype(int)
+    messages = [livox(ns, POINTS + np.float32(k), times) for k, ns in enumerate(CLOUD_NS)]
+    still = [odometry(ns, np.eye(4)) for ns in ODOMETRY_NS]
+    run = open_run(write_bag(tmp_path / name, {"/livox/lidar": messages, "/odom": still}))
+    np.testing.assert_array_equal(run.read(4).points, POINTS + np.float32(4))
+    message = run.source.message(4)
+    np.testing.assert_allclose(message.times, 1e-9 * times)
+    assert message.rings.tolist()[:5] == [0, 1, 2, 3, 0]
+    moving = open_run(write_bag(tmp_path / f"moving_{name}", {"/livox/lidar": messages, "/odom": driven()}))
+    assert 0.1 < np.abs(moving.read(4).points - POINTS - 4).max() < 3.0  # deskewed
+
+
 def _cut(bag):
     file = only_file(bag)
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
@@ -249,7 +344,7 @@ def test_unreadable_bags_are_refused_with_reason(tmp_path, storage, compression,
         ({}, r"no topic with sensor_msgs/msg/PointCloud2; record one: it has no topics at all"),
         ({"/odom": driven()}, r"no topic with sensor_msgs.*it has /odom \(nav_msgs/msg/Odometry\)"),
         ({"/points": [], "/odom": driven()}, "not one cloud"),
-        ({"/points": clouds()}, r"no topic with nav_msgs/msg/Odometry; give --odometry FILE"),
+        ({"/points": clouds()}, r"no topic with nav_msgs/msg/Odometry; make it of the clouds: --odometry kiss-icp, or"),
         ({"/points": [b"\0\1\0\0"] * 3, "/odom": driven()}, "not one cloud"),
         ({"/points": clouds([0, 0, 0]), "/odom": driven()}, r"0\.000 to 0\.000 s, odometry 17.*clocks the same"),
         ({"/points": clouds(), "/odom": driven([*ODOMETRY_NS, START - 10**10, START])}, "odometry go back by 1"),

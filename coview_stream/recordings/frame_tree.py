@@ -1,0 +1,117 @@
+"""Frames of a recording, from ``/tf_static`` and ``/tf``: where the lidar is mounted, and odometry's frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from coview_stream.errors import MessageError
+from coview_stream.geometry.transforms import Pose, inverse
+from coview_stream.messages.validation import checked_pose, stamp_join
+
+TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_BODIES = ("base_link", "base_footprint", "base_frame", "body")
+"""Usual names of the body, the first that a tree has."""
+_WORLDS = ("map", "world", "earth", "utm", "global")
+"""Frames above odometry's."""
+_SAME = 1e-6  # of a transform that is repeated
+_MAX_FRAMES = 1000  # a hostile recording could name millions
+
+
+def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
+    """Yield stamp in ns, parent, child and T_parent_child (4, 4) of a TFMessage in CDR; MessageError if damaged."""
+    if payload[:2] not in (b"\0\0", b"\0\1"):
+        raise MessageError("not a message in CDR")
+    order, at = (">", "<")[payload[1]], 4
+
+    def take(kinds: str, align: int) -> tuple[float, ...]:
+        nonlocal at
+        at = 4 + (at - 4 + align - 1 & -align)
+        values = struct.unpack_from(order + kinds, payload, at)
+        at += struct.calcsize(order + kinds)
+        return values
+
+    def name() -> str:
+        nonlocal at
+        length = int(take("I", 4)[0])
+        at += length
+        return payload[at - length : at].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+    try:
+        for _ in range(int(take("I", 4)[0])):
+            sec, nanosec = take("iI", 4)
+            parent, child = name(), name()
+            numbers = take("7d", 8)
+            yield stamp_join(int(sec), int(nanosec)), parent, child, checked_pose(numbers[:3], numbers[3:])
+    except struct.error as error:
+        raise MessageError("the message is truncated") from error
+
+
+class FrameTree:
+    """Tree of a recording's frames.
+
+    Attributes:
+        lidar: frame of the clouds, once it is known; only what moves above it is kept.
+    """
+
+    def __init__(self) -> None:
+        self.lidar = ""
+        self._parents: dict[str, tuple[str, Pose]] = {}  # by child
+        self._moved: set[str] = set()  # ROS 1 repeats transforms on /tf that never change
+        self._samples: dict[str, list[tuple[int, Pose]]] = {}  # by child, of those that are not static
+
+    def add(self, payload: bytes, static: bool) -> None:
+        """Add the transforms of a TFMessage in CDR; MessageError if it is damaged."""
+        for stamp_ns, parent, child, T in read_transforms(payload):
+            if child not in self._parents and len(self._parents) < _MAX_FRAMES:
+                self._parents[child] = parent, T
+            before = self._parents.get(child)
+            if static or before is None or before[0] != parent:
+                continue
+            if np.abs(T - before[1]).max() > _SAME:
+                self._moved.add(child)
+            if not self.lidar or child in self.above(self.lidar):
+                self._samples.setdefault(child, []).append((stamp_ns, T))
+
+    def body(self) -> str:
+        """Return the robot's frame by its usual names; empty if there is none above the lidar."""
+        above = self.above(self.lidar)
+        return next((name for name in _BODIES if name in above), "")
+
+    def mount(self, body: str) -> Pose | None:
+        """Return T_body_lidar (4, 4); None if the frames are not connected, or move against each other."""
+        of_body, of_lidar = self.above(body), self.above(self.lidar)
+        common = next((name for name in of_lidar if name in of_body), None)
+        if common is None:
+            return None
+        T_common = []
+        for names in (of_body, of_lidar):
+            T = np.eye(4)
+            for child in names[: names.index(common)]:
+                if child in self._moved:
+                    return None
+                T = self._parents[child][1] @ T
+            T_common.append(T)
+        return np.asarray(inverse(T_common[0]) @ T_common[1])
+
+    def odometry(self) -> tuple[str, str, list[tuple[int, Pose]]] | None:
+        """Return odometry's frame, the body's, and stamps in ns with T_odom_body (4, 4); None if there is none.
+
+        It is the highest transform above the lidar that moves, or is called odometry, but not in the map.
+        """
+        moving = [child for child in self.above(self.lidar)[:-1] if child in self._samples and self._is_odometry(child)]
+        moving = [child for child in moving if self._parents[child][0] not in _WORLDS] or moving[:1]
+        return (self._parents[moving[-1]][0], moving[-1], self._samples[moving[-1]]) if moving else None
+
+    def _is_odometry(self, child: str) -> bool:
+        return child in self._moved or "odom" in self._parents[child][0]
+
+    def above(self, name: str) -> list[str]:
+        """Return a frame and those above it, upward."""
+        names = [name]
+        while names[-1] in self._parents and self._parents[names[-1]][0] not in names:
+            names.append(self._parents[names[-1]][0])
+        return names
