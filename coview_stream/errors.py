@@ -77,7 +77,7 @@ EXTRA_OF = {
     "pyproj": "geo",
     "distributed": "cluster",
     "obstore": "s3",
-    "open3d": "build",
+    "open3d": "open3d",
     "CSF": "build",
     "matplotlib": "plot",
     "pye57": "e57",

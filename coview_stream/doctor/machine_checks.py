@@ -40,7 +40,7 @@ _CODECS = {
 
 _PARTS = {
     "node": (("scipy", "gtsam", "onnxruntime"), "serve, locate, replay"),
-    "build": (("open3d", "laspy", "pyproj"), "build, simulate, demo"),
+    "build": (("pyproj", "laspy"), "build, simulate, demo"),
     "plot": (("matplotlib",), "pictures"),
 }
 """Modules of each extra, the first of which tells whether it is installed, and the commands that need it."""

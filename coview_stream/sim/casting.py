@@ -1,4 +1,4 @@
-"""First hits of rays on meshes: by Open3D (Embree) where it loads, elsewhere by our own kernel, which is slower."""
+"""First hits of rays on meshes: by Open3D (Embree) where that is installed, else by our own kernel, which is slower."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _remedy(error: ImportError) -> str:
                 f"Ubuntu with `apt-get install {package}`{extra}"
             )
     if isinstance(error, ModuleNotFoundError) and error.name == "open3d":
-        return "Open3D is not installed; pip install 'coview-stream[build]'"
+        return "Open3D is not installed; pip install 'coview-stream[open3d]'"
     return f"Open3D cannot be loaded ({reason}); reinstall it with `pip install --force-reinstall open3d-cpu`"
 
 
