@@ -11,7 +11,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from coview_kernels import StationCodes
 from coview_kernels.arrays import I16
@@ -24,6 +23,7 @@ from coview_stream.basemap.tiles import Key, unit_normals
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
+from coview_stream.geometry.rasters import max_filter
 from coview_stream.geometry.transforms import Points
 
 TOO_LARGE = "too large to be searched as one; open a part of the site, --around X,Y,RADIUS"
@@ -239,5 +239,4 @@ def surveyed_around(cells: Ints, block: float) -> tuple[npt.NDArray[np.uint8], F
     columns, rows = (cells - low).T
     grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)
     grid[rows, columns] = True
-    square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
-    return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block
+    return (max_filter(grid.astype(np.float32), 2 * _SURVEY_MARGIN + 1) > 0.0).astype(np.uint8), low * block

@@ -51,6 +51,21 @@ def between(before: Floats, now: Floats) -> Floats:
     return np.stack([x, y, _wrapped(gap[..., 2])], axis=-1)
 
 
+def smoothly_between(at: Floats, stamps: Floats, poses: Floats) -> Floats:
+    """Return poses (L, 3) at moments (L,) by cubics between those (N, 3) at their stamps, with speeds by differences.
+
+    The headings are those of a path, not wrapped.
+    """
+    after = np.clip(np.searchsorted(stamps, at, side="right"), 1, len(stamps) - 1)
+    span = (stamps[after] - stamps[after - 1])[:, None]
+    s = (at - stamps[after - 1])[:, None] / span
+    speed = np.gradient(poses, stamps, axis=0)
+    start, end = poses[after - 1], poses[after]
+    leaving, arriving = span * speed[after - 1], span * speed[after]
+    cubic = leaving + arriving + 2.0 * (start - end)
+    return np.asarray(start + s * (leaving + s * (end - start - leaving - cubic + s * cubic)))
+
+
 def _turned(angle: Floats, v: Floats) -> tuple[Floats, Floats]:
     c, s = np.cos(angle), np.sin(angle)
     return c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.distributions import f_quantile
 
 RISK = 1e-3
 """Probability with which an error may exceed its level; in space, in the plane, in height and in angle each."""
@@ -104,10 +105,8 @@ def axes_of(covariance: Floats) -> tuple[float, float]:
 
 def _quantile(covariance: Floats, factor: float, freedom: float, risk: float) -> float:
     """Norm that an error with a covariance (K, K) exceeds with the probability ``risk``."""
-    from scipy.special import fdtri
-
     trace, axes = axes_of(covariance)
-    return factor * float(np.sqrt(trace * fdtri(axes, freedom, 1.0 - risk)))
+    return factor * float(np.sqrt(trace * f_quantile(axes, freedom, risk)))
 
 
 LEAST = 1e-9

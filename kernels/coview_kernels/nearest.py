@@ -124,3 +124,4 @@ SAMPLE_GRID = PointGrid.sorted(SAMPLE, Cells(np.ones(8), np.array([0, 2], np.int
 """A sorted cloud for the calls of :func:`compiled_by`: few clouds are sorted here, most come so from the map."""
 
 compiled_by("nearest", lambda: nearest(SAMPLE_GRID, SAMPLE, 1.0))
+compiled_by("PointGrid", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))

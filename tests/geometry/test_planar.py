@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 
 from coview_stream.geometry.planar import (
     between,
@@ -12,6 +13,7 @@ from coview_stream.geometry.planar import (
     planar_covariance,
     planar_motion,
     planar_pose,
+    smoothly_between,
     spatial,
 )
 from coview_stream.geometry.transforms import inverse
@@ -45,3 +47,11 @@ def test_a_covariance_turns_into_the_axes_of_the_pose():
     covariance[3, 2] = covariance[2, 3] = 0.2  # the map's x, with the heading
     left = planar_covariance(covariance, spatial(np.array([5.0, 6.0, np.pi / 2])))
     assert left == pytest.approx(np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -0.2], [0.0, -0.2, 0.1]]))
+
+
+def test_smoothly_between_is_hermites_cubic():
+    rng = np.random.default_rng(4)
+    stamps, poses = np.cumsum(rng.uniform(0.01, 1.0, 30)), rng.normal(size=(30, 3))
+    at = np.array([stamps[0], 0.3 * stamps[3] + 0.7 * stamps[4], stamps[7], stamps[-1]])
+    expected = CubicHermiteSpline(stamps, poses, np.gradient(poses, stamps, axis=0))(at)
+    np.testing.assert_allclose(smoothly_between(at, stamps, poses), expected, atol=1e-12)

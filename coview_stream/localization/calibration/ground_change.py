@@ -21,7 +21,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter, uniform_filter1d
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
@@ -156,7 +155,7 @@ class GroundChange:
         self._structure *= math.exp(-driven / _SEEN)
         structure = structure_fits(self._scan, T_map_source, target, _SHIFTS)
         if structure is not None:
-            self._structure += _STRUCTURE * np.interp(_HEIGHTS, _SHIFTS, uniform_filter1d(structure, _BLUR))
+            self._structure += _STRUCTURE * np.interp(_HEIGHTS, _SHIFTS, _blurred(structure))
         return self._rise()
 
     @property
@@ -284,9 +283,7 @@ class _Patches:
         odds = math.log(kept / (1.0 - kept)) + np.clip(np.log(same[0] / other[0]), -_ODDS, _ODDS)
         total, known = np.zeros((2, self._shape[0] * self._shape[1]))
         total[self._known], known[self._known] = odds, 1.0
-        total, known = (
-            uniform_filter(each.reshape(self._shape), 3, mode="constant").ravel() for each in (total, known)
-        )
+        total, known = (_with_neighbours(each.reshape(self._shape)).ravel() for each in (total, known))
         mean = total / np.maximum(known, 1e-9)
         around = mean[self._known]
         mean[self._known] = np.where(around * odds < 0.0, around + 0.5 * odds, odds)
@@ -300,3 +297,15 @@ class _Patches:
         other = sum(share * np.exp(-np.abs(at) / size) / (2.0 * size) for size, share in _CHANGES)
         logs = np.stack([np.log(u * same + (1.0 - u) * other).sum(axis=1) for u in _KEPT])
         return _INDEPENDENT * logs, np.maximum(same, 1e-12), np.asarray(other)
+
+
+def _blurred(values: Floats) -> Floats:
+    """Return the means (N,) of values (N,) within :data:`_BLUR` of each, mirrored at the ends."""
+    return np.convolve(np.pad(values, _BLUR // 2, mode="symmetric"), np.full(_BLUR, 1.0 / _BLUR), mode="valid")
+
+
+def _with_neighbours(values: Floats) -> Floats:
+    """Return the sums (H, W) of each cell and the eight around it."""
+    rows = np.pad(values, 1)
+    rows = rows[:-2] + rows[1:-1] + rows[2:]
+    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])

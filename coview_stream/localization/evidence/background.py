@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.distributions import normal_quantile
 from coview_stream.localization.evidence.observation import ObservedScan, Share
 
 # prior, set by hand
@@ -79,9 +79,9 @@ def scatter(observed: Floats32) -> Floats:
     count = len(observed)
     shares = np.sort(_compared(observed), axis=0)
     levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
-    reach = (levels[1:] - levels[0]) / ndtri(np.array(_TAIL) / 100.0)[:, None]
+    reach = (levels[1:] - levels[0]) / np.array([normal_quantile(percent / 100.0) for percent in _TAIL])[:, None]
     if count >= _MANY:  # the second largest, by Blom's plotting position; the largest may be a twin of the right place
-        last = (shares[-2] - levels[0]) / ndtri((count - 1.375) / (count + 0.25))
+        last = (shares[-2] - levels[0]) / normal_quantile((count - 1.375) / (count + 0.25))
         reach = np.vstack([reach, last])
     return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
 

@@ -27,9 +27,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaln
 
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.distributions import log_beta
 from coview_stream.localization.evidence.background import Background, outcomes
 from coview_stream.localization.evidence.observation import Share
 
@@ -109,7 +109,7 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
 
 
 def _beta(x: Floats, a: float, b: float) -> Floats:
-    return np.asarray((a - 1.0) * np.log(x) + (b - 1.0) * np.log1p(-x) - betaln(a, b))
+    return np.asarray((a - 1.0) * np.log(x) + (b - 1.0) * np.log1p(-x) - log_beta(a, b))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats
@@ -116,7 +115,7 @@ def _explained(field: kernels.FieldMap, points: Points, structure: Points, shift
     near = np.flatnonzero(kernels.near_structure(field, flat, place))
     out = np.zeros(len(flat))
     if len(near):
-        distance, _ = cKDTree(structure).query(flat[near], distance_upper_bound=_TAKEN)
+        distance, _ = kernels.nearest(kernels.PointGrid(structure), flat[near], _TAKEN)
         out[near[~np.isfinite(distance)]] = 1.0
     return out.reshape(len(shifts), len(points))
 

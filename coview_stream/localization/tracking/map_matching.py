@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
 
 from coview_kernels import Prior
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.distributions import chi2_quantile, chi2_tail
 from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.evidence.observation import Evidence, ObservedScan
@@ -219,11 +219,11 @@ class MapMatcher:
             return match
         gap = match.T_map_body[:3, 3] - T_map_predicted[:3, 3]
         spread = belief.covariance[3:, 3:] + match.covariance[3:, 3:]
-        rare = chdtrc(6, rule.max_innovation)  # probability beyond which nothing is plausible
-        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
+        rare = chi2_tail(6, rule.max_innovation)  # probability beyond which nothing is plausible
+        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chi2_quantile(3, rare)
         if here and not matters(0.0, degrees):
             return replace(match, moves_place=True)
-        level = gap[2] ** 2 <= chdtri(1, rare) * spread[2, 2]
+        level = gap[2] ** 2 <= chi2_quantile(1, rare) * spread[2, 2]
         moves = here or (level and not matters(metres, degrees))  # here, but turned; or so near that it does not matter
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
@@ -108,7 +107,8 @@ class CloudMotionMeter:
         if float(np.abs(motion).max()) < _NEAR_ZERO:
             rows = _some_structure(scan)
             points = before.levelled(calibration) - before.position.astype(np.float32)
-            same = float((cKDTree(points).query(transform(none, scan.points[rows]))[0] < _SAME).mean())
+            grid = kernels.PointGrid(points)
+            same = float((kernels.nearest(grid, transform(none, scan.points[rows]), _SAME)[0] < _SAME).mean())
         return CloudMotion(motion, covariance, best[2], usual, inverse(before.T_odom_body) @ T_now, same)
 
     def _registered(

@@ -8,11 +8,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
-from scipy.special import chdtri
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.distributions import chi2_quantile
 from coview_stream.geometry.planar import (
     between,
     compose,
@@ -20,6 +19,7 @@ from coview_stream.geometry.planar import (
     planar_covariance,
     planar_motion,
     planar_pose,
+    smoothly_between,
     spatial,
 )
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
@@ -320,7 +320,7 @@ class Witness:
             return np.stack([np.interp(at, stamps, column) for column in poses.T], axis=1)
         first = max(0, int(np.searchsorted(stamps, at[-1])) - _RECENT)
         stamps, poses = stamps[first:], poses[first:]
-        return np.asarray(CubicHermiteSpline(stamps, poses, np.gradient(poses, stamps, axis=0))(at))
+        return smoothly_between(at, stamps, poses)
 
     def _unsure(self, stamp: float) -> Floats:
         """Return half of the products (L,) of the seconds to the frames of odometry before and after, by LAGS."""
@@ -333,7 +333,7 @@ class Witness:
 def _contradicts(o: Floats, noise: Floats, seen: CloudMotion) -> bool:
     """Return whether the clouds' motion is one that odometry's errors explain once in a thousand."""
     gap = between(o, seen.motion)
-    return float(gap @ np.linalg.solve(noise + seen.covariance, gap)) > float(chdtri(3, _RISK))
+    return float(gap @ np.linalg.solve(noise + seen.covariance, gap)) > chi2_quantile(3, _RISK)
 
 
 def _on_map(before: Estimate | None, now: Estimate | None) -> Seen | None:

@@ -60,7 +60,7 @@ class TrackEngine(Engine):
 
     kernels = ("transform_unique", "nearest", "align_planes")
     # of robots that have a place to be tracked from, which takes a search longer than it does to load them
-    later_kernels = ("crop_points", "field_scores")
+    later_kernels = ("crop_points", "field_scores", "PointGrid")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -122,6 +122,7 @@ class SearchEngine(Engine):
     """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = GlobalSearch.KERNELS
+    later_kernels = ("PointGrid",)  # of a place that has been accepted
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
