@@ -305,7 +305,7 @@ def _blurred(values: Floats) -> Floats:
 
 
 def _with_neighbours(values: Floats) -> Floats:
-    """Return the sums (H, W) of each cell and the eight around it."""
+    """Return the sums (H, W) of each cell and its eight neighbours: zero where all are, unlike a running sum."""
     rows = np.pad(values, 1)
     rows = rows[:-2] + rows[1:-1] + rows[2:]
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])

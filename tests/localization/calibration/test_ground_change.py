@@ -78,6 +78,20 @@ def test_ground_as_surveyed_is_kept_and_other_heights_become_improbable(site):
     assert change.metres == 0.0
 
 
+def test_ground_far_from_any_that_the_survey_has_is_kept_to_the_last_point(site):
+    xy = np.stack(np.meshgrid(*[np.arange(-78.0, 79.0, 4.0)] * 2), axis=-1).reshape(-1, 2)
+    far = np.column_stack([xy, site.level(xy)])[np.abs(xy).max(axis=1) > 48.0].astype(np.float32)
+    none = np.zeros(len(far), dtype=bool)
+    for change in (GroundChange(site.field) for _ in range(5)):
+        for _ in range(2):
+            scan = site.now()
+            points = np.concatenate([scan.points, far])
+            above, height = np.append(scan.above, none), np.append(scan.height, np.zeros(len(far), dtype=np.float32))
+            wide = RegistrationCloud(points, above, height)
+            left, _ = view(change, site, wide)
+        assert (np.abs(left.points[:, :2]).max(axis=1) > 48.0).sum() == len(far)
+
+
 def test_ground_that_is_dug_beside_the_robot_is_left_out_and_the_height_stays(site):
     """As on the ramp of a pit: half of the patches lie below the survey's, at many depths."""
 
