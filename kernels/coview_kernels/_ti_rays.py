@@ -2,7 +2,7 @@
 """Taichi source of rays.py: each ray goes down the tree, the nearer child first, and up again by the nodes' numbers."""
 
 from coview_kernels import runtime
-from coview_kernels.reference.rays import EDGE, LEAST, SLACK, THIN
+from coview_kernels.reference.rays import EDGE, LEAST, THIN
 
 ti = runtime.library()
 
@@ -10,6 +10,7 @@ FLOATS = ti.types.ndarray(ti.f32, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 
 NOWHERE = 1e30  # metres
+SLACK = 1e-6  # of a distance, and metres: more than rounding in float32 moves a side of a box
 
 
 @ti.func
@@ -35,6 +36,20 @@ def met(corners: ti.template(), at, o, d) -> ti.f64:
     return distance
 
 
+@ti.func
+def enters(boxes: ti.template(), at, o, whole, best):
+    """Tell whether a ray enters the box whose sides stand at ``at``, nearer than ``best``; all in float32.
+
+    ``whole`` is one over the ray's direction. Minima and maxima are spelt out: the library's care for NaN costs half.
+    """
+    near, far = ti.cast(0.0, ti.f32), best
+    for k in ti.static(range(3)):
+        one, other = (boxes[at + k] - o[k]) * whole[k], (boxes[at + 3 + k] - o[k]) * whole[k]
+        first, last = ti.select(one < other, one, other), ti.select(one < other, other, one)
+        near, far = ti.select(first > near, first, near), ti.select(last < far, last, far)
+    return near <= far + ti.cast(SLACK, ti.f32) * (1 + far)
+
+
 @runtime.kernel
 def cast(boxes: FLOATS, axes: WHOLES, corners: FLOATS, rays: FLOATS, distance: FLOATS, found: WHOLES):
     """Write the distance to the first triangle of each ray, and its place among the corners (-1: none)."""
@@ -42,15 +57,12 @@ def cast(boxes: FLOATS, axes: WHOLES, corners: FLOATS, rays: FLOATS, distance: F
         leaves = axes.shape[0]
         size = corners.shape[0] // 9 // leaves
         o, d = three(rays, 6 * n), three(rays, 6 * n + 3)
-        whole = ti.Vector.zero(ti.f64, 3)
+        start, whole = ti.cast(o, ti.f32), ti.Vector.zero(ti.f32, 3)
         for k in ti.static(range(3)):
-            whole[k] = 1.0 / ti.select(ti.abs(d[k]) > LEAST, d[k], LEAST)
+            whole[k] = ti.cast(1.0 / ti.select(ti.abs(d[k]) > LEAST, d[k], LEAST), ti.f32)
         best, place, at = ti.cast(NOWHERE, ti.f64), -1, 1
         while at > 0:
-            one, other = (three(boxes, 6 * at) - o) * whole, (three(boxes, 6 * at + 3) - o) * whole
-            near = ti.max(ti.min(one, other).max(), 0.0)
-            far = ti.min(ti.max(one, other).min(), best)
-            inside = near <= far + SLACK * (1.0 + ti.abs(far))
+            inside = enters(boxes, 6 * at, start, whole, ti.cast(best, ti.f32))
             if inside and at < leaves:
                 at = 2 * at + ti.cast(rays[6 * n + 3 + axes[at]] < 0, ti.i32)
             else:
