@@ -3,7 +3,7 @@
     pip install uv && python .ci/check_platforms.py [--all]
 
 Prints a table: for each platform and Python, whether the robot's side, ``[node]`` and ``[all]`` resolve; takes minutes.
-Exit code 1 where one that README promises does not. ``--all``: also older glibc, of which some do not, and Windows.
+Exit code 1 where one that docs/small.md promises does not. ``--all``: also older glibc, and Windows.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROMISED = {
     "aarch64-manylinux_2_28": ("", "node"),
     "aarch64-apple-darwin": ("", "node"),
 }
-"""Platforms as uv names them, with the oldest glibc, and what README says resolves there."""
+"""Platforms as uv names them, with the oldest glibc, and what docs/small.md says resolves there."""
 
 TRIED = ("x86_64-manylinux_2_31", "x86_64-manylinux_2_17", "aarch64-manylinux_2_31", "x86_64-pc-windows-msvc")
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
