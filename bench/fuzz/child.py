@@ -39,8 +39,10 @@ with atheris.instrument_imports(include=["coview_stream", "rosbags", "laspy"]) i
     import rosbags.rosbag1
     import rosbags.rosbag2  # noqa: F401 - likewise
 
+    from bench.fuzz import wrong
     from coview_stream import messages
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.site.manifest import Manifest
     from coview_stream.clouds import read_cloud
     from coview_stream.clouds.trajectory import read_kitti_poses, read_times, read_tum
     from coview_stream.errors import CoViewError, MapError
@@ -69,6 +71,11 @@ def _file(name: str, read: Callable[[Path], object], data: bytes) -> object:
     path = _folder() / name
     path.write_bytes(data)
     return read(path)
+
+
+def _in_folder(whole: Callable[[Path, bytes], object], data: bytes) -> object:
+    os.environ["COVIEW_CACHE"] = str(_folder() / "cache")
+    return whole(_folder(), data)
 
 
 def _message(decode: Callable[[Sample, str], object], codec: str, data: bytes) -> object:
@@ -137,12 +144,15 @@ TARGETS: dict[str, Target] = {
     **{end: _P(_file, f"a.{end}", read_cloud) for end in ("las", "laz", "ply", "pcd", "npy", "bin")},
     "trajectory": _trajectory,
     "map": _P(_file, "a.coview", _map),
+    "manifest": lambda data: Manifest.from_bytes(data, "manifest.json"),
+    **{name: _P(_in_folder, whole) for name, whole in wrong.TARGETS.items()},
     "state": _state,
     **{end: _P(_file, f"a.{end}", _bag) for end in ("mcap", "db3", "bag")},
     "rpc": _rpc,
 }
 
 LIMIT_S = 10  # seconds of one input of a few kB: a hundred times more than any of them needs
+LIMIT_WHOLE_S = 60  # of a whole map, which is built
 MEMORY = 2 << 30  # bytes besides the libraries: LAZ and PCD may unpack to a hundred times
 MAX_INPUT = 32_768  # bytes: the largest seed, a database, has 28 kB
 _ODD = (bytes(4), b"\xff" * 4, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\xff" * 8, b"-1", b"1e999", b"nan", b"[")
@@ -151,9 +161,10 @@ _ODD = (bytes(4), b"\xff" * 4, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\xff"
 class Watch:
     """A target and its counts: executions, accepted inputs, findings by place."""
 
-    def __init__(self, target: Target, found: Path) -> None:
-        self._target, self._found, self._written = target, found, 0.0
-        self.books: dict[str, Any] = {"executions": 0, "values": 0, "places": {}}
+    def __init__(self, name: str, found: Path) -> None:
+        self._target, self._found, self._written = TARGETS[name], found, 0.0
+        self._limit = LIMIT_WHOLE_S if name in wrong.TARGETS else LIMIT_S
+        self.books: dict[str, Any] = {"executions": 0, "values": 0, "honest_mb": 0.0, "peak_mb": 0.0, "places": {}}
 
     def __call__(self, data: bytes) -> None:
         """Run one input."""
@@ -176,15 +187,20 @@ class Watch:
     def within_time(self, data: bytes) -> None:
         """Run one input; keep it as ``current`` in case it ends the process."""
         (self._found / "current").write_bytes(data)
-        faulthandler.dump_traceback_later(LIMIT_S, exit=True)
+        faulthandler.dump_traceback_later(self._limit, exit=True)
         self(data[:MAX_INPUT])
         faulthandler.cancel_dump_traceback_later()
 
     def write(self, done: bool = False) -> None:
         """Write the counts; ``done`` tells that no input ended the process."""
         self._written = time.monotonic()
+        self.books["peak_mb"] = _peak_mb()
         (self._found / "result.part").write_text(json.dumps(self.books | {"done": done}))
         (self._found / "result.part").replace(self._found / "result.json")
+
+
+def _peak_mb() -> float:
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
 def mutated(rng: random.Random, seeds: list[bytes]) -> bytes:
@@ -212,7 +228,7 @@ def main(names: str, corpus: Path, found: Path, seconds: float, seed: int) -> No
             f"-max_total_time={max(1, round(seconds))}", f"-timeout={LIMIT_S}", "-rss_limit_mb=0", f"-seed={seed}",
             f"-max_len={MAX_INPUT}", f"-artifact_prefix={found}/",
         ]  # fmt: skip
-        watch = Watch(TARGETS[names], found)
+        watch = Watch(names, found)
         atheris.Setup([sys.argv[0], *options, str(found / "corpus"), str(corpus)], watch)
         atheris.Fuzz()
         return
@@ -220,13 +236,15 @@ def main(names: str, corpus: Path, found: Path, seconds: float, seed: int) -> No
     for name in names.split(","):
         place, own = (found, corpus) if seconds else (found / name, corpus / name)
         place.mkdir(exist_ok=True)
-        seeds = [path.read_bytes() for path in sorted(own.iterdir())]
-        watch = Watch(TARGETS[name], place)
+        files = sorted(own.iterdir(), key=lambda path: (not path.name.startswith("seed"), path.name))
+        seeds, watch = [path.read_bytes() for path in files], Watch(name, place)
         end = time.monotonic() + seconds
-        for data in [] if seconds else seeds:
-            watch.within_time(data)
+        for file, data in zip(files, seeds, strict=True):
+            (watch if seconds else watch.within_time)(data)  # the first one may build a map, and compile kernels
+            if file.name.startswith("seed"):
+                watch.books["honest_mb"] = _peak_mb()
         while time.monotonic() < end:
-            watch.within_time(mutated(rng, seeds))
+            watch.within_time(rng.randbytes(8) if name in wrong.TARGETS else mutated(rng, seeds))
         watch.write(done=True)
         (place / "current").unlink(missing_ok=True)
 

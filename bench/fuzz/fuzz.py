@@ -54,7 +54,7 @@ def rows(asked: argparse.Namespace) -> Iterator[Row]:
 def fuzzed(name: str, found: Path, seconds: float) -> dict[str, Any]:
     """Fuzz one target, again and again where an input ends the child."""
     (found / "corpus").mkdir(parents=True, exist_ok=True)
-    outcome: dict[str, Any] = {"executions": 0, "values": 0, "places": {}}
+    outcome: dict[str, Any] = {"executions": 0, "values": 0, "honest_mb": 0.0, "peak_mb": 0.0, "places": {}}
     end, attempt = time.monotonic() + seconds, 0
     while attempt == 0 or time.monotonic() < end - 1.0:
         attempt += 1
@@ -64,6 +64,7 @@ def fuzzed(name: str, found: Path, seconds: float) -> dict[str, Any]:
             books = json.loads((found / "result.json").read_text())
             outcome["executions"] += books["executions"]
             outcome["values"] += books["values"]
+            outcome |= {name: max(outcome[name], books[name]) for name in ("honest_mb", "peak_mb")}
             outcome["places"] |= books["places"]
         if code:  # keep the input that ended the child: libFuzzer's, or the one that had just begun
             lines = output.strip().splitlines() or [""]

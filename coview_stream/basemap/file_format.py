@@ -51,6 +51,7 @@ _TYPES = {
     "U8": "|u1",
 }  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}
+_TIERS = ("", ".rest")
 _Shape = tuple[str | int, ...]
 _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "origin": ("<f8", (3,)),
@@ -60,16 +61,9 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "tile_index": ("<i8", ("tiles", 4)),
     "surveyed": ("|u1", ("rows", "columns")),
     "surveyed_corner": ("<f8", (2,)),
-    **{
-        f"station_codes{tier}{part}": expected
-        for tier in ("", ".rest")
-        for part, expected in {
-            "": ("<i2", ("stations", 16, 16)),
-            ".basis": ("<f4", (16, 16, "columns of the basis", 2)),
-            ".step": ("<f4", (16, 2, 16)),
-            ".norm": ("<f4", (33,)),
-        }.items()
-    },
+    **{f"station_codes{tier}": ("<i2", ("stations", 16, 16)) for tier in _TIERS},
+    **{f"station_codes{tier}.step": ("<f4", (16, 2, 16)) for tier in _TIERS},
+    **{f"station_codes{tier}.norm": ("<f4", (33,)) for tier in _TIERS},
     "field.tiles": ("<i4", ("field tiles", 3)),
     "field.occupied": ("<i8", ("field tiles", FIELD_TILE, FIELD_TILE)),
     "field.ground": ("<i2", ("field tiles", FIELD_TILE, FIELD_TILE)),
@@ -83,6 +77,7 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
 """Type and shape of each array; dimensions of the same name have the same length."""
 _MAX_METRES = 1e7  # of a corner, a station or a point: no map of the Earth is larger
 MAX_AREA = 5.4e8  # square metres of the rectangle that holds a map: more than kernels count in int32
+_FEATURES_TILE = 32.0  # metres
 _BESIDE = 1300.0  # metres: a tile of a site, which the field may cover beside what has been surveyed
 _ROWS = 1 << 18  # points that are checked at a time
 
@@ -334,8 +329,13 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     Stations, field and ``points``, if they are asked for, must lie on the raster of surveyed cells: all other rasters
     are as large as it at most, and it is in the file.
     """
-    descriptor = ("<f2", ("stations", config.descriptor.rings, config.descriptor.sectors))
+    bins, channels = (config.descriptor.rings, config.descriptor.sectors), len(config.descriptor.channels)
+    descriptor = ("<f2", ("stations", *bins))
     expected = _EXPECTED | {f"descriptor.{name}": descriptor for name in config.descriptor.channels}
+    expected |= {
+        f"station_codes{tier}.basis": ("<f4", (16, 16, config.descriptor.rings * channels, 2)) for tier in _TIERS
+    }
+    expected["station_codes.sample"] = ("<f2", (channels, "sample", *bins))
     known: dict[str, int] = {}
     for name, (kind, dimensions) in expected.items():
         array = arrays.get(name)
@@ -360,13 +360,18 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     low, high = corner - config.block, corner + size + config.block
     for name in ("stations", "points") if points else ("stations",):
         _check_places(name, arrays[name], low, high)
-    if (field := arrays.get("field.tiles")) is not None and len(field):
-        edge = FIELD_CELL * FIELD_TILE
-        first, last = (
-            edge * np.asarray(each, dtype=np.float64)[1::-1] for each in (field.min(axis=0), field.max(axis=0))
-        )
-        if not ((first >= low - _BESIDE) & (last <= high + _BESIDE)).all():
-            raise _refused("field.tiles", "lies beside the surveyed cells")
+    # tiles of the field are (row, column), all else (x, y)
+    for name, unit, xy in (
+        ("field.tiles", FIELD_CELL * FIELD_TILE, [1, 0]),
+        ("learned.tiles", _FEATURES_TILE, [0, 1]),
+        ("learned.place_at", 1.0, [0, 1]),
+    ):
+        if (places := arrays.get(name)) is not None and len(places):
+            first, last = (
+                unit * np.asarray(each, dtype=np.float64)[xy] for each in (places.min(axis=0), places.max(axis=0))
+            )
+            if not ((first >= low - _BESIDE) & (last <= high + _BESIDE)).all():  # false for NaN as well
+                raise _refused(name, "lies beside the surveyed cells")
     # of each stretch of points once: nothing that is cut out of the map is larger than the map
     stretches = arrays["tile_index"][:, 2:]
     begin, end = stretches[np.lexsort(stretches.T)].T if len(stretches) else stretches.T

@@ -53,11 +53,13 @@ def all_positive(config: Any, *but: str) -> None:
     positive(config, *(f.name for f in fields(config) if f.name not in but))
 
 
-def counts(config: object, *names: str, minimum: int = 1) -> None:
-    """Refuse fields that are not whole numbers of at least ``minimum``."""
+def counts(config: object, *names: str, minimum: int = 1, maximum: int | None = None) -> None:
+    """Refuse fields that are not whole numbers of at least ``minimum``, and at most ``maximum``."""
     for name in names:
         value = getattr(config, name)
-        require(isinstance(value, int) and value >= minimum, config, name, f"a whole number >= {minimum}")
+        fits = isinstance(value, int) and value >= minimum and (maximum is None or value <= maximum)
+        most = "" if maximum is None else f" and <= {maximum}"
+        require(fits, config, name, f"a whole number >= {minimum}{most}")
 
 
 def fraction(config: object, *names: str) -> None:

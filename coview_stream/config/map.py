@@ -13,15 +13,19 @@ Channel = Literal["scan_context", "coview", "paper"]
 Preset = Literal["slam", "tls"]
 
 
+_FINEST = 0.01  # metres: finer than any laser scanner measures, and 10,000 km of it are still counted in int32
+
+
 @dataclass(frozen=True)
 class DescriptorConfig:
     """Polar descriptor of a virtual scan (paper, eqs 1-4); set by hand where the paper gives no value.
 
-    Stored in the map and read back from it, so that map and robot cannot drift apart.
+    Stored in the map and read back from it, so that map and robot cannot drift apart. A map may come from anyone:
+    ranges keep the work for a station within ten times that of the defaults.
 
     Attributes:
-        radius: metres that a descriptor reaches; the paper's.
-        rings: bins along it; at most 100,000 in all sectors.
+        radius: metres that a descriptor reaches; the paper's; at most 200.
+        rings: bins along it, 80 at most; at most 4,800 in all sectors.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together. ``scan_context`` is the greatest height of every bin. ``paper`` is the
             co-view context as printed (eqs 1-4): the greatest height of bins that are horizontally co-visible only, the
@@ -42,9 +46,11 @@ class DescriptorConfig:
     def __post_init__(self) -> None:
         check_types(self)
         positive(self, "radius", "voxel")
-        require(self.radius <= 1000, self, "radius", "at most 1000 m")
-        counts(self, "rings", "sectors", minimum=4)
-        require(self.rings * self.sectors <= 100_000, self, "sectors", "at most 100,000 bins in all rings")
+        require(self.radius <= 200, self, "radius", "at most 200 m")
+        require(self.voxel >= _FINEST, self, "voxel", f"at least {_FINEST} m")
+        counts(self, "rings", minimum=4, maximum=80)
+        counts(self, "sectors", minimum=4)
+        require(self.rings * self.sectors <= 4800, self, "sectors", "at most 4,800 bins in all rings")
         known = get_args(Channel)
         require(bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}")
         require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")
@@ -81,8 +87,10 @@ class MapConfig:
     def __post_init__(self) -> None:
         check_types(self)
         positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")
-        counts(self, "outlier_neighbours", minimum=0)
-        counts(self, "normal_neighbours", minimum=3)
+        counts(self, "outlier_neighbours", minimum=0, maximum=1000)
+        counts(self, "normal_neighbours", minimum=3, maximum=1000)
+        require(1.0 <= self.tile <= 1280.0, self, "tile", "of 1 to 1280 m")
+        require(self.voxel >= _FINEST, self, "voxel", f"at least {_FINEST} m")
         halves = self.block / 0.5  # stations must stand at the centres of the raster's cells
         require(abs(halves - round(halves)) < 1e-6, self, "block", "a multiple of 0.5 m")
         require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")

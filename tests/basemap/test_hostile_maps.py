@@ -143,6 +143,33 @@ def test_parameters_of_another_kind_are_refused(small: Any, tmp_path: Path, para
         BaseMap.load(tmp_path / "a.coview")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "flaw"),
+    [
+        ("rings", 40, r"station_codes\.basis has the shape"), ("sectors", 30, r"station_codes\.sample has the shape"),
+        ("channels", ["coview"], "station_codes"), ("rings", 320, "rings is 320"), ("sectors", 600, "sectors is 600"),
+        ("radius", 1000.0, "radius is 1000"), ("voxel", 1e-300, "voxel is 1e-300"),
+    ],
+)  # fmt: skip
+def test_counts_of_the_settings_are_those_of_the_arrays_and_within_bounds(
+    small: Any, tmp_path: Path, name: str, value: Any, flaw: str
+) -> None:
+    parameters = json.loads(json.dumps(small[1]))
+    parameters["config"]["descriptor"][name] = value
+    arrays = {name: values for name, values in small[0].items() if not name.startswith("descriptor")}
+    file_format.save(tmp_path / "a.coview", arrays, parameters)
+    with pytest.raises(MapError, match=flaw):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+@pytest.mark.parametrize(("name", "value"), [("learned.tiles", 30_000), ("learned.place_at", np.nan)])
+def test_features_lie_on_the_surveyed_cells(small: Any, name: str, value: float) -> None:
+    kind = file_format._EXPECTED[name][0]
+    arrays = small[0] | {name: np.array([[0, 0], [value, 0]]).astype(kind)}
+    with pytest.raises(MapError, match=f"{name} lies beside"):
+        file_format.check_arrays(arrays, BaseMap(*small).config)
+
+
 def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, tmp_path: Path) -> None:
     parameters = json.loads(json.dumps(small[1]))
     parameters["config"]["descriptor"]["channels"].append("coview_strict")  # of maps from before November 2026

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from coview_kernels import StationCodes
 from coview_stream.basemap.file_format import MAX_AREA, Arrays
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, layers_arrays
 from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, map_arrays
@@ -23,7 +24,7 @@ from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEn
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.stations import Described, describe_storeys
 from coview_stream.basemap.tiles import Key, sort_by_tile, unit_normals
-from coview_stream.config import config_of_map
+from coview_stream.config import MapConfig, config_of_map
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
@@ -63,14 +64,17 @@ def assemble(
         if progress:
             progress(done, steps)
 
-    if not sum(entry.stations for entry in entries):
+    counted, block = sum(entry.stations for entry in entries), config_of_map(manifest.parameters["config"]).block
+    if not counted:
         raise MapError("the site has no stations there; build it again, or ask for other tiles")
     across, down = (
         1 + max(numbers) - min(numbers) for numbers in zip(*((e.column, e.row) for e in entries), strict=True)
     )
-    if across * down * manifest.tile**2 > MAX_AREA:
-        area = across * down * manifest.tile**2 / 1e6
-        raise MapError(f"tiles in a rectangle of {area:.0f} km2, {MAX_AREA / 1e6:.0f} at most: {TOO_LARGE}")
+    area = across * down * manifest.tile**2
+    if (most := MAX_AREA * min(1.0, (block / MapConfig.block) ** 2)) < area:  # as many cells
+        raise MapError(f"tiles in a rectangle of {area / 1e6:.0f} km2, {most / 1e6:.0f} at most: {TOO_LARGE}")
+    if counted > StationCodes.MAX_STATIONS:
+        raise MapError(f"{counted} stations, {StationCodes.MAX_STATIONS} at most: {TOO_LARGE}")
     tiles = SiteTiles(manifest, store, entries, into, step)
     states = tiles.states(manifest)
     arrays, rows = map_arrays(tiles, into, None if earlier is None else earlier(states), step)

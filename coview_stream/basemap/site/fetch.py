@@ -25,8 +25,11 @@ from coview_stream.basemap.site.manifest import (
     LayerEntry,
     Manifest,
     TileEntry,
+    is_site,
     part_file,
+    read_manifest,
     tiles_around,
+    write_manifest,
 )
 from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
@@ -167,6 +170,7 @@ class Mirror:
         self.around = around
         self.offline = ""
         self._verify_key = verify_key
+        self._known: tuple[bytes, Manifest] | None = None  # newest manifest that was read, by the hash of its bytes
         name = hashlib.sha256(source.name.encode()).hexdigest()[:16]
         self.directory = cache_folder() / "sites" / name
         self._store = TileStore(self.directory)
@@ -190,13 +194,13 @@ class Mirror:
         try:
             self.refresh(progress, check=True)
         except (TransportError, MapError) as error:
+            if not is_site(self.directory):
+                raise
+            cached = Manifest.load(self.directory, key=self._verify_key)
             try:
-                cached = Manifest.load(self.directory)
                 wanted = self._wanted(cached)
             except MapError:
                 raise error from None
-            if self._verify_key is not None:
-                cached.check_signature(self._verify_key, str(self.directory))
             if isinstance(error, MapError) and not all(
                 self._store.is_whole(layer.sha256, layer.bytes) for layer, _ in wanted.values()
             ):
@@ -214,6 +218,13 @@ class Mirror:
             if keys is None or (tile.column, tile.row) in keys
             for layer in tile.layers.values()
         }
+
+    def _read(self, raw: bytes, name: str) -> Manifest:
+        """Read a manifest, unless it has the bytes of the newest one; errors as of :meth:`Manifest.from_bytes`."""
+        digest = hashlib.sha256(raw).digest()
+        if self._known is None or self._known[0] != digest:
+            self._known = digest, Manifest.from_bytes(raw, name, self._verify_key)
+        return self._known[1]
 
     def _asked(self, ask: Callable[[], bytes]) -> bytes:
         """Return an answer of the source; TransportError for any failure."""
@@ -233,13 +244,11 @@ class Mirror:
         with contextlib.suppress(OSError):
             os.utime(self.directory)  # recently used: the cache keeps it
         raw = self._asked(self.source.manifest)
-        manifest = Manifest.from_bytes(raw, f"{self.source.name}/{FILE}")
-        if self._verify_key is not None:
-            manifest.check_signature(self._verify_key, self.source.name)
-        try:
-            before = Manifest.load(self.directory)
-        except MapError:
-            before = None
+        manifest = self._read(raw, f"{self.source.name}/{FILE}")
+        local, before = b"", None
+        with contextlib.suppress(MapError):  # none yet
+            local = read_manifest(self.directory)
+            before = self._read(local, str(self.directory))
         wanted = self._wanted(manifest)
         exists = self._store.is_whole if check else self._store.holds
         missing = [(layer, tile) for layer, tile in wanted.values() if not exists(layer.sha256, layer.bytes)]
@@ -263,9 +272,10 @@ class Mirror:
             if progress:
                 progress(done, total)
         changed, opened = before is None or before.sha256 != manifest.sha256, set[str]()
-        if changed or before != manifest:
+        if local != raw:
             self.directory.mkdir(parents=True, exist_ok=True)
-            manifest.save(self.directory)
+            write_manifest(self.directory, raw)
+            self._known = hashlib.sha256(raw).digest(), manifest
         if changed and before is not None:  # a process may still use the state before
             with contextlib.suppress(MapError):  # none was opened
                 opened = Manifest.load(self.directory, OPENED).hashes()

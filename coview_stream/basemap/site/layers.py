@@ -71,9 +71,9 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
     return b"".join([_MAGIC, len(header).to_bytes(4, "little"), header, *parts])
 
 
-def most_points(tile: float, voxel: float) -> int:
-    """Return the greatest number of points, or stations, that a tile may count."""
-    return _PER_COLUMN * columns_of(tile, voxel) ** 2
+def most_points(tile: float, cell: float) -> int:
+    """Return the greatest number of points in voxels, or of stations in blocks, of a tile's count."""
+    return _PER_COLUMN * columns_of(tile, cell) ** 2
 
 
 def most_bytes(layer: str, points: int, stations: int, tile: float, voxel: float) -> int:

@@ -1,24 +1,27 @@
 """Manifest of a site (settings, and tiles by the hashes of their layers), grid of its tiles, and parts of sites.
 
 The manifest is a JSON file, ``manifest.json``. Its hash identifies the state of the whole site; a signature (ed25519)
-covers every byte of the layers. Readers check all numbers and names, and bound their count.
+covers every byte of the layers. Readers verify it before they read anything, then check all numbers and names, tile by
+tile: another thread never waits longer than for one tile, and what is refused has needed no memory.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.basemap.signature import SigningKey, VerifyKey
+from coview_stream.basemap.signature import SigningKey, VerifyKey, sha256_of
 from coview_stream.basemap.site.layers import most_points
 from coview_stream.basemap.site.store import SHA256, read_record, write_record
 from coview_stream.basemap.tiles import Key
@@ -32,12 +35,16 @@ VERSION = 2  # is written; sites of version 1, with layers compressed otherwise,
 FILE = "manifest.json"
 OPENED = "opened.json"  # in a mirror: the last manifest that a map was opened from
 LAYERS = ("cloud", "stations", "features")  # of a tile; features are optional
-MAX_MANIFEST = 1 << 28  # bytes: 400,000 tiles
-_MAX_LAYER = 1 << 28  # bytes
+MAX_MANIFEST = 1 << 24  # bytes: 35,000 tiles, of which 5,300 can be opened as one map
+MAX_LAYER = 1 << 28  # bytes
+_MAX_HEAD = 1 << 21  # bytes of all but the tiles: 18,000 sources
+_MAX_TAIL = 64  # bytes behind the tiles: the version
+_MAX_ENTRY = 2048  # bytes of a tile, which has 450
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
 _MAX_DEPTH = 32  # of the parameters
 _PURPOSE = b"site manifest\n"
+_BEGIN = re.compile(rb'(?:, "signature": "([0-9a-f]*)", "signer": "([0-9a-f]*)")?(, "tile": [-+.0-9eE]+, "tiles": \[)')
 
 TILE = 320.0  # metres, a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)
 HALO = 64.0  # metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin
@@ -84,7 +91,7 @@ class TileEntry:
         for name, layer in data["layers"].items():
             if name not in LAYERS or not SHA256.fullmatch(layer["sha256"]):
                 raise ValueError(f"tile {column}, {row} has a layer {str(name)[:20]!r} that is none")
-            layers[name] = LayerEntry(layer["sha256"], _whole(layer["bytes"], _MAX_LAYER))
+            layers[name] = LayerEntry(layer["sha256"], _whole(layer["bytes"], MAX_LAYER))
         if not {"cloud", "stations"} <= set(layers):
             raise ValueError(f"tile {column}, {row} lacks a layer")
         points, stations, area = (_whole(data[name], 1 << 31) for name in ("points", "stations", "area"))
@@ -123,7 +130,7 @@ class Manifest:
     @cached_property
     def sha256(self) -> str:
         """Hash of all but the signature."""
-        return hashlib.sha256(self._content()).hexdigest()
+        return sha256_of(self._pieces())
 
     @property
     def nbytes(self) -> int:
@@ -134,50 +141,59 @@ class Manifest:
         """Return the hashes of all layers."""
         return {layer.sha256 for tile in self.tiles for layer in tile.layers.values()}
 
-    def _content(self) -> bytes:
-        plain = asdict(self)
+    def _pieces(self, joint: str = ", ", line: str = "") -> Iterator[bytes]:
+        """Yield all but the signature as JSON: ``joint`` joins tiles, ``line`` is before each and after the last."""
+        plain = {item.name: getattr(self, item.name) for item in fields(self)}
         del plain["signer"], plain["signature"]
-        return json.dumps({"format": FORMAT} | plain, sort_keys=True, allow_nan=False).encode()
+        head = json.dumps({"format": FORMAT} | plain | {"tiles": []}, sort_keys=True, allow_nan=False)
+        head, tail = head.rsplit("]", 1)
+        yield head.encode()
+        for number, tile in enumerate(self.tiles):
+            entry = vars(tile) | {"layers": {name: vars(layer) for name, layer in tile.layers.items()}}
+            text = json.dumps(entry, sort_keys=True, allow_nan=False)
+            yield f"{joint if number else ''}{line}{text}".encode()
+        yield f"{line}]{tail}".encode()
 
     def signed(self, key: SigningKey) -> Manifest:
         """Return a signed copy."""
-        return replace(self, signer=key.fingerprint, signature=key.sign(_PURPOSE + self._content()).hex())
-
-    def check_signature(self, key: VerifyKey, name: str) -> None:
-        """Verify the signature; MapError if it is not signed, or not by this key."""
-        if not self.signature:
-            raise MapError(
-                f"{name}: the site is not signed, and a signature by {key.name} is asked for; build it with --sign and "
-                f"the key that {key.name} belongs to"
-            )
-        try:
-            signature = bytes.fromhex(self.signature)
-        except ValueError:
-            signature = b""
-        if not key.verifies(_PURPOSE + self._content(), signature):
-            raise MapError(
-                f"{name}: is not signed with {key.name} ({key.fingerprint}) but by {self.signer[:32]}, or was changed "
-                "since; give the public key of who built it, or a site of theirs"
-            )
+        signature = key.sign(_PURPOSE + b"".join(self._pieces())).hex()
+        return replace(self, signer=key.fingerprint, signature=signature)
 
     def to_bytes(self) -> bytes:
-        """Return the file's content."""
-        plain = json.loads(self._content())
-        if self.signature:
-            plain |= {"signer": self.signer, "signature": self.signature}
-        return (json.dumps(plain, sort_keys=True, indent=1) + "\n").encode()
+        """Return the file's content, with a line for each tile."""
+        head, *rest = self._pieces(",", "\n")
+        if self.signature and (begin := _BEGIN.search(head)):
+            own = f', "signature": "{self.signature}", "signer": "{self.signer}"'
+            head = head[: begin.start(3)] + own.encode() + head[begin.start(3) :]
+        return b"".join([head, *rest, b"\n"])
 
     @classmethod
-    def from_bytes(cls, raw: bytes, name: str) -> Manifest:
-        """Read untrusted bytes of :meth:`to_bytes`; MapError if they are no manifest, or of an unknown version."""
+    def from_bytes(cls, raw: bytes, name: str, key: VerifyKey | None = None) -> Manifest:
+        """Read untrusted bytes of :meth:`to_bytes`, or of earlier versions, which indented all.
+
+        MapError if they are no manifest, or of an unknown version; or not signed with the key, if there is one, which
+        is seen to first.
+        """
         try:
-            data = json.loads(raw, parse_float=_finite, parse_constant=_finite)
-            if not isinstance(data, dict) or data.get("format") != FORMAT:
-                raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
-            if data.get("version") not in (1, VERSION):
-                raise MapError(
-                    f"{name}: is of version {str(data.get('version'))[:20]}, this program reads {VERSION} and 1"
-                )
+            if len(raw) > MAX_MANIFEST:
+                raise ValueError(f"more than {MAX_MANIFEST >> 20} MB")
+            content = _in_one_line(raw)
+            begin = _BEGIN.search(content, 0, _MAX_HEAD)
+            if begin is None:
+                _refuse_other(content, name)
+            signature, signer = (part or b"" for part in begin.group(1, 2))
+            content = content[: begin.start()] + content[begin.start(3) :]
+            first = begin.end() - begin.start(3) + begin.start()  # of the tiles, without the signature
+            if key is not None:
+                _check_signature(content, signature, signer, key, name)
+            tiles, end = _tiles_of(content, first)
+            if len(content) - end > _MAX_TAIL:
+                raise ValueError("more follows its tiles than the version")
+            data = _loads(content[:first] + content[end:])
+            if data["format"] != FORMAT or data["tiles"]:
+                raise ValueError("it is of another kind")
+            if data["version"] not in (1, VERSION):
+                raise MapError(f"{name}: is of version {str(data['version'])[:20]}, this program reads {VERSION} and 1")
             origin = tuple(_number(value) for value in data["origin"])
             if len(origin) != 3:
                 raise ValueError("origin is no list of three numbers")
@@ -186,14 +202,13 @@ class Manifest:
                 raise ValueError("tile, crs or parameters are invalid")
             _check_depth(parameters, _MAX_DEPTH)
             grid = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
-            tiles = tuple(TileEntry.of(entry) for entry in data["tiles"])
             if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
                 raise ValueError("a tile is named twice")
-            most = most_points(tile, grid.config.voxel)
-            if any(max(entry.points, entry.stations) > most for entry in tiles):
-                raise ValueError(f"a tile counts more than {most} points or stations")
-            signed = str(data.get("signer", "")), str(data.get("signature", ""))
-            manifest = cls(origin, tile, crs, parameters, tiles, *signed, int(data["version"]))
+            most = most_points(tile, grid.config.voxel), most_points(tile, grid.config.block)
+            if any(entry.points > most[0] or entry.stations > most[1] for entry in tiles):
+                raise ValueError("a tile counts more than {} points or {} stations".format(*most))
+            signed = signer.decode(), signature.decode()
+            manifest = cls(origin, tile, crs, parameters, tuple(tiles), *signed, int(data["version"]))
             _ = manifest.sha256  # can be written again
             return manifest
         except MapError:
@@ -212,27 +227,78 @@ class Manifest:
 
     def save(self, directory: Path, name: str = FILE) -> None:
         """Write it into a site's directory, complete or not at all; MapError if it cannot be written."""
-        try:
-            with atomic_file(directory / name, sync=True) as file:
-                file.write(self.to_bytes())
-        except OSError as error:
-            raise MapError(f"{directory / name}: cannot be written ({error.strerror})") from error
+        write_manifest(directory, self.to_bytes(), name)
 
     @classmethod
-    def load(cls, directory: Path, name: str = FILE) -> Manifest:
-        """Read the manifest of a site's directory; MapError if it is missing, or cannot be read."""
-        path = directory / name
-        try:
-            with path.open("rb") as file:
-                raw = file.read(MAX_MANIFEST + 1)
-        except OSError as error:
-            raise MapError(
-                f"{directory}: is no site, {name} cannot be read ({error.strerror}); give a .coview file, or a "
-                "directory that 'build -o DIRECTORY/' made"
-            ) from error
-        if len(raw) > MAX_MANIFEST:
-            raise MapError(f"{path}: is too large for a manifest")
-        return cls.from_bytes(raw, str(path))
+    def load(cls, directory: Path, name: str = FILE, key: VerifyKey | None = None) -> Manifest:
+        """Read the manifest of a site's directory; MapError as of :meth:`from_bytes`, or if it is missing."""
+        return cls.from_bytes(read_manifest(directory, name), str(directory / name), key)
+
+
+def read_manifest(directory: Path, name: str = FILE) -> bytes:
+    """Return the bytes of the manifest of a site's directory; MapError if it is missing."""
+    try:
+        with (directory / name).open("rb") as file:
+            return file.read(MAX_MANIFEST + 1)
+    except OSError as error:
+        raise MapError(
+            f"{directory}: is no site, {name} cannot be read ({error.strerror}); give a .coview file, or a "
+            "directory that 'build -o DIRECTORY/' made"
+        ) from error
+
+
+def write_manifest(directory: Path, raw: bytes, name: str = FILE) -> None:
+    """Write the bytes of a manifest into a site's directory, complete or not at all; MapError if that fails."""
+    try:
+        with atomic_file(directory / name, sync=True) as file:
+            file.write(raw)
+    except OSError as error:
+        raise MapError(f"{directory / name}: cannot be written ({error.strerror})") from error
+
+
+def _loads(text: bytes) -> Any:
+    return json.loads(text, parse_float=_finite, parse_constant=_finite)
+
+
+def _in_one_line(raw: bytes) -> bytes:
+    """Return JSON of several lines as json.dumps writes it in one; its strings hold no line ends."""
+    lines = (line.strip(b" \r\n") for line in io.BytesIO(raw))
+    return b"".join(line + b" " if line.endswith(b",") else line for line in lines)
+
+
+def _refuse_other(content: bytes, name: str) -> NoReturn:
+    """Raise the MapError of bytes that list no tiles."""
+    if f'"format": "{FORMAT}"'.encode() in content[:_MAX_HEAD]:
+        raise ValueError("it lists no tiles as 'build' writes them")
+    raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
+
+
+def _check_signature(content: bytes, signature: bytes, signer: bytes, key: VerifyKey, name: str) -> None:
+    if not signature:
+        raise MapError(
+            f"{name}: the site is not signed, and a signature by {key.name} is asked for; build it with --sign and "
+            f"the key that {key.name} belongs to"
+        )
+    if len(signature) % 2 or not key.verifies(_PURPOSE + content, bytes.fromhex(signature.decode())):
+        raise MapError(
+            f"{name}: is not signed with {key.name} ({key.fingerprint}) but by {signer[:32].decode()}, or was changed "
+            "since; give the public key of who built it, or a site of theirs"
+        )
+
+
+def _tiles_of(content: bytes, at: int) -> tuple[list[TileEntry], int]:
+    """Return the tiles that are listed from a place on, and where their list ends; ValueError if they are none."""
+    decoder, tiles = json.JSONDecoder(parse_float=_finite, parse_constant=_finite), []
+    more = content[at : at + 1] != b"]"
+    while more:
+        entry, length = decoder.raw_decode(content[at : at + _MAX_ENTRY].decode("ascii"))
+        tiles.append(TileEntry.of(entry))
+        at += length
+        more = content[at : at + 2] == b", "
+        at += 2 * more
+    if content[at : at + 1] != b"]":
+        raise ValueError(f"its list of tiles breaks off after {len(tiles)}")
+    return tiles, at
 
 
 def is_site(path: Path) -> bool:

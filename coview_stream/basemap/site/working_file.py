@@ -75,21 +75,17 @@ def working_file(
     Raises:
         MapError: no site, a layer is missing or damaged, not signed with the key, or no room in the cache.
     """
-    manifest = Manifest.load(directory)
-    if verify_key is not None:
-        manifest.check_signature(verify_key, str(directory))
+    manifest = Manifest.load(directory, key=verify_key)
     if directory.resolve().parent != (cache_folder() / "sites").resolve():
         return _written(directory, manifest, progress, keys)
     opened = None
     with contextlib.suppress(MapError):  # none yet
-        opened = Manifest.load(directory, OPENED)
+        opened = Manifest.load(directory, OPENED, verify_key)
     try:
         path = _written(directory, manifest, progress, keys)
     except MapError as error:
         if opened is None or opened == manifest:
             raise
-        if verify_key is not None:
-            opened.check_signature(verify_key, str(directory))
         warn(f"{error}; going on with the map that was opened before, manifest {opened.sha256[:12]}")
         return _written(directory, opened, progress, keys)
     if opened != manifest:

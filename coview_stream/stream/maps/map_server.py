@@ -11,7 +11,7 @@ from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import Any
 
-from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.manifest import Manifest, read_manifest
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.errors import MapError
 from coview_stream.stream.maps.zenoh_source import MapKeys
@@ -46,14 +46,14 @@ class MapServer:
         """
         import zenoh
 
-        self.manifest = Manifest.load(directory)
+        self._raw = read_manifest(directory)
+        self.manifest = Manifest.from_bytes(self._raw, str(directory))
         self.answered = 0
         """Number of queries answered with bytes."""
         self.sent = 0
         """Bytes of these answers."""
         self._directory, self._keys = directory, keys
         self._store = TileStore(directory)
-        self._raw = self.manifest.to_bytes()
         self._layers = _sizes(self.manifest)
         self._guard = RateLimitedErrors(log)
         self._stopping = threading.Event()
@@ -117,11 +117,15 @@ class MapServer:
             self.sent += len(raw)
 
     def _look(self) -> None:
-        refused = ""
+        refused, seen = "", self._raw
         while not self._stopping.wait(_LOOK):
             with self._guard.catch("looking at the manifest"):
                 try:
-                    manifest = Manifest.load(self._directory)
+                    raw = read_manifest(self._directory)
+                    if raw == seen:
+                        continue
+                    seen = raw
+                    manifest = Manifest.from_bytes(raw, str(self._directory))
                 except MapError as error:
                     if str(error) != refused:
                         log.error("%s; going on with manifest %s", error, self.manifest.sha256[:12])
@@ -131,7 +135,7 @@ class MapServer:
                 if manifest == self.manifest:
                     continue
                 self._layers = _sizes(self.manifest) | _sizes(manifest)  # clients may still fetch by the last one
-                self.manifest, self._raw = manifest, manifest.to_bytes()
+                self.manifest, self._raw = manifest, raw
                 log.info("manifest %s is served now", manifest.sha256[:12])
                 self._publisher.put(manifest.sha256)
 

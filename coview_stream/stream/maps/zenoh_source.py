@@ -8,13 +8,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from coview_stream.basemap.site.manifest import MAX_MANIFEST
+from coview_stream.basemap.site.manifest import MAX_LAYER, MAX_MANIFEST
 from coview_stream.errors import TransportError
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.keys import check_chunk, check_prefix
 
 _NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
-_MAX_MESSAGE = MAX_MANIFEST + (1 << 20)  # bytes of an answer and its frame; no layer is larger either
+_MAX_MESSAGE = MAX_LAYER + (1 << 20)  # bytes of an answer and its frame; no manifest is larger either
 _MAX_SITES = 100  # that are asked for their names
 _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 

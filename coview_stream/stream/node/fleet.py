@@ -185,4 +185,4 @@ class Fleet:
                 if name in self._endpoints and not self._endpoints[name].serving:
                     self._places[name] = LastPlace.from_message(plain)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            self._errors.report(sample.key, error)
+            self._errors.report(f"{self.prefix}/places", error)  # one place: strangers choose their names

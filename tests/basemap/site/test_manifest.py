@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import asdict, replace
 
 import pytest
@@ -46,7 +47,9 @@ def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
         (("tiles", 0, "low"), 1e300), (("crs",), 4), (("tile",), 300.0), (("parameters",), {}),
         (("parameters", "config"), {"block": 2.0}), (("parameters", "config", "block"), "2"),
         (("tiles", 0, "points"), 30_000_000), (("tiles", 0, "stations"), 30_000_000),
-        (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
+        (("parameters", "config", "descriptor", "rings"), 320),
+        (("parameters", "config", "descriptor", "radius"), 900.0),
+        (("tiles", 0, "stations"), 410_000), (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
     ],
 )  # fmt: skip
 def test_manifest_with_something_else_is_refused(path, value):
@@ -78,15 +81,58 @@ def test_signature_covers_the_hashes_of_the_layers(tmp_path):
     private, public, _ = make_keys(tmp_path / "mine")
     other = read_verify_key(make_keys(tmp_path / "other")[1])
     key = read_verify_key(public)
-    signed = Manifest.from_bytes(SITE.signed(SigningKey(private)).to_bytes(), "a")
-    signed.check_signature(key, "site")
+    signed = Manifest.from_bytes(SITE.signed(SigningKey(private)).to_bytes(), "a", key)
     assert signed.sha256 == SITE.sha256
+    indented = json.dumps(json.loads(signed.to_bytes()), sort_keys=True, indent=1).encode()  # as earlier versions did
+    assert Manifest.from_bytes(indented, "a", key) == signed
     with pytest.raises(MapError, match="not signed"):
-        SITE.check_signature(key, "site")
+        Manifest.from_bytes(SITE.to_bytes(), "a", key)
     swapped = replace(signed, tiles=(replace(TILE, layers=TILE.layers | {"cloud": LayerEntry("cd" * 32, 99)}),))
     for wrong, by in ((swapped, key), (signed, other)):
         with pytest.raises(MapError, match="is not signed with"):
-            wrong.check_signature(by, "site")
+            Manifest.from_bytes(wrong.to_bytes(), "a", by)
+
+
+def test_nothing_is_parsed_before_the_signature_is_verified(tmp_path, monkeypatch):
+    pytest.importorskip("cryptography", reason="pip install 'coview-stream[sign]'")
+    from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
+
+    private, public, _ = make_keys(tmp_path / "mine")
+    raw = SITE.signed(SigningKey(private)).to_bytes()
+    changed = raw.replace(b'"area": 7', b'"area": 8')
+    monkeypatch.setattr(json, "loads", lambda *args, **kwargs: pytest.fail("parsed"))
+    with pytest.raises(MapError, match="is not signed with"):
+        Manifest.from_bytes(changed, "a", read_verify_key(public))
+
+
+def test_manifest_of_many_tiles_is_read_tile_by_tile(monkeypatch):
+    many = replace(SITE, tiles=tuple(replace(TILE, column=k) for k in range(300)))
+    read: list[int] = []
+    loads, decode = json.loads, json.JSONDecoder.raw_decode
+    monkeypatch.setattr(json, "loads", lambda text, **kw: (read.append(len(text)), loads(text, **kw))[1])
+    monkeypatch.setattr(
+        json.JSONDecoder, "raw_decode", lambda self, text, idx=0: (read.append(len(text)), decode(self, text, idx))[1]
+    )
+    assert Manifest.from_bytes(many.to_bytes(), "site.json") == many
+    assert max(read) <= 2048 < len(many.to_bytes()) / 20
+
+
+@pytest.mark.parametrize(
+    "tiles", [b"{}," * 1000 + b"{}", b"[" * 4000, b'"' + b"x" * 4000 + b'"', b'{"a": ' + b"1, " * 4000 + b"}", b"1"]
+)
+def test_what_is_no_tile_is_refused_at_once(tiles):
+    raw = SITE.to_bytes()
+    begin = raw.index(b'"tiles": [') + len(b'"tiles": [')
+    tracemalloc.start()
+    with pytest.raises(MapError, match=r"site\.json"):
+        Manifest.from_bytes(raw[:begin] + tiles * 500 + raw[raw.index(b"\n]", begin) :], "site.json")
+    assert tracemalloc.get_traced_memory()[1] < 4 * len(tiles * 500) + 1_000_000
+    tracemalloc.stop()
+
+
+def test_manifest_larger_than_any_site_is_refused():
+    with pytest.raises(MapError, match="more than 16 MB"):
+        Manifest.from_bytes(SITE.to_bytes() + b" " * (1 << 24), "site.json")
 
 
 def test_store_gives_back_only_what_its_name_says(tmp_path):
