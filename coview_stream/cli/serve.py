@@ -226,6 +226,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         deskew=node.deskew and not args.no_deskew,
         mount=mount_of(args) or node.mount,
     )
+    localizer = replace(localizer, mount_drawn=localizer.mount_drawn and node.mount.drawn)
     if "max_gap" not in tables["node"]:  # a pause that keeps the pose up keeps its frames as well
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
     table = {"max_speed": node.max_speed} | tables["lidar_odometry"]

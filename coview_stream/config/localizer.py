@@ -266,6 +266,8 @@ class LocalizerConfig:
             own clouds, whose frame leans with the sensor.
         cloud_delay: seconds that clouds are stamped later than odometry, from -1 to 1, if known: estimated from there.
             Negative where odometry is late.
+        mount_drawn: heading and place of the lidar on the body are as in a drawing; False where they are guessed
+            (:attr:`coview_stream.config.mount.Mount.drawn`): estimated, and in covariances until motion shows them.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -278,6 +280,7 @@ class LocalizerConfig:
     reloc: Reloc = "auto"
     sensor_leans: bool = True
     cloud_delay: float = 0.0
+    mount_drawn: bool = True
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,8 @@ class Mount:
         x: metres forward of the body's origin.
         y: metres to its left.
         z: metres above it.
+        drawn: heading and place are as in a drawing, to 0.1 degrees and 5 mm. Else, as where only angles are stated,
+            the heading is a guess and the place is not known.
     """
 
     roll: float = 0.0
@@ -36,6 +38,7 @@ class Mount:
     x: float = 0.0
     y: float = 0.0
     z: float = 0.0
+    drawn: bool = True
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -58,7 +61,8 @@ class Mount:
         """Return the mount of this lidar if its clouds in the body frame have to be moved by a pose (4, 4) as well."""
         T = T_body_cloud @ self.T_body_sensor
         roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
-        return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), *T[:3, 3].tolist())
+        x, y, z = T[:3, 3].tolist()
+        return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), x, y, z, self.drawn)
 
     def to_json(self) -> dict[str, float]:
         """Plain data, with the unit in each name."""
@@ -68,21 +72,24 @@ class Mount:
     @property
     def option(self) -> str:
         """Text that :func:`parse_mount` reads, to a tenth of a degree and a centimetre."""
-        degrees = [math.degrees(angle) for angle in (self.roll, self.pitch, self.yaw)]
-        metres = [self.x, self.y, self.z]
-        numbers = [round(angle, 1) for angle in degrees] + [round(m, 2) for m in metres] * any(metres)
-        return ",".join(f"{number + 0.0:g}" for number in numbers)
+        angles = [round(math.degrees(angle), 1) for angle in (self.roll, self.pitch, self.yaw)]
+        metres = [round(m, 2) for m in (self.x, self.y, self.z)]
+        stated = any(metres) or (self.drawn and any(angles))
+        return ",".join(f"{number + 0.0:g}" for number in angles + metres * stated)
 
     def to_body(self, points: Points) -> Points:
         """Return a cloud (N, 3), sensor frame, metres, in the body frame; the cloud itself where they are one."""
-        if not any(getattr(self, f.name) for f in fields(self)):
+        if replace(self, drawn=True) == Mount():
             return points
         with np.errstate(invalid="ignore", over="ignore"):  # missing returns may be infinite
             return transform(self.T_body_sensor, points)
 
 
 def parse_mount(text: str) -> Mount:
-    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres; ConfigError for another text."""
+    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres; ConfigError for another text.
+
+    Angles alone are not ``drawn``, unless all are 0.
+    """
     given = f"--mount={text}"
     shape = "give roll,pitch,yaw in degrees, or roll,pitch,yaw,x,y,z with metres, such as --mount=180,0,0"
     try:
@@ -97,4 +104,7 @@ def parse_mount(text: str) -> Mount:
         raise ConfigError(f"{given}: an angle is beyond 360 degrees; {shape}")
     if any(abs(metres) > MAX_LEVER for metres in numbers[3:]):
         raise ConfigError(f"{given}: a sensor {MAX_LEVER:g} m away is no mount; metres follow the angles")
-    return Mount(*(math.radians(angle) for angle in numbers[:3]), *numbers[3:])
+    drawn = len(numbers) == 6 or not any(numbers)
+    roll, pitch, yaw = (math.radians(angle) for angle in numbers[:3])
+    x, y, z = numbers[3:] or (0.0, 0.0, 0.0)
+    return Mount(roll, pitch, yaw, x, y, z, drawn)

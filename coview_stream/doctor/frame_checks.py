@@ -178,7 +178,9 @@ def _explanation(
     if ground is not None and seen is not None:
         R = rot_z(-seen.yaw) @ turning(ground.up, UP)
         if seen.spread < HEADING and abs(seen.scale - 1.0) < SCALE and (ground.axis or abs(seen.yaw) > HEADING):
-            consider(turned_clouds(ground.axis, seen.yaw), _mount_finding(ground.axis, Mount().turned(R), robot))
+            consider(
+                turned_clouds(ground.axis, seen.yaw), _mount_finding(ground.axis, Mount(drawn=False).turned(R), robot)
+            )
         if unit != 1.0:
             consider(MILLIMETRES)
         for reading in (BOTH_CAMERA,) if ground.axis else (MIRRORED, *ODOMETRY):
@@ -200,6 +202,11 @@ def _explanation(
     return best
 
 
+_GUESSED = (
+    "its heading is good to some degrees and its place on the body is not seen: X,Y,Z by the drawing or /tf_static"
+)
+
+
 def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:
     turned = f"turned by {mount.yaw:.0f} degrees"
     if not axis:
@@ -207,7 +214,7 @@ def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:
     else:
         found = "the lidar is upside down" if axis == 1 else f"the lidar's {AXIS_NAMES[axis]} axis points up, not its z"
         found += f", {turned} about the vertical" if abs(mount.yaw) > math.degrees(HEADING) else ""
-    return Finding("FAIL", "mount", found, f"set --mount={mount.option}", robot)
+    return Finding("FAIL", "mount", found, f"set --mount={mount.option}; {_GUESSED}", robot)
 
 
 def _still(frames: Sequence[SeenFrame], pairs: Sequence[Pair], robot: str | None) -> Finding | None:

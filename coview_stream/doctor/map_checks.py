@@ -93,6 +93,8 @@ _WATCHED = 1500  # frames: five minutes
 def run_findings(run: Run, base_map: BaseMap | None = None, config: LocalizerConfig | None = None) -> Iterator[Finding]:
     """Judge a run of several frames and, with a map, whether it is localized there."""
     config = config or LocalizerConfig()
+    if run.mount is not None and not run.mount.drawn:
+        config = replace(config, mount_drawn=False)
     yield stamps_finding(run)
     try:
         frames = seen_frames(run)

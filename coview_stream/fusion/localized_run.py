@@ -210,9 +210,9 @@ def _part(result: dict[str, Any], name: str) -> dict[str, Any]:
 def _mount(values: dict[str, Any]) -> Mount:
     """Read :meth:`Mount.to_json`, also as earlier versions wrote it: radians, names without units."""
     angles, metres = ("roll", "pitch", "yaw"), ("x", "y", "z")
-    read = {name: math.radians(_number(values, f"{name}_deg")) or _number(values, name) for name in angles}
-    read |= {name: _number(values, f"{name}_m") or _number(values, name) for name in metres}
-    return Mount(**read)
+    roll, pitch, yaw = (math.radians(_number(values, f"{name}_deg")) or _number(values, name) for name in angles)
+    x, y, z = (_number(values, f"{name}_m") or _number(values, name) for name in metres)
+    return Mount(roll, pitch, yaw, x, y, z)
 
 
 def _number(values: dict[str, Any], name: str, otherwise: float = 0.0) -> float:

@@ -52,7 +52,7 @@ class FramePreparation:
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
-        self.estimator = CalibrationEstimator(config.sensor_leans, config.cloud_delay)
+        self.estimator = CalibrationEstimator(config.sensor_leans, config.cloud_delay, config.mount_drawn)
         self.conventions = Conventions()
         self.anchor: Floats | None = None
         self._odometry = OdometryCorrection()

@@ -234,6 +234,8 @@ def locate(
     """
     if smooth:
         require_library("gtsam", "gtsam>=4.3", "smoothing")  # before the run
+    if run.mount is not None and not run.mount.drawn:
+        config = replace(config or LocalizerConfig(), mount_drawn=False)
     localizer = RecordingLocalizer(base_map, config) if smooth else Localizer(base_map, config)
     recorded: list[RecordedFrame] = []
     if guess is not None:

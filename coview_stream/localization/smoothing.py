@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats, Ints
-from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, ProtectionLevel, protection_level
+from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, NO_OTHER, ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import (
     Pose,
     Poses,
@@ -304,7 +304,7 @@ class _Chain:
         reported = swap_rotation_translation(covariance + kept.shared + mount_and_clock)
         T = T @ self.since_cloud[k]
         T_map_body = pose_from(T[:3, :3], T[:3, 3] + origin) @ pose_from(np.eye(3), -frame.origin)
-        level = protection_level(reported, kept.doubt)
+        level = protection_level(reported, kept.doubt, others=self.calibration.heights(NO_OTHER))
         return SmoothedPose(frame.fix.stamp, kind, T_map_body, reported, level, fix.confidence)
 
 

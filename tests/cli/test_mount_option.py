@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import numpy as np
@@ -14,7 +15,7 @@ from coview_stream.clouds.files import read_cloud, write_cloud
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount, parse_mount
 from coview_stream.config.node import NodeConfig
-from coview_stream.geometry.transforms import inverse, transform
+from coview_stream.geometry.transforms import inverse, rotation_angle, transform
 from coview_stream.messages import decode_cloud
 from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.open_run import open_run
@@ -46,6 +47,20 @@ def test_run_of_a_turned_lidar_is_localized_as_that_of_the_body(world_file, worl
     (stamps, poses), (again, same) = (read_tum(tmp_path / name / "trajectory.tum") for name in "ab")
     assert (stamps == again).all()
     assert np.abs(poses - same).max() < 5e-3  # float32 of the turned points
+
+
+@pytest.mark.slow
+def test_level_contains_the_lever_arm_and_heading_that_nobody_has_stated(
+    world_file, world_run, world_drive, turned_run, tmp_path
+):
+    """As after the doctor's remedy, which sees neither the place of the lidar nor its heading to a degree."""
+    out = tmp_path / "out"
+    assert main(["locate", str(world_file), str(turned_run), "-o", str(out), "--no-pictures", "--mount=180,10,88"]) == 0
+    level = json.loads((out / "result.json").read_text())["protection_level"]
+    stamps, poses = read_tum(out / "trajectory.tum")
+    off = inverse(world_drive.T_map_body[round((stamps[-1] - 100.0) / 0.5)]) @ poses[-1]
+    assert 0.4 < np.linalg.norm(off[:3, 3]) < level["m"] < 12.0
+    assert np.degrees(rotation_angle(off[:3, :3])) < level["deg"]
 
 
 def test_live_clouds_are_turned_as_they_come():

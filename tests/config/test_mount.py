@@ -62,13 +62,22 @@ def test_mount_that_is_none_is_refused_in_one_line(text, said):
     assert "\n" not in str(caught.value)
 
 
+def test_angles_alone_are_a_guess_of_heading_and_place():
+    assert parse_mount("180,0,30,0,0,0").drawn
+    assert parse_mount("0,0,0").drawn
+    guessed = parse_mount("180,0,30")
+    assert not guessed.drawn
+    assert (guessed.option, parse_mount("180,0,30,0,0,0").option) == ("180,0,30", "180,0,30,0,0,0")
+    assert not guessed.turned(np.eye(3)).drawn
+
+
 def test_correction_is_said_as_an_option_that_has_it():
     mount = parse_mount("180,10,90,0.3,-0.2,0.5")
     R = Mount(roll=0.02, pitch=-0.05).T_body_sensor[:3, :3]
     found = parse_mount(mount.turned(R).option)
     assert np.allclose(found.T_body_sensor[:3, :3], R @ mount.T_body_sensor[:3, :3], atol=2e-3)
     assert np.allclose(found.T_body_sensor[:3, 3], R @ mount.T_body_sensor[:3, 3], atol=6e-3)
-    assert Mount().turned(Mount(pitch=math.radians(2.9)).T_body_sensor[:3, :3]).option == "0,2.9,0"
+    assert Mount().turned(Mount(pitch=math.radians(2.9)).T_body_sensor[:3, :3]).option == "0,2.9,0,0,0,0"
 
 
 @pytest.mark.parametrize("wrong", [{"roll": 7.0}, {"yaw": math.nan}, {"x": 1000.0}, {"z": math.inf}])

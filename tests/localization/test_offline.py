@@ -91,7 +91,7 @@ def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(worl
     upside_down = RunResult(1, [fix], mount=Mount(roll=np.pi))
     found = json.loads(json.dumps(upside_down.to_json(world_map)))["calibration"]
     assert found["pitch_deg"] == 2.9
-    assert "set --mount=180,2.9,0 to silence" in found["says"][0]
+    assert "set --mount=180,2.9,0,0,0,0 to silence" in found["says"][0]
     assert found["says"][0] in summary(upside_down)
     searching = RunResult(1, [Fix(1.0, State.SEARCHING, calibration=leaning)])  # it may be why
     assert searching.to_json(world_map)["calibration"]["pitch_deg"] == 2.9

@@ -13,6 +13,7 @@ from coview_stream.config.localizer import MAX_DELAY
 from coview_stream.config.mount import MAX_LEVER, Mount
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import OtherHeights
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
@@ -30,6 +31,7 @@ _LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
 """Least corrections that are reported: radians, factor, radians per metre, metres."""
 _TURNED, _SHIFTED, _LATE = math.radians(1.0), 0.1, 0.02
 """Likewise: radians of heading, metres of lever arm, seconds."""
+_RARE_SIGMAS = 3.29  # that a Gaussian exceeds once in a thousand, either way
 _TOLD = 2.0  # sigmas, below which such a correction is not reported
 _MOVED = {
     "sigma_tilt": math.radians(1.0), "sigma_scale": 0.02, "sigma_turn": math.radians(0.02),
@@ -41,7 +43,7 @@ HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 
 _RANGES = {
     **dict.fromkeys(("roll", "pitch"), math.radians(45.0)), "heading": math.pi,
     "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 3.0, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
-    **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "ground", "changed"), MAX_LEVER),
+    **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "sigma_height", "ground", "changed"), MAX_LEVER),
     **dict.fromkeys(("delay", "stated_delay", "sigma_delay"), 2.0 * MAX_DELAY),
 }  # fmt: skip
 """Largest values of a robot, in the units of :class:`Calibration`; sigmas are not negative."""
@@ -70,6 +72,7 @@ class Calibration:
         sigma_delay: one sigma of the delay, seconds.
         changed: metres of the ground around above the survey's, where it was dug or filled since; 0 where it was not.
         stated_delay: the part of ``delay`` that ``LocalizerConfig.cloud_delay`` states.
+        sigma_height: one sigma of the lever arm's height, metres, which motion does not show.
     """
 
     roll: float = 0.0
@@ -89,6 +92,7 @@ class Calibration:
     sigma_delay: float = CLOCK_TOLERANCE
     changed: float = 0.0
     stated_delay: float = 0.0
+    sigma_height: float = 0.0
 
     def require_plausible(self) -> Calibration:
         """Return it; InputError if a value is not finite or none of a robot."""
@@ -158,10 +162,15 @@ class Calibration:
         """
         heading = max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
         lever = max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
-        spread = np.diag([0.0, 0.0, heading, lever, lever, 0.0])
+        spread = np.diag([0.0, 0.0, heading, lever, lever, self.sigma_height**2])
         moving = np.concatenate([[0.0, 0.0, rates[2]], R_map_body @ [rates[0], rates[1], 0.0]])
         late = 0.5 * (1.0 + math.erf(self.delay / max(self.sigma_delay, 1e-9) / math.sqrt(2.0)))  # probability
         return np.asarray(spread + np.outer(moving, moving) * late * max(0.0, self.sigma_delay**2 - CLOCK_TOLERANCE**2))
+
+    def heights(self, others: OtherHeights) -> OtherHeights:
+        """Return heights that are possible beside a pose's, with those of the lever arm's, whose bound is known."""
+        reach = _RARE_SIGMAS * self.sigma_height
+        return OtherHeights(others.variance + self.sigma_height**2, others.reach + reach)
 
     @property
     def extrapolation(self) -> Floats:
@@ -181,7 +190,10 @@ class Calibration:
         # a remedy without the parts that may be nothing
         sits = math.hypot(self.lever_x, self.lever_y) >= max(_SHIFTED, _TOLD * self.sigma_lever)
         mended = self if sits else replace(self, lever_x=0.0, lever_y=0.0)
-        remedy = f"set --mount={given.moved(mended.T_body_cloud).option} to silence this"
+        option = given.moved(mended.T_body_cloud).option
+        if not given.drawn:  # its height is not seen
+            option = f"{option.rpartition(',')[0]},Z" if sits else f"{option},X,Y,Z"
+        remedy = f"set --mount={option} to silence this" + ", metres by the drawing" * (not given.drawn)
         leans = [
             f"{math.degrees(angle):.1f} deg in {name}"
             for name, angle in (("roll", self.roll), ("pitch", self.pitch))

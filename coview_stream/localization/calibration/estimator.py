@@ -81,6 +81,7 @@ _MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that show in a motion
 _FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
 """Choices (M, groups) of faulty groups."""
 _FREE = 1e6  # variance, in units of the wide prior's, that does not hold a component
+_GUESSED = 0.9  # probability that a mount of which only angles are stated is off by more than a drawing's tolerance
 _STEPPED = 0.5  # probability of a fault where something speaks for a step
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
@@ -124,13 +125,17 @@ class CalibrationBelief:
         shaking: (D,) log-likelihoods of DELAYS by the shaking of the body; see :class:`DelaySearch`.
     """
 
-    def __init__(self, sensor_leans: bool, cloud_delay: float = 0.0) -> None:
+    def __init__(self, sensor_leans: bool, cloud_delay: float = 0.0, mount_drawn: bool = True) -> None:
         self.P = np.diag(_WIDE**2)
         self._centre = np.zeros(SIZE)  # of the narrow priors
         self._centre[_CLOCK.axes] = self._stated_delay = cloud_delay
         self.x = self._centre.copy()
         self._exact = {group.sigma: group.exact for group in _GROUPS}
         self._shares = {group.sigma: group.share for group in _GROUPS}
+        self._sigma_height = 0.0
+        if sensor_leans and not mount_drawn:
+            self._shares |= {_HEADING.sigma: _GUESSED, _LEVER.sigma: _GUESSED}
+            self._sigma_height = _LEVER.wide  # motion in a plane does not show it
         self._sensor_leans = sensor_leans
         self.shaking = np.zeros(len(DELAYS))
         self._stand_straight()
@@ -257,7 +262,7 @@ class CalibrationBelief:
                 at += size
                 values |= dict(zip(group.names, (self._centre[group.axes] + mean[own]).tolist(), strict=True))
                 values[group.sigma] = math.sqrt(max(float(variance[own].mean()), 0.0))
-        return Calibration(**values, stated_delay=self._stated_delay)
+        return Calibration(**values, stated_delay=self._stated_delay, sigma_height=self._sigma_height)
 
     def _by_shaking(self) -> float:
         """Return the log-odds of the filter's delay against the expected one, by the shaking of the body.
@@ -314,9 +319,9 @@ class CalibrationEstimator:
         history: odometry as it came.
     """
 
-    def __init__(self, sensor_leans: bool = True, cloud_delay: float = 0.0) -> None:
-        """Begin with the priors; ``sensor_leans`` and ``cloud_delay`` as of a ``LocalizerConfig``."""
-        self._known = CalibrationBelief(sensor_leans, cloud_delay)
+    def __init__(self, sensor_leans: bool = True, cloud_delay: float = 0.0, mount_drawn: bool = True) -> None:
+        """Begin with the priors; the arguments are as of a ``LocalizerConfig``."""
+        self._known = CalibrationBelief(sensor_leans, cloud_delay, mount_drawn)
         self.history, self._delays = OdometryHistory(), DelaySearch()
         self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
         self._probability = 0.0  # that the leading place is right

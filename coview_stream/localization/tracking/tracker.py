@@ -234,7 +234,8 @@ class Tracker:
 
     def protection_level(self) -> ProtectionLevel:
         """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
-        return protection_level(self.reported_covariance(), self._doubt, others=self.change.others)
+        others = self._calibration.calibration.heights(self.change.others)
+        return protection_level(self.reported_covariance(), self._doubt, others=others)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         self._held = self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])

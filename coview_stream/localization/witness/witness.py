@@ -241,7 +241,9 @@ class Witness:
         driven, turned = float(np.linalg.norm(o[:2])), abs(float(o[2]))
         x, y, yaw = drift.variances(driven, turned)[[3, 4, 2]]
         along, across = calibration.sigma_scale * driven, max(calibration.sigma_heading, _HEADING) * driven
-        noise = np.diag(_JITTER**2 + [x + along**2, y + across**2, yaw + (calibration.sigma_turn * driven) ** 2])
+        swung = 2.0 * (1.0 - np.cos(turned)) * calibration.sigma_lever**2
+        of_mount = np.array([along**2 + swung, across**2 + swung, (calibration.sigma_turn * driven) ** 2])
+        noise = np.diag(_JITTER**2 + [x, y, yaw] + of_mount)
         on_map = None if registered is None else _on_map(before.on_map, registered)
         stamps = step_stamps(np.array([at for at, _ in self._path]), before.stamp, now.stamp)
         seen: CloudMotion | None = None

@@ -31,8 +31,8 @@ def test_scale_and_turn_of_odometry_are_estimated(scale):
 
 def test_lean_is_reported_as_the_mount_that_silences_it():
     leaning = Calibration(pitch=np.radians(2.9))
-    assert leaning.describe() == ["sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"]
-    assert "--mount=180,2.9,0 " in leaning.describe(Mount(roll=np.pi))[0]
+    assert leaning.describe() == ["sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0,0,0,0 to silence this"]
+    assert "--mount=180,2.9,0,0,0,0 " in leaning.describe(Mount(roll=np.pi))[0]
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,9 @@ class Drive(NamedTuple):
     delay: float = 0.0
     mount: np.ndarray = np.eye(4)
 
-    def learnt(self, earlier=None, stated=0.0):
+    def learnt(self, earlier=None, stated=0.0, drawn=True):
         """Return the estimator after the drive."""
-        estimator, correction = CalibrationEstimator(cloud_delay=stated), OdometryCorrection()
+        estimator, correction = CalibrationEstimator(cloud_delay=stated, mount_drawn=drawn), OdometryCorrection()
         rng = np.random.default_rng(1)
         history = estimator.history
         if earlier is not None:
@@ -96,7 +96,7 @@ def test_heading_and_lever_arm_are_measured():
     np.testing.assert_allclose(found.T_body_cloud[:2, 3], mount[:2, 3], atol=0.04)
     assert np.degrees(rotation_angle(found.R_body_cloud.T @ mount[:3, :3])) < 0.2
     assert abs(found.delay) < 0.01
-    assert any("--mount=0,0,-20" in clause for clause in found.describe())
+    assert any("--mount=0,0,-20.1,0.6" in clause for clause in found.describe())
 
 
 def test_straight_ahead_at_constant_speed_tells_the_heading_alone():
@@ -207,11 +207,29 @@ def test_errors_of_mount_and_clock_are_in_the_poses_covariance():
     np.testing.assert_allclose(np.diag(turned), [0, 0, 1e-4 - HEADING_TOLERANCE**2, lever, lever, 0])
 
 
+def test_guessed_mount_is_in_the_poses_covariance_until_motion_shows_it():
+    """The doctor's heading, 2.3 degrees off, of a lidar whose place nobody has stated."""
+    off = pose_from(rot_z(np.radians(2.3)), [0.2, -0.1, 0.0])
+    still, ahead = np.zeros(3), Drive(STRAIGHT, mount=off).learnt(drawn=False).calibration
+    before = CalibrationEstimator(mount_drawn=False).calibration
+    for prior in (before, ahead):  # straight on, nothing shows a lever arm
+        spread = np.sqrt(np.diag(prior.pose_covariance(np.eye(3), still)))
+        assert spread[3:].min() > 0.4
+    assert before.sigma_heading > np.radians(5.0) > 10.0 * ahead.sigma_heading
+    found = Drive(WINDING, mount=off).learnt(drawn=False).calibration
+    assert np.degrees(found.heading) == pytest.approx(2.3, abs=0.1)
+    assert (found.lever_x, found.lever_y) == pytest.approx((0.2, -0.1), abs=0.03)
+    assert max(found.sigma_lever, found.sigma_heading) < 0.03
+    assert found.sigma_height == before.sigma_height > 0.4  # never shown
+    (clause,) = [clause for clause in found.describe(Mount(yaw=0.5, drawn=False)) if "turned" in clause]
+    assert "--mount=0,0,30.9,0.2,-0.1,Z to silence this, metres by the drawing" in clause
+
+
 def test_mount_is_said_beyond_the_one_given():
     turned = Calibration(heading=np.radians(3.0), sigma_heading=np.radians(0.1), delay=0.12, sigma_delay=0.004)
     text = turned.describe(Mount(roll=np.pi))
     assert text[0].startswith("sensor is turned 3.0 +- 0.1 deg to the left on the body beyond its mount: corrected")
-    assert "--mount=180,0,3 " in text[0]
+    assert "--mount=180,0,3,0,0,0 " in text[0]
     assert text[1].startswith("clouds are 0.120 +- 0.004 s later than odometry: corrected; set --cloud-delay=0.12: ")
     assert "odometry is 0.300" in Calibration(delay=-0.3).describe()[0]
 

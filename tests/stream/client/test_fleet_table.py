@@ -60,7 +60,7 @@ def test_reason_stands_whole_below_its_robot_on_a_terminal(fleet):
 
 
 def test_what_the_node_says_of_the_sensor_stands_behind_the_reason(fleet):
-    says = "sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"
+    says = "sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0,0,0,0 to silence this"
     fleet.add_status("r1", {**STATUS, "calibration": {"says": [says, "b\x1b[2J"]}}, 9.0)
     assert fleet.table(9.1)[1].endswith(f"all well; {says}; b [2J")
     for odd in (None, 5, {"says": "x"}, {"says": None}, {}):
