@@ -142,7 +142,9 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.cli.process import start_logging, stop_on_signals
     from coview_stream.cli.view import open_sinks
     from coview_stream.stream.node.engine_process import start_children
+    from coview_stream.stream.node.heap import bound_heaps
 
+    bound_heaps(2, map_large=True)
     tables = settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CoViewError
+from coview_stream.stream.node.heap import bound_heaps, return_free_memory
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import Trust
@@ -379,9 +380,13 @@ def work(
         steps.append(engine.prepare_later)
         while True:
             use_pause()
+            worked = True
             while not pipe.poll(_PARENT_INTERVAL):
                 if parent not in (None, os.getppid()):  # its pipe may live on in a process that the parent has forked
                     return 0
+                if worked:
+                    return_free_memory()
+                worked = False
             pipe.send(attempt(engine, pipe.recv()))
     return 0
 
@@ -396,6 +401,7 @@ def _set_group_nice(nice: int) -> None:
 
 
 if __name__ == "__main__":
+    bound_heaps(1)  # one for each thread takes 20 MB more
     gc.disable()  # nearly all objects of the start stay: a tenth of the time
     with contextlib.suppress(OSError):
         os.nice(NICE[sys.argv[2]])

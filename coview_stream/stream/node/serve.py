@@ -216,7 +216,8 @@ def start_engines(
         # its sources may change while engines are started again: they open this very file, whose hash is known
         path, trust = base_map.path, None
     config = replace(options.localizer, sensor_leans=options.lidar is None)
-    if (missing := base_map.require_features(config.reloc)) is not None:
+    # where features may be left out, the search engine finds out whether the network can be loaded: it takes 60 MB
+    if (missing := base_map.require_features(config.reloc, load=config.reloc == "learned")) is not None:
         log.warning("%s: %s", options.map_path, missing)
         config = replace(config, reloc="coview")  # or the engines would say so again
     engines = {

@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from coview_stream.geometry.arrays import Bools, Complexes, Floats, Floats32, Ints, Reals
 
@@ -175,12 +174,16 @@ def _score(scores: Floats32, group: Ints, index: FeatureIndex, query: Complexes,
 
 def _half_spectra(images: Floats32, size: int) -> Complexes:
     """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
+    from scipy import fft  # for the search engine only
+
     whole = fft.fft(fft.rfft(images, size, axis=1), size, axis=0, overwrite_x=True)
     return np.asarray(whole.reshape(-1, *images.shape[2:]))
 
 
 def _inverse(product: Complexes, index: FeatureIndex, first: int) -> Floats32:
     """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
+    from scipy import fft
+
     size, last = index.block, first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
     rows = fft.ifft(grid, axis=0, overwrite_x=True)[first:last]
