@@ -68,7 +68,6 @@ EXTRA_OF = {
     "taichi": "taichi",
     "quadrants": "node",
     "gtsam": "node",
-    "onnxruntime": "node",
     "laspy": "node",
     "lazrs": "node",
     "rosbags": "messages",
@@ -86,7 +85,6 @@ EXTRA_OF = {
     "rerun": "viz",
     "foxglove": "foxglove",
     "torch": "learn-train",
-    "onnx": "learn-train",
     "psutil": "bench",
 }
 """Extra of the package that brings a module of others, by its first name."""

@@ -107,7 +107,7 @@ class BaseMap:
             CloudError: a source cannot be read, or its system is not of metres.
             ConfigError: an option is unknown or out of range.
             MapError: there is no ground to stand on.
-            DependencyError, InputError: ``learned=True`` without onnxruntime or weights.
+            InputError: ``learned=True`` without weights.
         """
         with naming_missing_libraries("building a map", "build"):
             from coview_stream.basemap.build import build_arrays
@@ -285,18 +285,18 @@ class BaseMap:
         return np.asarray(inside & (grid[index[:, 1], index[:, 0]] > 0))
 
     def require_features(self, reloc: Reloc, load: bool = True) -> str | None:
-        """Check that learned queries can be answered: the map's features, the weights and onnxruntime.
+        """Check that learned queries can be answered: the map's features and the weights.
 
         Args:
             reloc: mode of the search.
-            load: also load the network, which takes 0.3 s and 60 MB; only searching needs it.
+            load: also load the network; only searching needs it.
 
         Returns:
             The reason, with the remedy, why ``auto`` does not use the map's features; else None.
 
         Raises:
-            MapError, InputError, DependencyError: with ``learned``, if features, weights or onnxruntime are missing,
-                do not fit together or cannot be loaded.
+            MapError, InputError: with ``learned``, if features or weights are missing, do not fit together or cannot
+                be loaded.
         """
         if reloc == "coview":
             return None

@@ -28,7 +28,7 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
     Raises:
         CloudError: a source cannot be read.
         MapError: too few points, or no ground to put stations on.
-        DependencyError, InputError: learned features are asked for, and there is no onnxruntime or no weights.
+        InputError: learned features are asked for, and there are no weights.
     """
     if config.learned:
         from coview_stream.descriptors.network import VIEW_NAMES, network

@@ -61,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learned",
         action=argparse.BooleanOptionalAction,
-        help="store features for learned re-localization, 35 MB per km2 (they are, where onnxruntime can be loaded)",
+        default=True,
+        help="store features for learned re-localization, 35 MB per km2 (they are)",
     )
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
@@ -80,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
     """Build and save the map, and print its sizes."""
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.config import map_preset
-    from coview_stream.descriptors.network import VIEW_NAMES, network
-    from coview_stream.errors import ConfigError, CoViewError, MapError
+    from coview_stream.errors import ConfigError, MapError
 
     output = Path(args.output)
     if output.resolve() in [Path(name).resolve() for name in args.maps]:
@@ -91,14 +91,6 @@ def run(args: argparse.Namespace) -> int:
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = args.learned
-    if args.learned is None:  # where features can be made; if not, say why: the user may rely on them
-        try:
-            for view in VIEW_NAMES:
-                network(view)
-            options["learned"] = True
-        except CoViewError as error:
-            print(f"without learned features: {' '.join(str(error).split())}", file=sys.stderr)
-            options["learned"] = False
     tiles = args.output.endswith("/") or output.is_dir()
     if not tiles and (args.workers is not None or args.dask is not None or args.keep_going):
         raise ConfigError(

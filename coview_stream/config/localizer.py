@@ -261,7 +261,7 @@ class LocalizerConfig:
         graph: smoothing of poses.
         learned: look-up of learned features.
         reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where
-            map or installation lack them.
+            the map lacks them or has those of other weights.
         sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry made of the sensor's
             own clouds, whose frame leans with the sensor.
         cloud_delay: seconds that clouds are stamped later than odometry, from -1 to 1, if known: estimated from there.

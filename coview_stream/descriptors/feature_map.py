@@ -21,9 +21,9 @@ from coview_stream.descriptors.network import (
     PLACE_CELL,
     VIEW_NAMES,
     Features,
-    file_sha256,
     network,
     weights_file,
+    weights_id,
 )
 from coview_stream.errors import InputError, MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints, Reals
@@ -169,9 +169,9 @@ def means(tile: Int8s, ratio: int) -> Floats32:
 
 @lru_cache(maxsize=1)
 def weights_sha256() -> str:
-    """Return the sha256 of both networks' weights and the images' version; empty if a network has no weights."""
+    """Return the sha256 of both networks' :func:`weights_id` and the images' version; empty if one has no weights."""
     try:
-        parts = [file_sha256(weights_file(view)) for view in VIEW_NAMES]
+        parts = [weights_id(weights_file(view)) for view in VIEW_NAMES]
     except InputError:
         return ""
     return hashlib.sha256("\n".join([*parts, str(BIRDS_EYE_VIEW_VERSION)]).encode()).hexdigest()
@@ -253,7 +253,7 @@ def feature_arrays(
         window: metres, a multiple of 32.
 
     Raises:
-        DependencyError: no onnxruntime. InputError: no weights.
+        InputError: no weights.
     """
     encoder = network("aerial")
     low = np.floor(points[:, :2].min(axis=0) / TILE).astype(np.int64) * TILE
@@ -280,13 +280,13 @@ def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt
         size: its edge, a multiple of 32 m.
 
     Raises:
-        DependencyError: no onnxruntime. InputError: no weights.
+        InputError: no weights.
     """
     edge = (size + 2 * (_NET_MARGIN + _DRAW_MARGIN)) * _CELLS
     whole = birds_eye_view(points, (corner - _NET_MARGIN - _DRAW_MARGIN).astype(np.float32), (edge, edge))
     rim = _DRAW_MARGIN * _CELLS
     around = whole[:, rim:-rim, rim:-rim].copy()
-    # one thread: sums in another order could round another way
+    # one thread: processes do several squares at once
     return _stored(network("aerial", 1)(around), around, corner, (size, size))
 
 

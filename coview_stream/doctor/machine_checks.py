@@ -39,7 +39,7 @@ _CODECS = {
 """Modules that decode a robot's messages, and the package of each."""
 
 _PARTS = {
-    "node": (("scipy", "gtsam", "onnxruntime"), "serve, locate, replay"),
+    "node": (("scipy", "gtsam"), "serve, locate, replay"),
     "build": (("pyproj", "laspy"), "build, simulate, demo"),
     "plot": (("matplotlib",), "pictures"),
 }

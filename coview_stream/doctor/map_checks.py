@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     Judge = Callable[[Frame], tuple[str, str] | None]
 
-# of onnxruntime, the network and other imports, in two processes
-_NETWORK_MEMORY = 0.2 * GB
+_NETWORK_MEMORY = 0.04 * GB  # of the network and SciPy, in the process that searches
 _INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, the rest of a search's results
 _FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level
 _FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores

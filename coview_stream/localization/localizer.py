@@ -62,7 +62,7 @@ class Localizer:
             ConfigError: ``config`` is something else.
             InputError: ``base_map`` is something else.
             MapError: the file cannot be loaded.
-            MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
+            MapError, InputError: ``config.reloc`` is ``learned``, and that cannot be used here.
         """
         self.base_map, self.config = checked_arguments(base_map, config)
         self._local_maps = local_maps or LocalMaps(self.base_map, self.config.registration.source_range)
@@ -124,7 +124,7 @@ class Localizer:
         """Do the work that the first search and the first registrations would wait for: some seconds, once.
 
         Raises:
-            InputError, DependencyError: the network of the learned features cannot be loaded.
+            InputError: the network of the learned features cannot be loaded.
         """
         kernels.warm_up(*GlobalSearch.KERNELS, "nearest")  # tracking needs this one too
         self.search.prepare()

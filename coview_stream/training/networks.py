@@ -1,10 +1,9 @@
-"""The two encoders in PyTorch, of the map from above and of a robot's scans; their export to ONNX, quantisation."""
+"""The two encoders in PyTorch, of the map from above and of a robot's scans; the files of their weights."""
 
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +16,16 @@ from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.descriptors.birds_eye_view import LAYERS, Image
 from coview_stream.descriptors.network import (
     CARD,
-    ORIGIN,
-    OUTPUTS,
+    LAYER_NAMES,
+    MIN_ACTIVATION,
+    MIN_SIGMA,
+    PLACE_REACH,
+    PLACE_SIGMA,
     Features,
     file_sha256,
-    quantized_name,
-    weights_file,
     weights_name,
 )
-from coview_stream.errors import require_library
+from coview_stream.geometry.arrays import Floats32
 
 VIEWS = ("aerial", "ground")
 
@@ -34,15 +34,6 @@ LOCAL = 32
 
 PLACE = 128
 """Numbers in a global descriptor."""
-
-PLACE_REACH = 7
-"""Cells of 4 m about the middle that a global descriptor pools, under a Gaussian window of 14 m: up to 28 m."""
-
-_PLACE_SIGMA = 3.5  # cells of 4 m
-_MIN_SIGMA = 0.05
-_MIN_ACTIVATION = 1e-4  # before GeM's power
-_OPSET = 17  # of ONNX
-_SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
 
 
 class _Conv(nn.Module):
@@ -101,7 +92,7 @@ class PlaceNet(nn.Module):
         self.place = nn.Conv2d(4 * width, PLACE, 1)
         self.window: Tensor
         at = torch.arange(-PLACE_REACH, PLACE_REACH + 1, dtype=torch.float32)
-        weight = torch.exp(-0.5 * (at / _PLACE_SIGMA) ** 2)
+        weight = torch.exp(-0.5 * (at / PLACE_SIGMA) ** 2)
         window = (weight / weight.sum())[:, None].repeat(4 * width, 1, 1, 1)
         self.register_buffer("window", window, persistent=False)
 
@@ -117,9 +108,9 @@ class PlaceNet(nn.Module):
         merged = self.lateral[1](at2) + _doubled(self.lateral[2](at4))
         merged = functional.relu(self.lateral[0](at1) + _doubled(merged))
         local = functional.normalize(self.local(merged), dim=1)
-        sigma = functional.softplus(self.sigma(merged)) + _MIN_SIGMA
+        sigma = functional.softplus(self.sigma(merged)) + MIN_SIGMA
         # the generalised mean (GeM) under a round window about every cell, then a linear layer
-        raised = at4.clamp(min=_MIN_ACTIVATION).pow(self.power)
+        raised = at4.clamp(min=MIN_ACTIVATION).pow(self.power)
         down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)
         raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=4 * self.width)
@@ -127,45 +118,51 @@ class PlaceNet(nn.Module):
         return local, sigma, place
 
 
-class OneView(nn.Module):
-    """The network for one view, in the form that is exported."""
-
-    def __init__(self, net: PlaceNet, view: int) -> None:
-        super().__init__()
-        self.net, self.view = net, view
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Encode images of this view."""
-        encoded: tuple[Tensor, Tensor, Tensor] = self.net(x, self.view)
-        return encoded
-
-
 def _doubled(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
-    """Write one ONNX file per view and the card that records how they were made; a file is complete or absent.
+    """Write one file of weights per view and the card that records how they were made; a file is complete or absent.
 
     The card also holds the files' hashes, which tell one view's weights from the other's.
     """
     directory.mkdir(parents=True, exist_ok=True)
     written = []
     for view, name in enumerate(VIEWS):
-        single = OneView(net, view).eval()
+        arrays = {"power": net.power.detach().numpy()}
+        for layer in LAYER_NAMES:
+            arrays[f"{layer}.weight"], arrays[f"{layer}.bias"] = _folded(_module(net, layer, view), view)
+        # bytes come in, and cells of 0.5 m one after the other
+        stem = arrays["stem.weight"] / np.float32(255.0)
+        by_cell = stem.reshape(3, 3, LAYERS, 4, -1).swapaxes(2, 3)
+        arrays["stem.weight"] = by_cell.reshape(stem.shape)
         path = directory / weights_name(name)
-        image = torch.zeros(1, LAYERS, _SAMPLE, _SAMPLE)
-        sizes = {"image": {2: "height", 3: "width"}}
-        sizes |= {output: {2: f"{output}_height", 3: f"{output}_width"} for output in OUTPUTS}
-        with atomic_path(path) as part:
-            torch.onnx.export(
-                single, (image,), str(part), input_names=["image"], output_names=list(OUTPUTS),
-                dynamic_axes=sizes, opset_version=_OPSET, dynamo=False,
-            )  # fmt: skip
+        with atomic_path(path) as part, part.open("wb") as file:
+            np.savez(file, **arrays)
         written.append(path)
     card = card | {"sha256": {path.name: file_sha256(path) for path in written}}
     (directory / CARD).write_text(json.dumps(card, indent=1, sort_keys=True) + "\n")
     return written
+
+
+def _module(net: PlaceNet, layer: str, view: int) -> nn.Module:
+    """Return the module of a layer, by its name in the file."""
+    own = layer.startswith(("stem", "block"))
+    module: nn.Module = net.get_submodule(f"entry.{view}.{layer}" if own else layer)
+    return module
+
+
+def _folded(module: Any, view: int) -> tuple[Floats32, Floats32]:
+    """Return weights (rows, columns, inputs, outputs) and bias (outputs,) of a convolution and its normalisation."""
+    with torch.no_grad():
+        if isinstance(module, _Conv):
+            norm: Any = module.norm[view]
+            scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+            weight, bias = module.conv.weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+        else:
+            weight, bias = module.weight, module.bias
+        return weight.permute(2, 3, 1, 0).contiguous().numpy(), bias.numpy()
 
 
 def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
@@ -177,61 +174,3 @@ def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
         return Features(local[0].numpy(), sigma[0, 0].numpy(), place[0].numpy())
 
     return encode
-
-
-_LAYERS = ("Conv", "Add", "Relu")  # the rest takes no time
-
-
-def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
-    """Quantise the ground network in a directory of weights; write the result there and name it in the card.
-
-    Activations have eight bits in the range that the images cause, weights seven, one scale for each channel: sums
-    of eight would overflow on CPUs without VNNI. The aerial network is not quantised: maps are built once.
-
-    ``directory`` holds the weights and their card, which takes the ``note`` on the images: a hundred typical scans
-    (LAYERS, H, W). Raises InputError without weights, DependencyError without ONNX.
-    """
-    onnx = require_library("onnx", "onnx>=1.16", "quantisation (extra learn-train)")
-    from onnxruntime import quantization as tools
-    from onnxruntime.quantization.shape_inference import quant_pre_process
-
-    class Images(tools.CalibrationDataReader):
-        def __init__(self) -> None:
-            self._left: Iterator[Image] = iter(images)
-
-        def get_next(self) -> dict[str, Any] | None:
-            image = next(self._left, None)
-            return None if image is None else {"image": image[None].astype(np.float32) / np.float32(255.0)}
-
-    weights = weights_file("ground", directory)
-    written = directory / quantized_name("ground")
-    with tempfile.TemporaryDirectory() as folder, atomic_path(written) as part:
-        prepared = Path(folder) / "prepared.onnx"
-        quant_pre_process(str(weights), str(prepared), skip_symbolic_shape=True)
-        tools.quantize_static(
-            str(prepared), str(part), Images(), quant_format=tools.QuantFormat.QDQ, per_channel=True,
-            reduce_range=True, op_types_to_quantize=list(_LAYERS), activation_type=tools.QuantType.QUInt8,
-            weight_type=tools.QuantType.QInt8, nodes_to_exclude=_delicate(onnx.load(str(prepared)).graph),
-        )  # fmt: skip
-        model = onnx.load(str(part))
-        onnx.helper.set_model_props(model, {ORIGIN: file_sha256(weights)})
-        onnx.save(model, str(part))
-    card = json.loads((directory / CARD).read_text())
-    card["sha256"][written.name] = file_sha256(written)
-    card["quantized"] = note
-    (directory / CARD).write_text(json.dumps(card, indent=1, sort_keys=True) + "\n")
-    return written
-
-
-def _delicate(graph: Any) -> list[str]:
-    """Name the nodes behind a power or softplus and the inputs of a softplus: numbers of too many magnitudes."""
-    names: list[str] = []
-    tensors: set[str] = set()
-    steep = {name for node in graph.node if node.op_type == "Softplus" for name in node.input}
-    for node in graph.node:  # in order
-        if node.op_type in ("Pow", "Softplus") or tensors.intersection(node.input):
-            tensors.update(node.output)
-            names.append(str(node.name))
-        elif steep.intersection(node.output):
-            names.append(str(node.name))
-    return names

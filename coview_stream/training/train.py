@@ -23,7 +23,6 @@ from coview_stream.training.worlds import WorldViews, read_world, write_dataset
 from coview_stream.version import __version__
 
 _REPORT_STEPS = 20  # from one line of progress to the next
-_CALIBRATED = 120  # queries from which the ranges of the quantised network are taken
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
 
 Say = Callable[[str], None]
@@ -102,12 +101,11 @@ def train_session(
     Raises:
         ConfigError: a number is out of range. InputError: something cannot be written, or the directory holds
             worlds of another recipe or the state of another training.
-        DependencyError: PyTorch or ONNX is not installed.
+        DependencyError: PyTorch is not installed.
     """
     torch = require_library("torch", "torch==2.13.0", "training (extra learn-train)")
-    require_library("onnx", "onnx>=1.16", "training (extra learn-train)")
     from coview_stream.training.loop import train
-    from coview_stream.training.networks import encoder, export, quantize
+    from coview_stream.training.networks import encoder, export
 
     if threads > 0:
         torch.set_num_threads(threads)
@@ -146,9 +144,6 @@ def train_session(
         "validation": recall,
     }
     export(net, out, card)
-    images = [image for world in worlds[: plan.worlds] for image in world.queries]
-    note = f"on {_CALIBRATED} queries of the worlds trained on, or fewer"
-    quantize(out, images[:: -(-len(images) // _CALIBRATED)], note)
     return card
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 
 import pytest
@@ -81,11 +80,11 @@ def test_search_engine_process_uses_learned_features(learned_file, world_drive):
         process.close()
 
 
-def test_build_learned_names_missing_library(tmp_path, monkeypatch, refused):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+def test_build_names_missing_weights(tmp_path, monkeypatch, refused):
+    monkeypatch.setenv("COVIEW_WEIGHTS", str(tmp_path))
     network.cache_clear()
     scan = tmp_path / "not-even-looked-for.ply"
-    assert "pip install 'coview-stream[node]'" in refused("build", scan, "-o", tmp_path / "site.coview", "--learned")
+    assert "no weights of the aerial network" in refused("build", scan, "-o", tmp_path / "site.coview")
 
 
 @pytest.fixture(scope="module")

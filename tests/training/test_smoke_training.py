@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch: pip install '.[learn-train]'")
-pytest.importorskip("onnx", reason="training needs ONNX: pip install '.[learn-train]'")
 
 from coview_stream.cli import main
 from coview_stream.descriptors.birds_eye_view import LAYERS

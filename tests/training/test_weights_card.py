@@ -5,14 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 
-from coview_stream.descriptors.network import (
-    CARD,
-    VIEW_NAMES,
-    file_sha256,
-    quantized_name,
-    weights_directory,
-    weights_name,
-)
+from coview_stream.descriptors.network import CARD, VIEW_NAMES, file_sha256, weights_directory, weights_name
 from coview_stream.training.train import DEFAULT
 
 CARD_TEXT = json.loads((weights_directory() / CARD).read_text())
@@ -20,8 +13,8 @@ CARD_TEXT = json.loads((weights_directory() / CARD).read_text())
 
 def test_weights_match_card_hashes_and_size_limit() -> None:
     files = [weights_directory() / weights_name(view) for view in VIEW_NAMES]
-    files.append(weights_directory() / quantized_name("ground"))
     assert {path.name: file_sha256(path) for path in files} == CARD_TEXT["sha256"]
+    assert CARD_TEXT["same_as"].keys() == set(CARD_TEXT["sha256"].values())
     assert sum(path.stat().st_size for path in files) <= 5_000_000
 
 

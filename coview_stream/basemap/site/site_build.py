@@ -77,8 +77,13 @@ def build_site(
 
     Raises:
         CloudError: a source cannot be read. MapError: nothing to stand on, or the directory cannot be used.
-        ConfigError: a setting that sites cannot have.
+        ConfigError: a setting that sites cannot have. InputError: no weights for learned features.
     """
+    if config.learned:
+        from coview_stream.descriptors.network import VIEW_NAMES, weights_file
+
+        for view in VIEW_NAMES:  # before the clouds are read
+            weights_file(view)
     check_directory(directory)
     listed = sources_of(given, crs)
     if any(source.rows is not None for source in listed):

@@ -83,7 +83,7 @@ class GlobalSearch:
         """Do the work that the first update would wait for.
 
         Raises:
-            InputError, DependencyError: the network of the learned features cannot be loaded.
+            InputError: the network of the learned features cannot be loaded.
         """
         self._index.prepare()
         _ = self.base_map.field.layers

@@ -47,7 +47,7 @@ class SearchIndex:
         ``auto`` warns of learned features that cannot be used, and goes without them.
 
         Raises:
-            MapError, InputError, DependencyError: as :meth:`BaseMap.require_features`.
+            MapError, InputError: as :meth:`BaseMap.require_features`.
         """
         retrieval = None if config.reloc == "learned" else Retrieval(base_map)
         missing = base_map.require_features(config.reloc, load)

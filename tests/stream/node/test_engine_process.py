@@ -269,7 +269,7 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled(engine):
 
 @pytest.mark.slow
 def test_engine_that_cannot_prepare_says_why(engine):
-    child = Program("pipe.send(('ready', None)); pipe.send(('error', 'ground.onnx: no weights; train them'))")
+    child = Program("pipe.send(('ready', None)); pipe.send(('error', 'ground.npz: no weights; train them'))")
     process = engine("search", child=child)
     with pytest.raises(DiedError, match="no weights; train them"):
         process.run(job())

@@ -1,1 +1,1 @@
-"""Place recognition by learned features, on NumPy, SciPy and onnxruntime."""
+"""Place recognition by learned features, on NumPy and SciPy."""

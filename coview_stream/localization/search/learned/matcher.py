@@ -122,7 +122,7 @@ class FeatureMatcher:
         """Load the network and compute the map's spectra, which the first query would do otherwise.
 
         Raises:
-            InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
+            InputError: the weights cannot be loaded.
         """
         import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
 
@@ -133,7 +133,7 @@ class FeatureMatcher:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,) on the ground below the robot.
 
         Raises:
-            InputError, DependencyError: as :meth:`prepare`.
+            InputError: as :meth:`prepare`.
         """
         size = round(_SIZE / CELL)
         features = self.network(birds_eye_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
