@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, TextIO
 
+from coview_stream.cli.interrupt import interruptible
 from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, naming_missing_libraries
 from coview_stream.version import __version__
 
@@ -66,31 +67,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.stdout = sys.stdout or _null()  # closed by who called: Python then has none
     sys.stderr = sys.stderr or _null()
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", CoViewWarning)
-        warnings.showwarning = _show_warning
-        return _main(argv)
+    try:
+        with interruptible(whole_process=argv is None) as interrupt, warnings.catch_warnings():
+            warnings.simplefilter("always", CoViewWarning)
+            warnings.showwarning = _show_warning
+            try:
+                code, message = _main(argv)
+            except Exception:
+                if not interrupt.seen:
+                    raise
+            if interrupt.seen:  # whatever became of it
+                raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        code, message = 130, ""
+    if message is not None:
+        print(message and f"{PROGRAM}: error: {' '.join(message.split())}", file=sys.stderr)
+    return code
 
 
-def _main(argv: Sequence[str] | None) -> int:
+def _main(argv: Sequence[str] | None) -> tuple[int, str | None]:
+    """Return the exit code and the error."""
     try:
         code = _dispatch(sys.argv[1:] if argv is None else list(argv))
         sys.stdout.flush()  # a closed pipe must show up here, not while the interpreter shuts down
-        return code
+        return code, None
     except CoViewError as error:
-        return _fail(str(error))
+        return 2, str(error)
     except MemoryError:
-        return _fail("out of memory; use a smaller map or a coarser voxel size")
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
-        return 130
+        return 2, "out of memory; use a smaller map or a coarser voxel size"
     except BrokenPipeError:
         with contextlib.suppress(OSError, ValueError):  # or the interpreter would report the closed pipe at its exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return 141, None
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
-        return _fail(f"{error.filename}: {reason}" if error.filename else reason)
+        return 2, f"{error.filename}: {reason}" if error.filename else reason
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
@@ -130,11 +141,6 @@ def _dispatch(argv: list[str]) -> int:
         raise ConfigError(f"unrecognized arguments: {' '.join(rest)}; see `{PROGRAM} {args.command} --help`")
     with naming_missing_libraries(f"{PROGRAM} {args.command}", _EXTRAS.get(args.command)):
         return int(args.run(args))
-
-
-def _fail(message: str) -> int:
-    print(f"{PROGRAM}: error: {' '.join(message.split())}", file=sys.stderr)
-    return 2
 
 
 def _null() -> TextIO:

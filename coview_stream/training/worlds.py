@@ -7,16 +7,15 @@ import os
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.basemap.site.executors import Executor, ProcessExecutor
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.filters import voxel_grid
 from coview_stream.descriptors.birds_eye_view import CELL, Image, birds_eye_view
@@ -217,19 +216,15 @@ def write_dataset(
     missing = [seed for seed, path in paths.items() if not path.exists()]
     report = progress or (lambda seed, seconds: None)
     write = partial(_timed, directory, recipe)
-    if workers <= 1:
-        for seed in missing:
-            report(seed, write(seed))
-    else:
-        # Open3D in a forked process may hang on the threads of its parent
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            jobs = {pool.submit(write, seed): seed for seed in missing}
-            try:
-                for job in as_completed(jobs):
-                    report(jobs[job], job.result())
-            except BaseException:  # Ctrl-C too: else all pending worlds would be made first
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+    # Open3D in a forked process may hang on the threads of its parent
+    executor = ProcessExecutor(workers) if workers > 1 else Executor()
+    try:
+        for number, seconds in executor.run(write, missing):
+            if isinstance(seconds, Exception):
+                raise seconds
+            report(missing[number], seconds)
+    finally:
+        executor.close()
     return list(paths.values())
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
+import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -40,3 +42,14 @@ def start():
             return process
 
         yield run
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Puts another command in the place of ``info``."""
+
+    def install(run, add_arguments=lambda parser: None):
+        module = SimpleNamespace(HELP="acts", add_arguments=add_arguments, run=run)
+        monkeypatch.setitem(sys.modules, "coview_stream.cli.info", module)
+
+    return install

@@ -5,24 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
 import coview_stream.cli as cli
 from coview_stream.errors import CloudError
-
-
-@pytest.fixture
-def command(monkeypatch):
-    """Puts another command in the place of ``info``."""
-
-    def install(run, add_arguments=lambda parser: None):
-        module = SimpleNamespace(HELP="acts", add_arguments=add_arguments, run=run)
-        monkeypatch.setitem(sys.modules, "coview_stream.cli.info", module)
-
-    return install
-
 
 # pytest's own import roots, for processes that it starts do not inherit them
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -64,20 +65,28 @@ class ProcessExecutor(Executor):
         suspects: list[int] = []
         with _one_thread():
             pool = self._pool = self._pool or self._new(self.workers)
-            futures: dict[Future[Any], int] = {pool.submit(function, item): k for k, item in enumerate(items)}
-            for future in as_completed(futures):
-                try:
-                    yield futures[future], future.result()
-                except BrokenProcessPool:
-                    suspects.append(futures[future])
-                except Exception as error:
-                    yield futures[future], error
+            with _deaf_to_interrupts():
+                futures: dict[Future[Any], int] = {pool.submit(function, item): k for k, item in enumerate(items)}
+            try:
+                for future in as_completed(futures):
+                    try:
+                        yield futures[future], future.result()
+                    except BrokenProcessPool:
+                        suspects.append(futures[future])
+                    except Exception as error:
+                        yield futures[future], error
+            except BaseException:  # KeyboardInterrupt: nobody wants their results any more
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
             if suspects:
                 self.close()
             for number in sorted(suspects):
                 with self._new(1) as alone:
                     try:
-                        yield number, alone.submit(function, items[number]).result()
+                        with _deaf_to_interrupts():
+                            only = alone.submit(function, items[number])
+                        yield number, only.result()
                     except BrokenProcessPool:
                         yield (
                             number,
@@ -143,6 +152,16 @@ class DaskExecutor(Executor):
     def close(self) -> None:
         """Disconnect; a local cluster ends."""
         self._client.close()
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Start processes that no Ctrl-C at the terminal reaches: this one ends them; it is interrupted afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
