@@ -6,9 +6,10 @@ Every message names the file, field or key and the remedy. The command prints it
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
@@ -60,6 +61,14 @@ def warn(message: str | None) -> None:
     """Issue a :class:`CoViewWarning`, unless there is no message."""
     if message is not None:
         warnings.warn(message, CoViewWarning, stacklevel=3)
+
+
+def did_you_mean(given: str, known: Sequence[str]) -> str:
+    """Return the end of a message about an unknown name: the nearest known one, or all."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(given, known, 1)
+    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
 
 
 EXTRA_OF = {
@@ -121,9 +130,30 @@ def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator
         raise DependencyError(_not_installed(library, purpose, extra or EXTRA_OF[library])) from error
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra from where this package came: a checkout, a wheel, an address.
+
+    Its bare name is not enough: an index may not have it, or have it from somebody else. What came from an index is
+    named with its version, which pip finds installed and does not look for.
+    """
+    from importlib.metadata import PackageNotFoundError, distribution
+    from json import loads
+    from urllib.parse import unquote
+
+    try:
+        own = distribution("coview-stream")
+    except PackageNotFoundError:  # run by its path
+        return f"pip install '{Path(__file__).resolve().parents[1]}[{extra}]'"
+    source = loads(own.read_text("direct_url.json") or "{}")
+    address = str(source.get("url", ""))
+    if address.startswith("file://"):
+        editable = "-e " if source.get("dir_info", {}).get("editable") else ""
+        return f"pip install {editable}'{unquote(address.removeprefix('file://'))}[{extra}]'"
+    return f"pip install 'coview-stream[{extra}]" + (f" @ {address}'" if address else f"=={own.version}'")
+
+
 def _not_installed(library: str, purpose: str, extra: str) -> str:
-    # pip takes the installed version and looks for no other, wherever this package came from
-    return f"{purpose}: {_spelt(library)} is not installed; pip install 'coview-stream[{extra}]'"
+    return f"{purpose}: {_spelt(library)} is not installed; {install_command(extra)}"
 
 
 def _spelt(library: str) -> str:

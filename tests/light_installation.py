@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 import tempfile
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.errors import EXTRA_OF, DependencyError
+from coview_stream.errors import EXTRA_OF, DependencyError, install_command
 
 BLOCK = """
 import sys
@@ -73,7 +72,7 @@ def check_commands(folder: Path, map_path: Path, block: bool) -> None:
         assert done.returncode == 0, (arguments, done.stderr)
     done = run(folder, map_path, ["doctor", "MAP"], block)
     assert "Traceback" not in done.stderr, done.stderr
-    parts = "client, watch, info, doctor (more: pip install 'coview-stream[node,build,plot]')"
+    parts = f"client, watch, info, doctor (more: {install_command('node,build,plot')})"
     assert parts in done.stdout, done.stdout
     alone = ["doctor", "--robot", "r1", "--listen", "tcp/127.0.0.1:0", "--seconds", "0.5"]
     done = run(folder, map_path, alone, block)
@@ -83,7 +82,7 @@ def check_commands(folder: Path, map_path: Path, block: bool) -> None:
         done = run(folder, map_path, arguments, block)
         assert done.returncode == 2, (arguments, done.returncode, done.stdout, done.stderr)
         last = done.stderr.strip().splitlines()[-1]
-        assert re.search(rf"is not installed; pip install 'coview-stream\[{extra}\]'$", last), (arguments, done.stderr)
+        assert last.endswith(f"is not installed; {install_command(extra)}"), (arguments, done.stderr)
         assert "Traceback" not in done.stderr, done.stderr
 
 
@@ -122,7 +121,7 @@ def lacks(extra: str, act: Callable[[], object]) -> None:
         message = str(error)
     else:
         message = "nothing is lacking"
-    assert message.endswith(f"is not installed; pip install 'coview-stream[{extra}]'"), message
+    assert message.endswith(f"is not installed; {install_command(extra)}"), message
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from coview_stream import errors
-from coview_stream.errors import DependencyError, naming_missing_libraries, require_library
+from coview_stream.errors import DependencyError, install_command, naming_missing_libraries, require_library
 
 
 def test_installed_library_is_imported():
@@ -35,11 +36,45 @@ def test_broken_library_error_gives_the_reason(tmp_path, monkeypatch, kind, reas
 
 def test_missing_library_of_an_extra_is_named_with_the_extra(monkeypatch):
     monkeypatch.setitem(errors.EXTRA_OF, "fast_sums", "node")
-    says = r"^sums: fast-sums is not installed; pip install 'coview-stream\[node\]'$"
+    says = rf"^sums: fast-sums is not installed; {re.escape(install_command('node'))}$"
     with pytest.raises(DependencyError, match=says):
         require_library("fast_sums.quick", "fast-sums>=2.1", "sums")
     with pytest.raises(DependencyError, match=says), naming_missing_libraries("sums"):
         import fast_sums  # noqa: F401
+
+
+FILE = {"url": "file:///tmp/a%20b/coview_stream-0.1.0-py3-none-any.whl", "archive_info": {}}
+CHECKOUT = {"url": "file:///src/coview", "dir_info": {}}
+
+
+@pytest.mark.parametrize(
+    ("source", "command"),
+    [
+        (FILE, "pip install '/tmp/a b/coview_stream-0.1.0-py3-none-any.whl[e57]'"),
+        (CHECKOUT, "pip install '/src/coview[e57]'"),
+        (CHECKOUT | {"dir_info": {"editable": True}}, "pip install -e '/src/coview[e57]'"),
+        (FILE | {"url": "https://host/a.whl"}, "pip install 'coview-stream[e57] @ https://host/a.whl'"),
+        (None, "pip install 'coview-stream[e57]==0.7'"),  # of an index
+    ],
+)
+def test_extras_are_installed_from_where_the_package_came(tmp_path, monkeypatch, source, command):
+    about = tmp_path / "coview_stream-0.7.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: coview-stream\nVersion: 0.7\n")
+    if source is not None:
+        (about / "direct_url.json").write_text(json.dumps(source))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert install_command("e57") == command
+
+
+def test_no_message_names_the_package_alone():
+    """Whoever registers the name with an index would be installed."""
+    root = Path(__file__).parents[1]
+    files = [path for folder in ("coview_stream", "docs", "examples") for path in (root / folder).rglob("*.*")]
+    named = [
+        path for path in files if path.suffix in (".py", ".md") and "pip install 'coview-stream[" in path.read_text()
+    ]
+    assert named == [root / "coview_stream" / "errors.py"]
 
 
 def test_bug_of_our_own_is_not_taken_for_a_missing_library():

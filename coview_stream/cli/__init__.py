@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import itertools
 import os
 import re
 import sys
@@ -21,18 +22,21 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from coview_stream.cli.interrupt import interruptible
-from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, naming_missing_libraries
+from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, did_you_mean, naming_missing_libraries
 from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
 
 COMMANDS = (
     *("demo", "build", "info", "convert", "locate", "fuse", "eval", "simulate", "airborne"),
-    *("serve", "serve-map", "replay", "watch", "doctor", "train", "keygen"),
+    *("serve", "serve-map", "replay", "watch", "doctor", "train", "keygen", "help"),
 )
 """Names in the order of ``--help``."""
 
 _MODULES = {"eval": "evaluate", "serve-map": "serve_map"}  # a module called eval would shadow the builtin
+
+_COMPLETE_FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path (commandline -ct))"}
+"""Completion of a file name, as ``shtab coview_stream.cli.build_parser`` reads it from an argument."""
 
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
 """Extras with the libraries of a command; other commands name what they lack themselves."""
@@ -129,12 +133,31 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=module.HELP, description=module.HELP)
         module.add_arguments(sub)
         sub.set_defaults(run=module.run)
+        for action in sub._actions:
+            if action.type is Path or not action.option_strings or "FILE" in str(action.metavar):
+                action.complete = _COMPLETE_FILE  # type: ignore[attr-defined]
     return parser
 
 
+def _check_options(words: list[str], known: list[str], command: str) -> None:
+    """Refuse a long option that is none of a command's, nor the beginning of one (ConfigError)."""
+    for word in itertools.takewhile(lambda word: word != "--", words):
+        option = word.partition("=")[0]
+        if option.startswith("--") and not any(name.startswith(option) for name in known):
+            near = did_you_mean(option, [name for name in known if name.startswith("--")])
+            raise ConfigError(f"{command} has no option {option}; {near} `{PROGRAM} {command} --help` explains them")
+
+
 def _dispatch(argv: list[str]) -> int:
+    name = argv[0] if argv else "help"  # alone: the list of commands
+    if name not in COMMANDS and not name.startswith("-"):
+        raise ConfigError(f"there is no command {name!r}; {did_you_mean(name, COMMANDS)} `{PROGRAM} help` lists them")
+    parser = build_parser(name if name in COMMANDS else None)
+    if name in COMMANDS:  # before argparse, which names other mistakes first
+        (commands,) = (action.choices for action in parser._actions if action.dest == "command")
+        _check_options(argv[1:], [option for a in commands[name]._actions for option in a.option_strings], name)  # type: ignore[index]  # a dictionary
     try:
-        args, rest = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_known_args(_joined(argv))
+        args, rest = parser.parse_known_args(_joined(argv or [name]))
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
     if rest:

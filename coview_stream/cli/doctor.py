@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([finding.to_json() for finding in findings], indent=1))
     elif any(finding.verdict != "ok" for finding in findings):
-        print("by symptom, with what to do: docs/reasons.md")
+        print("by symptom, with what to do: `coview-stream help reasons`")
     return 1 if failed(findings) else 0
 
 

@@ -121,7 +121,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_initial(parser, of_robots=True)
     add_shared(parser, "--reloc", "--risk", "--verify-key")
     add_state(parser)
-    operation = parser.add_argument_group("operation (docs/operate.md)")
+    operation = parser.add_argument_group("operation (coview-stream help operate)")
     operation.add_argument("--node", dest="node_name", metavar="NAME", help="node's name in keys (the first robot's)")
     operation.add_argument("--fleet", metavar="NAME", help="share the robots with the other nodes of this fleet")
     operation.add_argument(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
 
@@ -55,6 +54,4 @@ def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
 
 def unknown_key(key: str, known: list[str]) -> str:
     """Return the message about a key that a table does not have, with its nearest known one."""
-    near = difflib.get_close_matches(key, known, 1)
-    remedy = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
-    return f"unknown key {key!r}; {remedy}"
+    return f"unknown key {key!r}; {did_you_mean(key, known)}"

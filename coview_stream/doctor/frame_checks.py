@@ -15,6 +15,7 @@ import numpy as np
 
 from coview_stream.config.mount import Mount
 from coview_stream.doctor.finding import Finding, Verdict
+from coview_stream.errors import install_command
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import one_in
 from coview_stream.geometry.transforms import Points, Pose, rot_z, yaw_of
@@ -87,7 +88,7 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
     if missing:
         if ground is not None:
             yield _ground_finding(ground, robot)
-        remedy = "pip install 'coview-stream[node]' here, or ask the doctor where that is installed"
+        remedy = f"{install_command('node')} here, or ask the doctor where that is installed"
         yield Finding("warn", "motion", f"not compared with odometry: {missing}", remedy, robot)
         return
     still = _still(frames, pairs, robot)
@@ -103,7 +104,7 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
             yield explanation
             return
     if ground is None:
-        remedy = "is z up, are points in metres, and are those on the ground sent too? docs/reasons.md"
+        remedy = "is z up, are points in metres, and are those on the ground sent too? `coview-stream help reasons`"
         yield Finding("warn", "ground", "none is seen below the sensor", remedy, robot)
         return
     yield _ground_finding(ground, robot)
@@ -269,5 +270,5 @@ def _motion_finding(seen: Fit | None, robot: str | None) -> Finding:
     )
     if seen.spread < HEADING and abs(seen.yaw) < HEADING:
         return Finding("FAIL", "motion", found, "are both in metres? is odometry's scale right?", robot)
-    remedy = "is it T_odom_body of the body the clouds are in, at their stamps? docs/reasons.md"
+    remedy = "is it T_odom_body of the body the clouds are in, at their stamps? `coview-stream help reasons`"
     return Finding("FAIL", "motion", found, remedy, robot)

@@ -24,6 +24,7 @@ import numpy as np
 from coview_kernels.runtime import cores
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.doctor.finding import Finding
+from coview_stream.errors import install_command
 
 GB = 1e9
 MIN_MEMORY = 0.6 * GB
@@ -83,9 +84,9 @@ def parts_finding(lacking: dict[str, list[str] | None]) -> Finding:
     broken = {part: names for part, names in installed.items() if names}
     if broken:
         reasons = "; ".join(f"{part} lacks {', '.join(names)}" for part, names in broken.items())
-        return Finding("warn", "parts", f"{text}; {reasons}", f"pip install 'coview-stream[{','.join(broken)}]'")
+        return Finding("warn", "parts", f"{text}; {reasons}", install_command(",".join(broken)))
     absent = [part for part in lacking if part not in installed]
-    more = f" (more: pip install 'coview-stream[{','.join(absent)}]')" if absent else ""
+    more = f" (more: {install_command(','.join(absent))})" if absent else ""
     return Finding("ok", "parts", text + more)
 
 
@@ -159,7 +160,7 @@ def codecs_finding(result: dict[str, Any]) -> Finding:
     missing = [result["error"]] if "error" in result else result["missing"]
     if missing:
         text = f"raw and JSON; ROS 2 CDR or Foxglove cannot be read: {', '.join(missing)}"
-        return Finding("warn", "message formats", text, "pip install 'coview-stream[messages]'")
+        return Finding("warn", "message formats", text, install_command("messages"))
     return Finding("ok", "message formats", "raw, JSON, ROS 2 CDR, Foxglove, keelson")
 
 
@@ -176,7 +177,7 @@ def matplotlib_finding(result: dict[str, Any]) -> Finding:
     if "error" not in result:
         return Finding("ok", "matplotlib", str(result["version"]))
     text = f"{result['error']}: no pictures from locate, demo, info and eval"
-    return Finding("warn", "matplotlib", text, "pip install 'coview-stream[plot]'")
+    return Finding("warn", "matplotlib", text, install_command("plot"))
 
 
 def memory() -> tuple[int | None, int | None]:

@@ -14,7 +14,7 @@ from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.machine_checks import GB, MIN_MEMORY
-from coview_stream.errors import CloudError, CoViewError, MapError, RunError
+from coview_stream.errors import CloudError, CoViewError, MapError, RunError, install_command
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -162,7 +162,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
         from coview_stream.localization.localizer import Localizer
         from coview_stream.localization.state import State
     except ImportError as error:
-        remedy = "pip install 'coview-stream[all]'"
+        remedy = install_command("all")
         return Finding("warn", "place", f"not searched for: {error.name} is missing", remedy)
     localizer = Localizer(base_map, config)
     reason, driven = "", 0.0
@@ -185,7 +185,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
     found = f"none on this map after {driven:.0f} m: {reason or 'too little has been seen'}"
     remedy = (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres, "
-        "and has the site not changed? docs/reasons.md"
+        "and has the site not changed? `coview-stream help reasons`"
     )
     sure = driven >= _ENOUGH and localizer.state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
     return Finding("FAIL" if sure else "warn", "place", found, remedy)
@@ -217,7 +217,7 @@ def sensor_findings(run: Run, base_map: BaseMap | None, config: LocalizerConfig)
         cause = Counter(cause for cause, _ in told).most_common(1)[0][0]
         reason = next(reason for other, reason in reversed(told) if other == cause)
         found = f"{reason}; so in {len(told)} of {len(indices)} frames"
-        yield Finding("FAIL", "sensors", found, f"cause {cause}: docs/reasons.md says what to do")
+        yield Finding("FAIL", "sensors", found, f"cause {cause}: `coview-stream help reasons` says what to do")
     else:
         yield Finding("ok", "sensors", f"{of} tell the same motion over {seconds:.0f} s")
         for clause in calibration().describe(run.mount):

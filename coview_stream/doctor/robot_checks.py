@@ -92,7 +92,7 @@ def _unreadable(
     elif first.counter == "unknown_encoding":
         remedy = f"send one of {', '.join(codecs)}, and name it in the Encoding"
     else:
-        remedy = "compare the sender with docs/wire.md, 'Byte layout'"
+        remedy = "compare the sender with 'Byte layout' in `coview-stream help wire`"
     return Finding("FAIL" if len(unreadable) == total else "warn", channel, found, remedy, robot)
 
 
@@ -335,7 +335,7 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
         elif "two places" in reason or "several places" in reason or "leads" in reason:
             remedy = "drive on, to where these places differ; `info --ambiguity` shows where that takes long"
         else:
-            remedy = "drive ten metres; if all else here is ok: is it on this map? docs/reasons.md"
+            remedy = "drive ten metres; if all else here is ok: is it on this map? `coview-stream help reasons`"
         return Finding("warn", "node", found, remedy, robot)
     return Finding("ok", "node", found, robot=robot)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coview_kernels import cast_rays, triangle_tree
-from coview_stream.errors import DependencyError
+from coview_stream.errors import DependencyError, install_command
 from coview_stream.geometry.arrays import Floats32, Indices
 from coview_stream.sim.mesh import Mesh
 
@@ -73,7 +73,7 @@ def _remedy(error: ImportError) -> str:
                 f"Ubuntu with `apt-get install {package}`{extra}"
             )
     if isinstance(error, ModuleNotFoundError) and error.name == "open3d":
-        return "Open3D is not installed; pip install 'coview-stream[open3d]'"
+        return f"Open3D is not installed; {install_command('open3d')}"
     return f"Open3D cannot be loaded ({reason}); reinstall it with `pip install --force-reinstall open3d-cpu`"
 
 

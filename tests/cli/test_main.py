@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,13 +29,50 @@ def test_version_and_help_exit_with_zero(capsys):
     assert "COMMAND" in out
 
 
-@pytest.mark.parametrize("argv", [[], ["no-such-command"], ["--no-such-option"]])
+@pytest.mark.parametrize("argv", [["no-such-command"], ["--no-such-option"], ["help", "no-such-page"]])
 def test_bad_usage_is_one_line_and_exit_two(argv, capsys):
     assert cli.main(argv) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("coview-stream: error: ")
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "near"),
+    [
+        (["biuld", "site.laz"], "build"),
+        (["build", "site.laz", "--ouput", "site.coview"], "--output"),
+        (["watch", "--secnds=3"], "--seconds"),
+        (["help", "reason"], "reasons"),
+    ],
+)
+def test_misspelt_names_are_answered_by_the_nearest(argv, near, capsys):
+    assert cli.main(argv) == 2
+    assert f"did you mean '{near}'?" in capsys.readouterr().err
+
+
+def test_help_prints_commands_and_pages(capsys):
+    assert cli.main([]) == 0
+    commands = capsys.readouterr().out
+    assert cli.main(["help"]) == 0
+    assert capsys.readouterr().out == commands
+    pages = re.search("^pages: (.*)$", commands, re.M)[1].split(", ")
+    assert pages == sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "docs").glob("*.md"))
+    assert cli.main(["help", "build"]) == 0
+    assert "usage: coview-stream build" in capsys.readouterr().out
+    for page in pages:
+        assert cli.main(["help", f"{page}.md"]) == 0
+        assert capsys.readouterr().out.startswith("# ")
+
+
+def test_shells_complete_commands_options_and_files():
+    complete = pytest.importorskip("shtab").complete
+    for shell in ("bash", "zsh", "fish"):
+        script = complete(cli.build_parser(), shell)
+        assert "simulate" in script
+        assert "ambiguity" in script
+    assert "info_pos_0_COMPGEN=_shtab_compgen_files" in complete(cli.build_parser(), "bash")
 
 
 @pytest.mark.parametrize(

