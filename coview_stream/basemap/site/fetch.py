@@ -171,7 +171,7 @@ class Mirror:
         self.offline = ""
         self._verify_key = verify_key
         self._known: tuple[bytes, Manifest] | None = None  # newest manifest that was read, by the hash of its bytes
-        name = hashlib.sha256(source.name.encode()).hexdigest()[:16]
+        name = hashlib.sha256(source.name.encode()).hexdigest()[:32]
         self.directory = cache_folder() / "sites" / name
         self._store = TileStore(self.directory)
 

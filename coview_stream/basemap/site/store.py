@@ -2,7 +2,8 @@
 
 The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. Least recently used files are deleted
 to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, for ``--verify-key`` as well: nobody else can reach
-them. A folder that others may write is refused, and one that they may read is closed to them.
+them. A folder that others may write or exchange is refused. One that they may read is closed to them, and files that
+they could write meanwhile are deleted.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from coview_kernels.runtime import is_private
 from coview_stream.basemap.signature import FileIdentity, file_identity
 from coview_stream.clouds.atomic_file import atomic_file, atomic_path
 from coview_stream.errors import ConfigError, MapError
@@ -111,13 +113,16 @@ def cache_folder() -> Path:
             state = folder.stat()
             if state.st_uid != os.getuid():
                 raise MapError(f"{folder}: belongs to another user; name a folder of your own in COVIEW_CACHE")
-            if state.st_mode & 0o022:
+            if state.st_mode & 0o022 or not is_private(folder):
                 raise MapError(
-                    f"{folder}: others may write to it, so its maps may be theirs; delete it and make it again with "
-                    "'mkdir -m 700', or name another folder in COVIEW_CACHE"
+                    f"{folder}: others may write to it, or to a folder that it is in, so its maps may be theirs; delete "
+                    "it and make it again with 'mkdir -m 700', or name another folder in COVIEW_CACHE"
                 )
-            if state.st_mode & 0o077:  # files in it are made by the umask, which may let others write them
+            if state.st_mode & 0o077:
                 folder.chmod(0o700)
+                for path in folder.rglob("*"):  # made by the umask, which may have let others write them
+                    if path.is_file() and path.stat().st_mode & 0o022:
+                        path.unlink()
     except OSError as error:
         raise MapError(f"{folder}: cannot be used ({error.strerror}); name a folder in COVIEW_CACHE") from error
     return folder

@@ -38,6 +38,31 @@ def test_folder_that_others_may_write_is_refused(tmp_path, monkeypatch, mode):
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
+def test_folder_that_others_may_exchange_is_refused(tmp_path, monkeypatch):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    monkeypatch.setenv("COVIEW_CACHE", str(shared / "cache"))
+    assert cache_folder() == shared / "cache"
+    shared.chmod(0o777)
+    with pytest.raises(MapError, match="or to a folder that it is in"):
+        cache_folder()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
+def test_files_that_others_could_write_while_the_folder_was_open_are_deleted(folder, tmp_path):
+    ours, theirs, mirrored = folder / "a.coview", folder / "b.coview", folder / "sites" / "x" / "manifest.json"
+    mirrored.parent.mkdir(parents=True)
+    for path, mode in ((ours, 0o644), (theirs, 0o666), (mirrored, 0o664)):
+        path.write_bytes(b"map")
+        path.chmod(mode)
+    assert cache_folder() == folder
+    assert theirs.exists()  # nobody else reaches it
+    folder.chmod(0o755)
+    assert cache_folder() == folder
+    assert (ours.exists(), theirs.exists(), mirrored.exists()) == (True, False, False)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
 def test_others_do_not_reach_the_folder_with_any_umask(tmp_path, monkeypatch):
     (tmp_path / "b").mkdir()
     (tmp_path / "b").chmod(0o755)
