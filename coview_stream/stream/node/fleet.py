@@ -3,7 +3,8 @@
 Every node ranks all nodes that are alive for each robot by a hash of both names (rendezvous hashing), and the first one
 serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. A node
 is alive that holds a liveliness token and tells the others the places of its robots once a second: a token goes at once
-with its process, but any session may hold one.
+with its process, but any session may hold one. A node whose engines have not been ready for 7 s tells nothing, and gives
+its robots up when the others have noticed, if there are any.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from coview_stream.errors import TransportError
@@ -33,6 +34,7 @@ _MISSED = 2  # looks in a row that do not show a node, before it counts as gone
 _LOOK = 0.1  # seconds between two looks at the tokens
 _TELL = 1.0  # seconds between two messages of the robots' places
 _SILENT = 30  # looks in a row without such a message, 3 s, before a token alone counts for nothing
+_UNREADY = 70  # looks in a row, 7 s, at engines that are not ready: one that died has been started again sooner
 _MAX_HEARD = 1024  # messages between two looks
 _MAX_BYTES = 4 << 20  # of such a message that are read
 
@@ -96,13 +98,22 @@ class Fleet:
         node: name of this node, unlike all others.
         endpoints: of all robots of the fleet, by name; none of them is served yet.
         transport: of tokens and places.
+        ready: tells whether this node's engines are.
     """
 
-    def __init__(self, prefix: str, node: str, endpoints: Mapping[str, RobotEndpoints], transport: Transport) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        node: str,
+        endpoints: Mapping[str, RobotEndpoints],
+        transport: Transport,
+        ready: Callable[[], bool] = lambda: True,
+    ) -> None:
         self.prefix, self.node = prefix, node
         self.members = FleetMembers(node)
         self._endpoints = endpoints
         self._transport = transport
+        self._ready, self._unready = ready, 0  # looks in a row at engines that were not
         self._errors = RateLimitedErrors(log)
         self._heard: deque[str] = deque(maxlen=_MAX_HEARD)  # nodes that have told something since the last look
         self._told = float("-inf")  # local time
@@ -140,8 +151,11 @@ class Fleet:
             changes = ((after - before, "came"), (before - after, "went"))
             news = "; ".join(f"{', '.join(sorted(nodes))} {verb}" for nodes, verb in changes if nodes)
             log.info("fleet: %s: %d nodes", news, len(after))
-        if self.node in tokens and self.members.settled and self._ranked != self.members.alive:
-            self._ranked = self.members.alive
+        self._unready = 0 if self._ready() else self._unready + 1
+        others = self.members.alive - {self.node}
+        alive = others if others and self._unready >= _UNREADY + _SILENT else self.members.alive
+        if self.node in tokens and self.members.settled and self._ranked != alive:
+            self._ranked = alive
             self._move({robot for robot in self._endpoints if owner(robot, self._ranked) == self.node})
         for robot, place in list(self._arriving.items()):
             if self._endpoints[robot].session.offer(place):
@@ -168,7 +182,9 @@ class Fleet:
             )  # fmt: skip
 
     def tell(self) -> None:
-        """Tell the others that this node is alive, and the places of its robots."""
+        """Tell the others that this node is alive, and the places of its robots; not without engines."""
+        if self._unready >= _UNREADY:
+            return
         places = {}
         for name, robot in self._endpoints.items():
             if robot.serving and (place := robot.session.last_place()) is not None:

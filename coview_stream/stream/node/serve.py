@@ -186,7 +186,10 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
         follower = MapFollower(options.mirrors, reloader.request, lambda: reloader.outcome)
         services["map source"] = follower.run
     if options.fleet is not None:
-        services["fleet"] = Fleet(options.fleet, node.identity.node, node.endpoints, node.transport).run
+        services["fleet"] = Fleet(
+            options.fleet, node.identity.node, node.endpoints, node.transport,
+            lambda: all(engine.ready for engine in node.feeds[0].engines.values()),
+        ).run  # fmt: skip
     health = NodeHealth(node, bool(options.network.connect), follower)
     if (keys := options.node_keys) is not None:
         health.answer(keys)

@@ -78,10 +78,14 @@ class Member(Site):
     def look(*nodes):
         """All nodes of a fleet tell and look, in turns, until each has heard the others."""
         for _ in range(3):
-            for node in nodes:
-                node.fleet.tell()
+            Member.tell(*nodes)
             for node in nodes:
                 node.fleet.look()
+
+    @staticmethod
+    def tell(*nodes):
+        for node in nodes:
+            node.fleet.tell()
 
     @property
     def serves(self):
@@ -134,6 +138,35 @@ def test_ghosts_with_tokens_take_no_robot():
         late.fleet.look()  # others do not wait for ghosts for ever
     Member.look(*nodes, late)
     assert set.union(*(node.serves for node in (*nodes, late))) == set(robots)
+
+
+def test_node_without_engines_gives_its_robots_up_while_there_are_others():
+    net, robots = MemoryTransport(), ROBOTS[:20]
+    a, b = (Member(net, name, robots) for name in ("a", "b"))
+    Member.look(a, b)
+    before = a.serves
+    assert before
+    assert b.serves == set(robots) - before
+    a.fleet._ready = lambda: False
+
+    def looks(number):
+        for k in range(number):
+            if k % 10 == 0:
+                Member.tell(a, b)
+            for node in (a, b):
+                node.fleet.look()
+
+    looks(60)
+    assert a.serves == before  # its engines may be starting again
+    looks(60)
+    assert (a.serves, b.serves) == (set(), set(robots))
+    net.withdraw(f"{PREFIX}/nodes/b")
+    looks(5)
+    assert a.serves == set(robots)  # nobody else would
+    net.announce(f"{PREFIX}/nodes/b")
+    a.fleet._ready = lambda: True
+    looks(20)
+    assert a.serves == before
 
 
 def test_node_that_comes_takes_its_robots_with_their_places():
