@@ -39,7 +39,12 @@ def direct_needs(extra):
             yield text
 
 
-@pytest.mark.parametrize(("lock", "extra"), [("test", "test"), ("wheel", "all"), ("tools", None)])
+EXTRAS = ("all", "cluster", "e57", "foxglove", "kiss-icp", "s3", "sign", "viz")
+
+
+@pytest.mark.parametrize(
+    ("lock", "extra"), [("test", "test"), ("wheel", "all"), ("tools", None), *(("extras", name) for name in EXTRAS)]
+)
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 @pytest.mark.parametrize("python", ["3.11", "3.12", "3.13", "3.14"])
 def test_lock_has_every_direct_dependency_at_an_allowed_version(lock, extra, machine, python):
@@ -69,10 +74,14 @@ def test_every_locked_version_has_hashes(lock):
 
 
 def test_locks_agree(check):
-    test, wheel, tools = (check.locked(LOCKS[name].read_text()) for name in ("test", "wheel", "tools"))
+    test, wheel, tools, extras = (
+        check.locked(LOCKS[name].read_text()) for name in ("test", "wheel", "tools", "extras")
+    )
     assert wheel < test
-    shared = {name for name, _ in tools} & {name for name, _ in test}
-    assert {entry for entry in tools if entry[0] in shared} == {entry for entry in test if entry[0] in shared}
+    assert wheel < extras
+    for other in (tools, extras):
+        shared = {name for name, _ in other} & {name for name, _ in test}
+        assert {entry for entry in other if entry[0] in shared} == {entry for entry in test if entry[0] in shared}
 
 
 def test_advisory_for_a_locked_version_fails_and_a_waived_one_is_printed(check, tmp_path, capsys):

@@ -115,8 +115,8 @@ def cache_folder() -> Path:
                 raise MapError(f"{folder}: belongs to another user; name a folder of your own in COVIEW_CACHE")
             if state.st_mode & 0o022 or not is_private(folder):
                 raise MapError(
-                    f"{folder}: others may write to it, or to a folder that it is in, so its maps may be theirs; delete "
-                    "it and make it again with 'mkdir -m 700', or name another folder in COVIEW_CACHE"
+                    f"{folder}: others may write to it, or to a folder that it is in, so its maps may be theirs; "
+                    "delete it and make it again with 'mkdir -m 700', or name another folder in COVIEW_CACHE"
                 )
             if state.st_mode & 0o077:
                 folder.chmod(0o700)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from queue import Empty, Full, Queue
 from typing import Any
 
 from coview_stream.basemap.site.manifest import Manifest, read_manifest
@@ -21,8 +20,8 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 log = logging.getLogger("coview_stream.maps")
 
 _LOOK = 1.0  # seconds between two looks at the manifest's file
-_QUEUE = 256  # waiting queries; more are refused, and clients repeat them
-_READERS = 8  # answers at once: a reader that has stopped holds up the thread of each until zenoh drops it
+_QUEUE, _OF_ONE = 256, 32  # waiting queries, and those of one reader; more are refused, and clients repeat them
+_ANSWERS = 8  # at once, one for each reader: one that has stopped holds up a thread until zenoh drops it
 
 
 class MapServer:
@@ -57,7 +56,9 @@ class MapServer:
         self._layers = _sizes(self.manifest)
         self._guard = RateLimitedErrors(log)
         self._stopping = threading.Event()
-        self._queries: Queue[Any] = Queue(_QUEUE)
+        self._queries: deque[tuple[str, Any]] = deque()  # with their readers
+        self._answering: set[str] = set()  # readers
+        self._waiting = threading.Condition()
         self._counting = threading.Lock()
         with zenoh_config.zenoh_errors("zenoh session"):
             self._session: Any = zenoh.open(zenoh_config.compose(connect, listen, config))
@@ -67,7 +68,7 @@ class MapServer:
             self._publisher = self._session.declare_publisher(keys.changed)
         self._threads = [
             threading.Thread(target=work, name=f"coview {name}", daemon=True)
-            for name, work in (*[("maps", self._answer_all)] * _READERS, ("manifest", self._look))
+            for name, work in (*[("maps", self._answer_all)] * _ANSWERS, ("manifest", self._look))
         ]
         for thread in self._threads:
             thread.start()
@@ -77,27 +78,40 @@ class MapServer:
         self._stopping.set()
         with self._guard.catch("closing"):
             self._session.close()  # and all that was declared on it
-        with contextlib.suppress(Empty):
-            while True:
-                self._queries.get_nowait()
-        for _ in range(_READERS):
-            self._queries.put(None)
+        with self._waiting:
+            self._queries.clear()
+            self._waiting.notify_all()
         end = time.monotonic() + 2.0
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
 
     def _put(self, query: Any) -> None:
-        try:
-            self._queries.put_nowait(query)
-        except Full:
+        source = query.source_info
+        reader = "" if source is None else str(source.source_id.zid)  # all who do not say count as one
+        with self._waiting:
+            own = sum(waiting == reader for waiting, _ in self._queries)
+            if taken := own < _OF_ONE and len(self._queries) < _QUEUE:
+                self._queries.append((reader, query))
+                self._waiting.notify()
+        if not taken:
             with self._guard.catch("refusing"):
                 query.reply_err(b"too many queries wait: ask again")
 
+    def _next(self) -> tuple[str, Any] | None:
+        """Wait for a query of a reader who has no answer under way; None at the end."""
+        with self._waiting:
+            while not self._stopping.is_set():
+                for at, (reader, query) in enumerate(self._queries):
+                    if reader not in self._answering:
+                        del self._queries[at]
+                        self._answering.add(reader)
+                        return reader, query
+                self._waiting.wait()
+        return None
+
     def _answer_all(self) -> None:
-        while not self._stopping.is_set():
-            query = self._queries.get()
-            if query is None:
-                return
+        while (taken := self._next()) is not None:
+            reader, query = taken
             with self._guard.catch("answering"), query:
                 if query.key_expr.intersects(self._keys.manifest):
                     self._reply(query, self._keys.manifest, self._raw)
@@ -109,6 +123,10 @@ class MapServer:
                     except MapError as error:
                         log.error("%s", error)
                         query.reply_err(str(error).encode())
+
+            with self._waiting:
+                self._answering.discard(reader)
+                self._waiting.notify()
 
     def _reply(self, query: Any, key: str, raw: bytes) -> None:
         query.reply(key, raw)

@@ -94,7 +94,9 @@ class ZenohSource:
                 raise TransportError(f"{self.name}: nothing answers there; is serve-map running?") from error
         with zenoh_config.zenoh_errors(self.name):
             refusal = ""
-            for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
+            own = zenoh.SourceInfo(self._session.id, 0)  # servers answer each reader in turn
+            target = zenoh.QueryTarget.BEST_MATCHING
+            for reply in self._session.get(key, timeout=_TIMEOUT, target=target, source_info=own):
                 if reply.ok is None:
                     refusal = bytes(reply.err.payload)[:300].decode(errors="replace").replace(_NO_ANSWER, "")
                     continue

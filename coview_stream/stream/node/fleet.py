@@ -3,8 +3,8 @@
 Every node ranks all nodes that are alive for each robot by a hash of both names (rendezvous hashing), and the first one
 serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. A node
 is alive that holds a liveliness token and tells the others the places of its robots once a second: a token goes at once
-with its process, but any session may hold one. A node whose engines have not been ready for 7 s tells nothing, and gives
-its robots up when the others have noticed, if there are any.
+with its process, but any session may hold one. A node whose engines have not been ready for 7 s tells nothing, and
+gives its robots up when the others have noticed, if there are any.
 """
 
 from __future__ import annotations

@@ -278,15 +278,16 @@ def test_command_says_what_it_serves_and_ends_with_a_signal(site, endpoint):
 STOPPED = """
 import os, signal, sys, zenoh
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
-for _ in range(5):
-    session.get(sys.argv[2], lambda reply: None)  # more than the link holds, by one or two
+for _ in range(int(sys.argv[3])):
+    session.get(sys.argv[2], lambda reply: None)  # more than the link holds
 print("up", flush=True)
 os.kill(os.getpid(), signal.SIGSTOP)
 """
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP")
-def test_readers_that_stopped_hold_up_no_other(site, endpoint):
+@pytest.mark.parametrize("queries", [5, 40])
+def test_readers_that_stopped_hold_up_no_other(site, endpoint, queries):
     layer = max((x for tile in Manifest.load(site).tiles for x in tile.layers.values()), key=lambda x: x.bytes)
     keys = MapKeys.of("yard")
     server = MapServer(site, keys, listen=[f"{endpoint}#so_sndbuf=8192"])
@@ -294,7 +295,7 @@ def test_readers_that_stopped_hold_up_no_other(site, endpoint):
     readers = []
     try:
         for _ in range(3):
-            command = [sys.executable, "-c", STOPPED, client, keys.layer(layer.sha256)]
+            command = [sys.executable, "-c", STOPPED, client, keys.layer(layer.sha256), str(queries)]
             readers.append(subprocess.Popen(command, stdout=subprocess.PIPE))
             assert readers[-1].stdout.readline() == b"up\n"
         begin = time.monotonic()
