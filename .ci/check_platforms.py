@@ -17,15 +17,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("", "node", "all")
 PROMISED = {
-    "x86_64-manylinux_2_35": PARTS,
-    "x86_64-manylinux_2_28": ("", "node"),
-    "aarch64-manylinux_2_35": PARTS,
-    "aarch64-manylinux_2_28": ("", "node"),
+    "x86_64-manylinux_2_28": PARTS,
+    "aarch64-manylinux_2_28": PARTS,
     "aarch64-apple-darwin": ("", "node"),
 }
 """Platforms as uv names them, with the oldest glibc, and what docs/small.md says resolves there."""
 
-TRIED = ("x86_64-manylinux_2_31", "x86_64-manylinux_2_17", "aarch64-manylinux_2_31", "x86_64-pc-windows-msvc")
+TRIED = ("x86_64-manylinux_2_17", "x86_64-pc-windows-msvc")
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 
 
