@@ -16,11 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("", "node", "all")
-PROMISED = {
-    "x86_64-manylinux_2_28": PARTS,
-    "aarch64-manylinux_2_28": PARTS,
-    "aarch64-apple-darwin": ("", "node"),
-}
+PROMISED = {"x86_64-manylinux_2_28": PARTS, "aarch64-manylinux_2_28": PARTS, "aarch64-apple-darwin": ("", "node")}
 """Platforms as uv names them, with the oldest glibc, and what docs/small.md says resolves there."""
 
 TRIED = ("x86_64-manylinux_2_17", "x86_64-pc-windows-msvc")
