@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -78,3 +79,30 @@ def test_all_errors_derive_from_coview_error():
         assert kind.__doc__
     assert issubclass(errors.MapError, errors.InputError)
     assert issubclass(errors.DependencyError, ImportError)
+
+
+@pytest.mark.slow
+def test_types_of_a_users_program_check(tmp_path):
+    """Arrays as NumPy makes them, float64, are welcome wherever points are."""
+    program = tmp_path / "program.py"
+    program.write_text("""
+import numpy as np
+from coview_stream import AcceptanceConfig, AsyncLocalizer, BaseMap, Localizer, LocalizerConfig, MapConfig, RobotClient
+
+points = np.zeros((100, 3))
+base_map = BaseMap.build(points, config=MapConfig(voxel=0.5), crs="EPSG:25832")
+localizer = Localizer(base_map, LocalizerConfig(acceptance=AcceptanceConfig(risk=1e-5)))
+fix = localizer.step(points, np.eye(4), 0.0)
+fix = localizer.step(points.astype(np.float32), np.eye(4), 0.1)
+if fix.T_map_body is not None and fix.protection is not None:
+    print(fix.position, fix.protection.metres)
+localizer.save_state("robot.json")
+with AsyncLocalizer("site.coview") as loop, RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:
+    loop.load_state("robot.json")
+    loop.step(points, np.eye(4), 0.2)
+    robot.send_cloud(points, 0.2)
+""")
+    root = Path(__file__).resolve().parents[1]
+    command = [sys.executable, "-m", "mypy", "--strict", f"--config-file={root}/pyproject.toml", str(program)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

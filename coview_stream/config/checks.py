@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import numbers
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, did_you_mean
+
+Config = TypeVar("Config")
 
 
 def require(ok: bool, config: object, name: str, allowed: str) -> None:
@@ -17,6 +20,26 @@ def require(ok: bool, config: object, name: str, allowed: str) -> None:
     if not ok:
         value = getattr(config, name)
         raise ConfigError(f"{name} is {value!r}; it must be {allowed} ({type(config).__name__}.{name})")
+
+
+def names_parts(kind: type[Config]) -> type[Config]:
+    """Have a configuration of configurations refuse a field that one of these has, with its place (ConfigError)."""
+    made = kind.__init__
+
+    @functools.wraps(made)
+    def checked(self: Config, *given: Any, **named: Any) -> None:
+        own = {item.name: item.default_factory for item in fields(kind)}  # type: ignore[arg-type]
+        for name in named.keys() - own.keys():
+            for part, inner in own.items():
+                if isinstance(inner, type) and name in inner.__dataclass_fields__:
+                    raise ConfigError(
+                        f"{kind.__name__} has no {name}; write {part}={inner.__name__}({name}={named[name]!r})"
+                    )
+            raise ConfigError(f"{kind.__name__} has no {name}; {did_you_mean(name, list(own))}")
+        made(self, *given, **named)
+
+    kind.__init__ = checked  # type: ignore[method-assign, assignment]
+    return kind
 
 
 _NUMBERS = {"float": (numbers.Real, "a number"), "int": (numbers.Integral, "a whole number")}

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from coview_stream.config.checks import all_positive, check_types, counts, fraction, positive, require
+from coview_stream.config.checks import all_positive, check_types, counts, fraction, names_parts, positive, require
 
 MIN_PAIRS = 50
 """Pairs that a registration needs, and points that a crop of the map needs."""
@@ -248,6 +248,7 @@ class GraphConfig:
         positive(self, "huber")
 
 
+@names_parts
 @dataclass(frozen=True)
 class LocalizerConfig:
     """Settings of the localizer; the defaults need no change.

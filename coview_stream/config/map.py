@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
-from coview_stream.config.checks import check_types, counts, positive, require
+from coview_stream.config.checks import check_types, counts, names_parts, positive, require
 from coview_stream.errors import ConfigError
 
 Channel = Literal["scan_context", "coview", "paper"]
@@ -56,6 +56,7 @@ class DescriptorConfig:
         require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")
 
 
+@names_parts
 @dataclass(frozen=True)
 class MapConfig:
     """Building of a base map; set by hand where the paper gives no value.

@@ -11,12 +11,14 @@ import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
+from coview_stream.geometry.arrays import Reals
+from coview_stream.geometry.transforms import Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.frame import FramePreparation, PreparedFrame
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
@@ -33,7 +35,7 @@ from coview_stream.localization.witness.witness import Witness
 _DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
 
 
-class Localizer:
+class Localizer(SavedState):
     """Localization of one robot on a base map (paper, eqs 1-13, and a graph of poses from the first fix on).
 
     Attributes:
@@ -131,12 +133,12 @@ class Localizer:
 
     # ---- one frame
 
-    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
+    def step(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> Fix:
         """Localize by one more frame; docs/method.md has the steps.
 
         Args:
-            cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres, or (N, 4) with intensities that
-                are not used; rows with NaN are dropped.
+            cloud: (N, 3) float32 or float64 body-frame points (x forward, z up), deskewed, metres, or (N, 4) with
+                intensities that are not used; rows with NaN are dropped.
             T_odom_body: (4, 4) odometry pose of the frame, gravity aligned, metres.
             stamp: seconds.
 
@@ -156,7 +158,7 @@ class Localizer:
             self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
         return self.fix()
 
-    def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
+    def add_frame(self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
         """:meth:`step` without the search: its arguments, and its errors.
 
         Args:
@@ -300,7 +302,7 @@ class Localizer:
 
     # ---- the steps
 
-    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
+    def _predict(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
         """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
         searching = not self.state.has_place
         drift = self._tracker.odometry.drift.variances if searching else None

@@ -15,12 +15,14 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CoViewError, InputError
+from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.protection import protection_level
-from coview_stream.geometry.transforms import Points, Pose, inverse, yaw_of
+from coview_stream.geometry.transforms import Pose, inverse, yaw_of
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.localizer import checked_arguments
 from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.search.recognizers import SearchIndex
@@ -49,7 +51,7 @@ _CLOSE_TIMEOUT = 1.0  # seconds for the threads to end
 log = logging.getLogger("coview_stream")
 
 
-class AsyncLocalizer:
+class AsyncLocalizer(SavedState):
     """A localizer whose calls never wait: search and registration run in child processes.
 
     Two of them do the work of a :class:`~coview_stream.localization.localizer.Localizer`, one the searches, one the
@@ -104,7 +106,7 @@ class AsyncLocalizer:
                 raise TimeoutError(f"the processes are not ready after {timeout:g} s")
             time.sleep(_STEP)
 
-    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
+    def step(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> Fix:
         """Hand over one more frame and return at once; arguments as of ``Localizer.step``.
 
         Frames may come faster than they are worked on: then the newest replaces the one that waits (:attr:`skipped`).
@@ -269,7 +271,7 @@ class Mailbox:
         self._fixed: _Frame | None = None  # its frame
         self._frames: dict[int, _Frame] = {}  # by their stamps in nanoseconds, from the one under way on
 
-    def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float) -> None:
+    def add_frame(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> None:
         """Check a frame and have it wait for the engine."""
         points = validate_cloud(cloud)
         with self.changed:

@@ -16,7 +16,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -24,8 +24,9 @@ from urllib.parse import quote
 import numpy as np
 
 from coview_stream.errors import ConfigError, InputError, MessageError
-from coview_stream.geometry.transforms import Pose, is_pose, yaw_of
+from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.saved_state import read_calibration, read_pose
 from coview_stream.localization.search.hints import MAX_DISTANCE, PlaceGuess
 from coview_stream.messages import decode_pose
 from coview_stream.messages.types import Sample
@@ -62,8 +63,8 @@ class LastPlace:
         """Read :meth:`to_message`, from anyone; ValueError, TypeError or KeyError for something else."""
         return cls(
             map_sha256=str(plain["map_sha256"])[:64],
-            T_map_odom=_read_pose(plain, "T_map_odom"),
-            calibration=_read_calibration(plain.get("calibration")),
+            T_map_odom=read_pose(plain, "T_map_odom"),
+            calibration=read_calibration(plain.get("calibration")),
         )
 
 
@@ -122,8 +123,8 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
         return LastPlace(
             map_sha256,
             stamp_ns=int(document["stamp_ns"]),
-            T_map_body=_read_pose(document, "T_map_body"),
-            calibration=_read_calibration(document.get("calibration")),
+            T_map_body=read_pose(document, "T_map_body"),
+            calibration=read_calibration(document.get("calibration")),
         )
     except FileNotFoundError:
         return None
@@ -188,22 +189,6 @@ def _open_regular(path: Path) -> BinaryIO:
         file.close()
         raise OSError("it is no file")
     return file
-
-
-def _read_pose(document: Any, name: str) -> Pose:
-    T = np.asarray(document[name], dtype=np.float64)
-    if not is_pose(T):
-        raise ValueError(f"{name} is not a finite rigid 4x4 transform")
-    return T
-
-
-def _read_calibration(plain: Any) -> Calibration | None:
-    if plain is None:
-        return None
-    if not isinstance(plain, dict):
-        raise ValueError("its calibration is something else")
-    names = {f.name for f in fields(Calibration)}
-    return Calibration(**{name: float(value) for name, value in plain.items() if name in names}).require_plausible()
 
 
 # ---- guesses of people: parameters of a query, JSON, or RViz' pose

@@ -1,0 +1,96 @@
+"""A program that starts again goes on from the place and the calibration that it saved."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.errors import InputError
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.result import Fix
+from coview_stream.localization.saved_state import SavedState
+from coview_stream.localization.state import State
+
+
+class Robot(SavedState):
+    """A localizer that knows this pose, and notes what it is told."""
+
+    def __init__(self, T_map_body=None, calibration=Calibration()):  # noqa: B008  # frozen
+        self.T_map_body, self.calibration, self.told = T_map_body, calibration, []
+
+    def fix(self):
+        if self.T_map_body is None:
+            raise RuntimeError("no frame yet")
+        return Fix(1.0, State.TRACKING, T_map_body=self.T_map_body)
+
+    def hint_pose(self, T_map_body):
+        self.told.append(T_map_body)
+
+    def hint_calibration(self, earlier):
+        self.told.append(earlier)
+
+
+def place(x):
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_pose_and_calibration_come_back(tmp_path):
+    path, calibration = tmp_path / "r1.json", Calibration(roll=0.1, scale=0.02, ground=0.3)
+    Robot(place(448_000.25), calibration).save_state(path)
+    again = Robot()
+    assert again.load_state(path) is True
+    np.testing.assert_array_equal(again.told[0], place(448_000.25))
+    assert again.told[1] == calibration
+
+
+def test_pose_of_the_file_stays_while_there_is_none(tmp_path):
+    path = tmp_path / "r1.json"
+    Robot(place(3.0)).save_state(path)
+    Robot(calibration=Calibration(roll=0.2)).save_state(path)
+    again = Robot()
+    again.load_state(path)
+    np.testing.assert_array_equal(again.told[0], place(3.0))
+    assert again.told[1].roll == 0.2
+
+
+def test_first_start_has_no_file(tmp_path):
+    robot = Robot()
+    assert robot.load_state(tmp_path / "none.json") is False
+    assert robot.told == []
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"version": 2}, "version 2, this release reads 1"),
+        ({"format": "site"}, "something else"),
+        ({"T_map_body": [[1, 2], [3, 4]]}, "not a finite rigid"),
+        ({"calibration": {"scale": 1e9}}, "scale is 1000000000.0"),
+    ],
+)
+def test_other_file_is_refused_by_name(tmp_path, change, text):
+    path = tmp_path / "r1.json"
+    Robot(place(3.0)).save_state(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=rf"r1\.json: .*{text}"):
+        Robot().load_state(path)
+
+
+@pytest.mark.slow
+def test_localizer_goes_on_where_it_was(world_map, world_drive, tmp_path):
+    from coview_stream.localization.localizer import Localizer
+
+    frames = list(zip(world_drive.clouds, world_drive.T_odom_body, strict=True))
+    first = Localizer(world_map)
+    fixes = [first.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(frames)]
+    assert fixes[-1].T_map_body is not None
+    first.save_state(tmp_path / "r1.json")
+    again = Localizer(world_map)
+    assert again.load_state(tmp_path / "r1.json")
+    fix = again.step(*frames[-1], 0.5 * len(frames))
+    assert fix.T_map_body is not None
+    np.testing.assert_allclose(fix.position, fixes[-1].position, atol=0.1)
