@@ -118,7 +118,7 @@ def test_field_in_the_wrong_place_is_named_with_the_right_one():
         LocalizerConfig(risk=1e-5)
     with pytest.raises(ConfigError, match=r"write descriptor=DescriptorConfig\(radius=3\)"):
         MapConfig(radius=3)
-    with pytest.raises(ConfigError, match="LocalizerConfig has no acceptence; did you mean 'acceptance'?"):
+    with pytest.raises(ConfigError, match="no acceptence; did you mean 'acceptance'"):
         LocalizerConfig(acceptence=AcceptanceConfig())
 
 
