@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib.util
 import re
 import shlex
@@ -18,9 +19,13 @@ import coview_stream
 from bench.__main__ import BENCHMARKS
 from coview_stream import RejectionReason, State
 from coview_stream.cli import build_parser
+from coview_stream.cli.info import describe
+from coview_stream.doctor.finding import Finding
+from coview_stream.localization.offline import RunResult
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.messages import decode_cloud, decode_odometry, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.report.evaluation import Evaluation
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -365,3 +370,17 @@ def test_each_promise_names_a_test_or_a_benchmark():
     promises = [line for line in text_of("limits.md").splitlines() if line.startswith("| **")]
     assert len(promises) > 10
     assert [line for line in promises if "`tests/" not in line and "python -m bench" not in line] == []
+
+
+def test_fields_of_json_are_documented(world_map):
+    fields = {
+        "out/result.json": RunResult(1, []).to_json(world_map),
+        "eval --json": {"format", *(field.name for field in dataclasses.fields(Evaluation))},
+        "doctor --json": {"format", "findings", *(field.name for field in dataclasses.fields(Finding))},
+        "info --json": {"format", "signature", *describe(world_map)},
+    }
+    section = text_of("wire.md").partition("## JSON of commands")[2]
+    for name, known in fields.items():
+        row = re.search(rf"^\| `{re.escape(name)}` \| (.*) \|$", section, re.M)[1]
+        named = set(re.findall(r"`([\w ]+)`", row))
+        assert set(known) <= named, name

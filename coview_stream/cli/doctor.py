@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         if not args.json:
             print(finding.line(), flush=True)  # the next one may take seconds
     if args.json:
-        print(json.dumps([finding.to_json() for finding in findings], indent=1))
+        print(json.dumps({"format": 1, "findings": [finding.to_json() for finding in findings]}, indent=1))
     elif any(finding.verdict != "ok" for finding in findings):
         print("by symptom, with what to do: `coview-stream help reasons`")
     return 1 if failed(findings) else 0

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
     if args.json:
-        print(json.dumps(facts, indent=1))
+        print(json.dumps({"format": 1} | facts, indent=1))
     else:
         print("\n".join(f"{name:<14} {_text(value)}" for name, value in facts.items()))
     if args.plot:

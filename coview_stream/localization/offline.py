@@ -187,6 +187,7 @@ class RunResult:
         evidence = self.fixes[-1].evidence if self.fixes else None
         latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
         return {
+            "format": 1,
             "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),

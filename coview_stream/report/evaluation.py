@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -94,8 +95,8 @@ class Evaluation:
     origin_t_m: float | None = None
 
     def to_json(self) -> str:
-        """Return one JSON object with the attributes as keys; errors rounded to 0.1 mm and 0.0001 degree."""
-        return json.dumps(_rounded(asdict(self)), indent=1)
+        """Return one JSON object: ``format`` and the attributes; errors rounded to 0.1 mm and 0.0001 degree."""
+        return json.dumps({"format": 1} | _rounded(asdict(self)), indent=1)
 
 
 def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
@@ -164,7 +165,7 @@ def _stats(values: Floats) -> ErrorStats | None:
     return ErrorStats(float(values.mean()), rmse, float(np.median(values)), float(values.max()))
 
 
-def _rounded(value: object) -> object:
+def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _rounded(item) for key, item in value.items()}
     return round(value, 4) if isinstance(value, float) else value

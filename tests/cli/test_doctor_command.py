@@ -62,7 +62,7 @@ class Robot:
 
 def findings_of(capsys, *argv):
     code = main(["doctor", "--json", *argv])
-    return code, json.loads(capsys.readouterr().out)
+    return code, json.loads(capsys.readouterr().out)["findings"]
 
 
 @pytest.mark.slow
