@@ -13,6 +13,11 @@ from pathlib import Path
 from typing import Any
 
 
+def printable(text: object) -> str:
+    """Return text of anyone's file or message in a form safe for a terminal: no control characters, one line."""
+    return "".join(c if c.isprintable() else " " for c in str(text))
+
+
 class CoViewWarning(UserWarning):
     """Input that is used but may not be meant. The message is one sentence, which the command prints as one line."""
 

@@ -22,7 +22,14 @@ from pathlib import Path
 from typing import NoReturn, TextIO
 
 from coview_stream.cli.interrupt import interruptible
-from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, did_you_mean, naming_missing_libraries
+from coview_stream.errors import (
+    ConfigError,
+    CoViewError,
+    CoViewWarning,
+    did_you_mean,
+    naming_missing_libraries,
+    printable,
+)
 from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
@@ -85,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         code, message = 130, ""
     if message is not None:
-        print(message and f"{PROGRAM}: error: {' '.join(message.split())}", file=sys.stderr)
+        print(message and f"{PROGRAM}: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code
 
 
@@ -180,6 +187,6 @@ def _show_warning(
 ) -> None:
     """Print our own warnings as one line, others as Python does."""
     if issubclass(category, CoViewWarning):
-        print(f"{PROGRAM}: warning: {' '.join(str(message).split())}", file=sys.stderr)
+        print(f"{PROGRAM}: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
     else:
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import acceptance_config, add_shared, check_picture
-from coview_stream.errors import naming_missing_libraries
+from coview_stream.errors import naming_missing_libraries, printable
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -150,8 +150,8 @@ def _text(value: object) -> str:
         rows = []
         for key, inner in value.items():
             parts = inner.items() if isinstance(inner, dict) else [("", inner)]
-            rows += [f"{key}{'.' if name else ''}{name} = {item}" for name, item in parts]
+            rows += [printable(f"{key}{'.' if name else ''}{name} = {item}") for name, item in parts]
         return ("\n" + " " * 15).join(rows)
     if isinstance(value, list):
-        return "  ".join(str(v) for v in value)
-    return "unknown" if value is None else " ".join(str(value).split())[:300]
+        return printable("  ".join(str(v) for v in value))
+    return "unknown" if value is None else printable(" ".join(str(value).split()))[:300]

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
+from coview_stream.errors import printable
+
 _ASKED = b"."
 _ENDING = frozenset((signal.SIGINT, signal.SIGTERM, ord(_ASKED)))  # bytes of the pipe: a signal's number, or ours
 
@@ -113,8 +115,16 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(document)
 
 
+class LineFormatter(logging.Formatter):
+    """One printable line a record, and the lines of its exception; names in it may be anyone's."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # logging's name
+        """Return the line."""
+        return printable(super().formatMessage(record))
+
+
 def start_logging(level: int, as_json: bool) -> None:
     """Log to stderr from ``level`` on."""
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonFormatter() if as_json else logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.setFormatter(JsonFormatter() if as_json else LineFormatter("%(asctime)s %(levelname)s %(message)s"))
     logging.basicConfig(level=level, handlers=[handler])

@@ -127,9 +127,9 @@ class _Watch:
         self._queue.put((time.monotonic(), topic, sample))
 
     def _show(self, arrived: float, topic: Topic, sample: Sample) -> None:
+        from coview_stream.errors import printable
         from coview_stream.messages import decode_pose
         from coview_stream.messages.json_messages import pose_record, read_status
-        from coview_stream.stream.transport.error_guard import printable
 
         robot = topic.robot or sample.key.split("/")[topic.depth]
         try:

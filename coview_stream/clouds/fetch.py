@@ -131,6 +131,20 @@ def download(address: str, target: Path) -> int:
     return size
 
 
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follows a server's word to other web servers, never from https to http."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
+        if not is_web_address(newurl) or (req.type == "https" and not newurl.lower().startswith("https://")):
+            raise ValueError(f"{newurl[:80]!r} after {req.type}")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+_OPENER = urllib.request.build_opener(_Redirects)
+
+
 def open_web_file(request: urllib.request.Request) -> Any:
     """Return the answer to a request, tried again while the server is busy; CloudError if it cannot be fetched."""
     address = request.full_url
@@ -138,7 +152,7 @@ def open_web_file(request: urllib.request.Request) -> Any:
         raise CloudError(f"{address}: not an http:// or https:// address")
     for left in reversed(range(_TRIES)):
         try:
-            return urllib.request.urlopen(request, timeout=_TIMEOUT)
+            return _OPENER.open(request, timeout=_TIMEOUT)
         except urllib.error.HTTPError as error:
             if error.code in _ANSWERS:
                 return error

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.errors import InputError, require_library
+from coview_stream.errors import InputError, printable, require_library
 from coview_stream.geometry.arrays import Floats
 
 _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
@@ -105,7 +105,7 @@ def short_name(text: str | None) -> str:
         code = system.to_epsg()
         return f"EPSG:{code} {system.name}" if code else str(system.name)
     named = re.match(r'\s*\w+\["([^"]+)"', text)
-    return named.group(1) if named else " ".join(text.split())[:60]
+    return printable(named.group(1) if named else " ".join(text.split()))[:60]
 
 
 def _like_degrees(low: Floats, high: Floats) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from coview_stream.stream.transport.error_guard import printable
+from coview_stream.errors import printable
 
 Verdict = Literal["ok", "warn", "FAIL"]
 

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from coview_stream.basemap import file_format
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 
@@ -31,6 +32,17 @@ def test_info_prints_json(world_file, capsys):
     assert facts["from"][0] == pytest.approx(-34.0, abs=0.3)
     assert facts["to"][0] == pytest.approx(34.0, abs=0.5)
     assert facts["sources"].keys() == {"site.ply"}
+
+
+def test_names_in_a_map_reach_the_terminal_without_control_characters(world_file, tmp_path, capsys, refused):
+    arrays, parameters, _ = file_format.load(world_file)
+    escape = "\x1b]0;title\x07\x1b[2J"
+    named = parameters | {"crs": escape + "EPSG:1", "sources": {f"{escape}a.las": "ab"}, "ground_filter": escape}
+    file_format.save(tmp_path / "a.coview", arrays, named)
+    assert main(["info", str(tmp_path / "a.coview")]) == 0
+    told = capsys.readouterr()
+    assert all(line.isprintable() for line in (told.out + told.err).splitlines())
+    assert refused("info", tmp_path / f"{escape}.coview").strip().isprintable()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"nonsense" * 20, "flipped", "half"])

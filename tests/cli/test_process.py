@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.cli.process import JsonFormatter, Stop, stop_on_signals
+from coview_stream.cli.process import JsonFormatter, LineFormatter, Stop, stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -136,3 +136,11 @@ def test_record_is_one_line_of_json_with_its_exception(error):
     assert fields["time"].endswith("+00:00")
     assert ("exception" in fields) == (error is not None)
     assert error is None or "ValueError: wrong" in fields["exception"]
+
+
+def test_log_line_is_printable_and_its_exception_follows():
+    error = ValueError("wrong")
+    arguments = (logging.WARNING, __file__, 1, "%s", ("\x1b[2J\nfake line",), (ValueError, error, None))
+    first, *rest = LineFormatter("%(message)s").format(logging.LogRecord("a", *arguments)).splitlines()
+    assert first == " [2J fake line"
+    assert rest == ["ValueError: wrong"]

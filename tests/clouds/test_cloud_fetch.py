@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import urllib.request
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -15,7 +16,7 @@ import pytest
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud
-from coview_stream.clouds.fetch import RangeFile, Window, download, fetch_cloud, is_copc
+from coview_stream.clouds.fetch import RangeFile, Window, _Redirects, download, fetch_cloud, is_copc
 from coview_stream.errors import CloudError, ConfigError
 from tests.clouds.copc_file import write_copc
 
@@ -152,6 +153,19 @@ def test_servers_and_files_that_cannot_be_used_are_named(
     with pytest.raises(CloudError, match="broken"):
         fetch_cloud(tmp_path / "broken.copc.laz", tmp_path, WINDOW)
     assert not list(tmp_path.glob("*.las"))
+
+
+@pytest.mark.parametrize(
+    ("at", "to", "followed"),
+    [
+        ("https://a/x", "https://b/x", True), ("http://a/x", "https://a/x", True), ("http://a/x", "http://b/x", True),
+        ("https://a/x", "http://a/x", False), ("http://a/x", "ftp://a/x", False), ("https://a/x", "file:///x", False),
+    ],
+)  # fmt: skip
+def test_server_leads_to_web_servers_only_and_never_out_of_https(at: str, to: str, followed: bool) -> None:
+    request = urllib.request.Request(at)
+    with contextlib.nullcontext() if followed else pytest.raises(ValueError, match="after http"):
+        assert _Redirects().redirect_request(request, None, 302, "Found", {}, to)
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "5,5,1,1", "0,0,nan,1", "0,0,inf,1", ""])

@@ -31,7 +31,7 @@ from coview_stream.basemap.site.manifest import (
     tiles_around,
     write_manifest,
 )
-from coview_stream.basemap.site.store import TileStore, cache_folder, evict, layer_path
+from coview_stream.basemap.site.store import TileStore, cache_bound, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
 from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
 
@@ -250,6 +250,11 @@ class Mirror:
             local = read_manifest(self.directory)
             before = self._read(local, str(self.directory))
         wanted = self._wanted(manifest)
+        if (size := sum(layer.bytes for layer, _ in wanted.values())) > cache_bound():  # whoever wrote the manifest
+            raise MapError(
+                f"{self.source.name}: its tiles are {size / 1e9:.1f} GB, more than the cache may hold; open a part of "
+                "it (--around X,Y,RADIUS), or set COVIEW_CACHE_GB"
+            )
         exists = self._store.is_whole if check else self._store.holds
         missing = [(layer, tile) for layer, tile in wanted.values() if not exists(layer.sha256, layer.bytes)]
         done, total = 0, sum(layer.bytes for layer, _ in missing)

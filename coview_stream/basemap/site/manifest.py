@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.signature import SigningKey, VerifyKey, sha256_of
-from coview_stream.basemap.site.layers import most_points
+from coview_stream.basemap.site.layers import most_bytes, most_points
 from coview_stream.basemap.site.store import SHA256, read_record, write_record
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
@@ -40,6 +40,7 @@ MAX_LAYER = 1 << 28  # bytes
 _MAX_HEAD = 1 << 21  # bytes of all but the tiles: 18,000 sources
 _MAX_TAIL = 64  # bytes behind the tiles: the version
 _MAX_ENTRY = 2048  # bytes of a tile, which has 450
+_MAX_OVERHEAD = 1 << 17  # bytes of a layer besides its arrays
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
 _MAX_DEPTH = 32  # of the parameters
@@ -207,6 +208,11 @@ class Manifest:
             most = most_points(tile, grid.config.voxel), most_points(tile, grid.config.block)
             if any(entry.points > most[0] or entry.stations > most[1] for entry in tiles):
                 raise ValueError("a tile counts more than {} points or {} stations".format(*most))
+            for entry in tiles:
+                for kind, layer in entry.layers.items():
+                    limit = most_bytes(kind, entry.points, entry.stations, tile, grid.config.voxel)
+                    if layer.bytes > limit + limit // 8 + _MAX_OVERHEAD:
+                        raise ValueError(f"a layer has {layer.bytes} bytes, and unpacks to {limit} at most")
             signed = signer.decode(), signature.decode()
             manifest = cls(origin, tile, crs, parameters, tuple(tiles), *signed, int(data["version"]))
             _ = manifest.sha256  # can be written again

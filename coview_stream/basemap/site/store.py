@@ -146,11 +146,8 @@ def read_record(path: Path) -> Any:
         return json.loads(file.read(_MAX_RECORD))
 
 
-def evict(folder: Path, *keep: Path) -> None:
-    """Delete the least recently used working files and mirrors until the cache is within its bound.
-
-    Files that a process holds (:func:`hold`), and ``keep``, stay.
-    """
+def cache_bound() -> float:
+    """Return the bytes that the cache may hold; ConfigError if ``$COVIEW_CACHE_GB`` is no size."""
     text = os.environ.get("COVIEW_CACHE_GB", "20")
     try:
         bound = float(text)
@@ -158,7 +155,15 @@ def evict(folder: Path, *keep: Path) -> None:
         bound = -1.0
     if not bound > 0:
         raise ConfigError(f"COVIEW_CACHE_GB={text}: is no size in GB")
-    files = []
+    return bound * 1e9
+
+
+def evict(folder: Path, *keep: Path) -> None:
+    """Delete the least recently used working files and mirrors until the cache is within its bound.
+
+    Files that a process holds (:func:`hold`), and ``keep``, stay.
+    """
+    bound, files = cache_bound(), []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):  # another process may delete it meanwhile
             parts = [path, *path.rglob("*")]  # of a mirror its files
@@ -166,7 +171,7 @@ def evict(folder: Path, *keep: Path) -> None:
             files.append((max(used, default=0.0), sum(part.stat().st_size for part in parts if part.is_file()), path))
     total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files):
-        if total <= bound * 1e9:
+        if total <= bound:
             break
         if path in keep or (path.is_file() and _is_held(path)):
             continue

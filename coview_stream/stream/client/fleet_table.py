@@ -8,10 +8,10 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from coview_stream.errors import printable
 from coview_stream.geometry.protection import one_in
 from coview_stream.geometry.transforms import yaw_of
 from coview_stream.messages.types import PoseMessage
-from coview_stream.stream.transport.error_guard import printable
 
 WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown

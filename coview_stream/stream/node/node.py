@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.errors import CoViewError
+from coview_stream.errors import CoViewError, printable
 from coview_stream.localization.state import State
 from coview_stream.stream.node.counters import Rate
 from coview_stream.stream.node.engine_feed import EngineFeed
@@ -24,7 +24,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
-from coview_stream.stream.transport.error_guard import RateLimitedErrors, printable
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Transport
 

@@ -9,10 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-
-def printable(text: object) -> str:
-    """Return text from the network in a form safe for a terminal: no control characters, one line."""
-    return "".join(c if c.isprintable() else " " for c in str(text))
+from coview_stream.errors import printable
 
 
 def is_panic(error: BaseException) -> bool:

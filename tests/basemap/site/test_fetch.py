@@ -242,6 +242,7 @@ LIES = {
     "long label": TO + b"http://" + b"a" * 70 + b"/\r\n\r\n",
     "bracket": TO + b"http://[1/\r\n\r\n",
     "port": TO + b"http://127.0.0.1:x/\r\n\r\n",
+    "ftp": TO + b"ftp://127.0.0.1/x\r\n\r\n",
     "file": TO + b"file:///etc/passwd\r\n\r\n",
     "not changed": b"HTTP/1.1 304 Not Modified\r\n\r\n",
     "page of a proxy": OK + b"\r\n<html>maintenance</html>",
@@ -281,6 +282,14 @@ def test_body_that_drips_has_one_deadline():
         with pytest.raises(TransportError, match="is too slow"):
             WebSource(address).manifest()
     assert time.monotonic() - begin < 15.0
+
+
+def test_site_larger_than_the_cache_fetches_nothing(site, monkeypatch):
+    source = Directory(site)
+    monkeypatch.setenv("COVIEW_CACHE_GB", "1e-5")
+    with pytest.raises(MapError, match="more than the cache may hold; open a part of it"):
+        Mirror(source).open()
+    assert source.asked == []
 
 
 def test_any_failure_of_a_source_is_one_of_transport(site):

@@ -49,7 +49,8 @@ def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
         (("tiles", 0, "points"), 30_000_000), (("tiles", 0, "stations"), 30_000_000),
         (("parameters", "config", "descriptor", "rings"), 320),
         (("parameters", "config", "descriptor", "radius"), 900.0),
-        (("tiles", 0, "stations"), 410_000), (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
+        (("tiles", 0, "stations"), 410_000), (("tiles", 0, "layers", "cloud", "bytes"), 1 << 25),
+        (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
     ],
 )  # fmt: skip
 def test_manifest_with_something_else_is_refused(path, value):

@@ -9,13 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coview_stream.errors import MessageError
+from coview_stream.errors import MessageError, printable
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record, read_status
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.fleet_table import MAX_ROBOTS, SILENT, STALE, FleetTable
-from coview_stream.stream.transport.error_guard import printable
 
 T = pose_from(rot_z(math.radians(30)), [412_000.123, 5_318_000.456, 7.891])
 POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12)
