@@ -230,21 +230,18 @@ class GraphConfig:
     """Smoothing of poses (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
 
     Attributes:
-        window: newest keyframes with which the graph restarts; older ones live on in the belief that they left behind.
-        restart: keyframes at which it restarts.
+        window: newest keyframes that are smoothed; older ones live on in the belief that they left behind.
         huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
             once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
             kernel that lets go altogether would, with an optimistic covariance, lock the map out for good.
     """
 
     window: int = 40
-    restart: int = 120
     huber: float = 3.5
 
     def __post_init__(self) -> None:
         check_types(self)
-        counts(self, "window", "restart", minimum=2)
-        require(self.restart > self.window, self, "restart", f"greater than window ({self.window})")
+        counts(self, "window", minimum=2)
         positive(self, "huber")
 
 

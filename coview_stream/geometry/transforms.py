@@ -272,12 +272,54 @@ def boxplus(T_map_body: Pose, step: Floats) -> Pose:
     return moved
 
 
-def adjoint(T: Pose) -> Floats:
-    """Return the matrix (6, 6) with T exp(xi) = exp(Ad xi) T."""
-    Ad = np.zeros((6, 6))
-    Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
-    Ad[3:, :3] = skew(T[:3, 3]) @ T[:3, :3]
+def relative(T_map_a: Poses, T_map_b: Poses) -> Poses:
+    """Return poses (..., 4, 4) of b in the frames of a."""
+    R_t = np.swapaxes(T_map_a[..., :3, :3], -1, -2)
+    T = np.zeros(np.broadcast_shapes(T_map_a.shape, T_map_b.shape))
+    T[..., :3, :3] = R_t @ T_map_b[..., :3, :3]
+    T[..., :3, 3:] = R_t @ (T_map_b[..., :3, 3:] - T_map_a[..., :3, 3:])
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def moved(T: Poses, xi: Floats) -> Poses:
+    """Return poses (..., 4, 4) moved along their bodies' axes by xi (..., 6): T exp(xi), to first order."""
+    out = T.copy()
+    out[..., :3, :3] = T[..., :3, :3] @ exp_so3(xi[..., :3])
+    out[..., :3, 3:] += T[..., :3, :3] @ xi[..., 3:, None]
+    return out
+
+
+def adjoint(T: Poses) -> Floats:
+    """Return the matrices (..., 6, 6) with T exp(xi) = exp(Ad xi) T."""
+    Ad = np.zeros((*T.shape[:-2], 6, 6))
+    Ad[..., :3, :3] = Ad[..., 3:, 3:] = T[..., :3, :3]
+    Ad[..., 3:, :3] = skew(T[..., :3, 3]) @ T[..., :3, :3]
     return Ad
+
+
+def log_se3(T: Poses) -> tuple[Floats, Floats]:
+    """Return the logarithms xi (..., 6) of poses (..., 4, 4), and their derivatives D (..., 6, 6).
+
+    log(T exp(d)) = xi + D d to first order: D is the inverse of the right Jacobian, I + ad/2 + a ad^2 + b ad^4 with
+    ad [u, v] = [xi, (u, v)] (Bullo and Murray, "Proportional derivative control on the Euclidean group", ECC 1995).
+    """
+    turn = log_so3(T[..., :3, :3])
+    angle = np.sqrt((turn * turn).sum(axis=-1))[..., None, None]
+    small = angle < 0.03  # radians: below, the next terms of the series are smaller than its first by 1e-5
+    half = 0.5 * np.where(small, 1.0, angle)
+    slope, bend = half / np.tan(half), (half / np.sin(half)) ** 2
+    mean = 0.5 * (slope - bend)
+    a1 = np.where(small, 1 / 12 + angle**2 / 720, (1.0 - slope) / (4.0 * half**2))
+    a2 = np.where(small, 1 / 12, (2.0 * (1.0 - slope) + mean) / (4.0 * half**2))
+    b = np.where(small, -1 / 720, (1.0 - slope + mean) / (16.0 * half**4))
+    K = skew(turn)
+    shift = (np.eye(3) - 0.5 * K + a1 * (K @ K)) @ T[..., :3, 3:]
+    ad = np.zeros((*T.shape[:-2], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = K
+    ad[..., 3:, :3] = skew(shift[..., 0])
+    squared = ad @ ad
+    return np.concatenate([turn, shift[..., 0]], axis=-1), np.eye(6) + 0.5 * ad + a2 * squared + b * squared @ squared
 
 
 @dataclass(frozen=True)

@@ -1,40 +1,51 @@
-"""Pose graphs on gtsam: while tracking a chain of keyframes, on iSAM2; offline any graph, solved at once.
+"""Pose graph while tracking: a chain of keyframes, and the covariance of the newest.
 
-The unknowns of the chain are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the
-difference of two poses in the tangent of the body, the estimate is the most probable one given
+The unknowns are the poses X_k = ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of
+two poses in the tangent of the body, the estimate is the most probable one given
 
 * a prior on the first: e(T_prior, X_0) ~ N(0, P)
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
 * registrations: e(Y_k, X_k) ~ N(0, R_k), under Huber's kernel on the whitened residual
 
-Only the newest pose is used; smoothing the earlier ones reweighs their registrations.
+It is found by Gauss-Newton on X_k exp(xi_k). The linear problem of each step is a chain, whose normal equations are
+block tridiagonal: a Kalman filter and the recursion backwards of Rauch, Tung and Striebel solve it exactly (Bell, "The
+iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optimization 1994; Barfoot, State Estimation for Robotics,
+chapter 3). With the measured step e, its derivative D (:func:`~coview_stream.geometry.transforms.log_se3`), and w the
+kernel's weight, min(1, huber / |R^-1/2 e|), of iteratively reweighted least squares:
 
-The memory is bounded: at ``restart`` keyframes the graph restarts with the newest ``window`` of them, and the first
-one's *filtering* belief, from the measurements up to it, replaces the past. For a chain this is exact up to
-linearisation, as past and future meet in one pose; its smoothed belief would count the later measurements twice.
-(gtsam's fixed-lag smoother leaks and loses keys: gtsam issues 1452, 1638 and 1935.)
+    odometry       m' = F m - D^-1 e,  P' = F P F^T + D^-1 Q D^-T          F = Ad(X_k^-1 X_{k-1})
+    registration   m = m' - G (D^-1 e + m'),  P = G C                      C = D^-1 R D^-T / w,  G = P' (P' + C)^-1
+    backwards      xi_{k-1} = m_{k-1} + P_{k-1} F^T P'^-1 (xi_k - m')
+
+A new measurement moves the newest poses alone: those that move noticeably are linearised again, and only from the
+first of them on the filter runs again, as in iSAM2 (Kaess et al., IJRR 2012). Only the newest pose is used; smoothing
+the earlier ones reweighs their registrations.
+
+The memory is bounded: of the keyframes older than the window the *filtering* belief of its first remains, from the
+measurements up to it. For a chain this is exact up to linearisation, as past and future meet in one pose; its smoothed
+belief would count the later measurements twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from coview_stream.config import GraphConfig
-from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import (
     Pose,
-    Poses,
     adjoint,
     along_body,
     along_map,
     boxminus,
     inverse,
+    log_se3,
+    moved,
     orthonormal,
+    relative,
 )
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
@@ -61,20 +72,29 @@ class Estimate(NamedTuple):
 
 
 class _Gaussian(NamedTuple):
-    """A pose and its covariance (6, 6), unlike an :class:`Estimate`'s along the axes of its own body, as gtsam's."""
+    """A pose and its covariance (6, 6), unlike an :class:`Estimate`'s along the axes of its own body."""
 
     T: Pose
     covariance: Floats
 
 
+class _Step(NamedTuple):
+    """Belief about a step xi from where a keyframe is linearised."""
+
+    mean: Floats  # (6,)
+    covariance: Floats  # (6, 6)
+
+
 @dataclass
 class _Keyframe:
-    """One pose of the chain."""
+    """One pose of the chain; what the filter makes of it is as of its last run."""
 
-    T: Pose  # (4, 4) T_map_body, initial or linearised
-    between: _Gaussian | None = None  # this body in the frame of the previous one; None for the first
+    T: Pose  # (4, 4) T_map_body, where it is linearised
+    between: _Gaussian  # this body in the frame of the previous one, or of the map for the first
     corrections: list[_Gaussian] = field(default_factory=list)  # measured poses in the map
-    filtered: _Gaussian | None = None  # belief when it was the newest; None for the newest
+    F: Floats = field(init=False)  # (6, 6)
+    predicted: _Step = field(init=False)
+    filtered: _Step = field(init=False)
 
 
 class PoseGraph:
@@ -87,31 +107,20 @@ class PoseGraph:
     """
 
     def __init__(self, config: GraphConfig | None = None) -> None:
-        """Make an empty graph; gtsam is imported here and no earlier.
-
-        Raises:
-            DependencyError: gtsam is not installed, or cannot be loaded.
-        """
         self.config = config or GraphConfig()
-        # gtsam has no types that mypy reads everywhere, hence Any
-        self._gtsam: Any = require_library("gtsam", "gtsam>=4.3", "tracking")
-        self._kernel: Any = self._gtsam.noiseModel.mEstimator.Huber.Create(self.config.huber)
         self._keyframes: list[_Keyframe] = []
         self._newest_belief: _Gaussian | None = None
-        self._isam: Any = None
-        self._factors: Any = None  # not handed over to iSAM2 yet, nor are the values
-        self._values: Any = None
+        self._stale = 0  # first keyframe that the filter has not seen as it is
 
     def __len__(self) -> int:
-        """Keyframes held: at most ``restart``, however long the robot drives; zero before ``start``."""
+        """Keyframes held: at most ``window``, however long the robot drives; zero before ``start``."""
         return len(self._keyframes)
 
     def start(self, T_map_body: Pose, covariance: Floats) -> None:
         """Begin a new chain with a prior on the first pose; the old chain is dropped."""
         T = check_rigid(T_map_body, "T_map_body")
         prior = _Gaussian(T, along_body(check_covariance(covariance, "covariance"), T))
-        self._keyframes, self._newest_belief = [_Keyframe(T)], None
-        self._build(prior)
+        self._keyframes, self._newest_belief, self._stale = [_Keyframe(T, prior)], prior, 0
 
     def move(self, T_between: Pose, covariance: Floats) -> None:
         """Add a keyframe by odometry from the newest.
@@ -124,22 +133,17 @@ class PoseGraph:
         spread = check_covariance(covariance, "covariance")
         before = self._belief()
         T = orthonormal(before.T @ step)
-        moved = _Gaussian(step, along_body(spread, T))
-        self._keyframes[-1].filtered = before
-        self._keyframes.append(_Keyframe(T, moved))
+        between = _Gaussian(step, along_body(spread, T))
+        self._keyframes.append(_Keyframe(T, between))
         # odometry alone does not change earlier poses, so there is nothing to solve
-        Ad = adjoint(inverse(step))
-        self._newest_belief = _Gaussian(T, Ad @ before.covariance @ Ad.T + moved.covariance)
-        self._add_motion(len(self) - 1)
-        if len(self) > self.config.restart:  # with the newest keyframes, from the filtering belief of the first
-            self._update()
-            values = self._isam.calculateEstimate()
-            for key, item in enumerate(self._keyframes):
-                item.T = np.asarray(values.atPose3(key).matrix())
-            del self._keyframes[: -self.config.window]
-            first = self._keyframes[0].filtered
-            assert first is not None  # a window holds two or more
-            self._build(first)
+        F = adjoint(inverse(step))
+        self._newest_belief = _Gaussian(T, F @ before.covariance @ F.T + between.covariance)
+        if len(self) > self.config.window:
+            self._filter()
+            del self._keyframes[0]
+            first = self._keyframes[0]
+            first.between = _Gaussian(moved(first.T, first.filtered.mean), first.filtered.covariance)
+            first.corrections, self._stale = [], len(self)
 
     def correct(self, T_map_body: Pose, covariance: Floats) -> None:
         """Add a registration of the newest keyframe, under Huber's kernel.
@@ -149,10 +153,8 @@ class PoseGraph:
         """
         T = check_rigid(T_map_body, "T_map_body")
         spread = check_covariance(covariance, "covariance")
-        measured = _Gaussian(T, along_body(spread, T))
-        self._newest.corrections.append(measured)
-        self._newest_belief = None
-        self._add_correction(len(self) - 1, measured)
+        self._newest.corrections.append(_Gaussian(T, along_body(spread, T)))
+        self._newest_belief, self._stale = None, min(self._stale, len(self) - 1)
 
     @property
     def estimate(self) -> Estimate:
@@ -168,96 +170,58 @@ class PoseGraph:
 
     def _belief(self) -> _Gaussian:
         """Return the newest keyframe's pose and covariance; solves at the first call."""
+        newest = self._newest
         if self._newest_belief is None:
-            _ = self._newest
-            self._update()
-            key = len(self) - 1
-            T = np.asarray(self._isam.calculateEstimatePose3(key).matrix())
-            self._newest_belief = _Gaussian(T, np.asarray(self._isam.marginalCovariance(key)))
+            self._filter()
+            for _ in range(_MAX_UPDATES):
+                if not self._relinearize():
+                    break
+                self._filter()
+            self._newest_belief = _Gaussian(moved(newest.T, newest.filtered.mean), newest.filtered.covariance)
         return self._newest_belief
 
-    def _build(self, prior: _Gaussian) -> None:
-        """Build iSAM2 from the keyframes; ``prior`` includes the corrections of the first one."""
-        gtsam = self._gtsam
-        parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(_RELINEARIZE)
-        parameters.relinearizeSkip = 1
-        self._isam = gtsam.ISAM2(parameters)
-        self._factors, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(prior.T), self._noise(prior)))
-        self._values.insert(0, gtsam.Pose3(self._keyframes[0].T))
-        for key, item in enumerate(self._keyframes[1:], start=1):
-            self._add_motion(key)
-            for measured in item.corrections:
-                self._add_correction(key, measured)
-        self._update()
-
-    def _update(self) -> None:
-        """Give iSAM2 the new factors and values, and relinearise the poses that they move."""
-        self._isam.update(self._factors, self._values)
-        self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
-        for _ in range(_MAX_UPDATES):
-            if not self._isam.update().getVariablesRelinearized():
+    def _relinearize(self) -> bool:
+        """Move the newest keyframes to their smoothed poses, back to the first that hardly moves; tell if any moved."""
+        xi, steps, item = self._newest.filtered.mean, list[Floats](), self._newest
+        while np.abs(xi).max() > _RELINEARIZE:
+            steps.append(xi)
+            if len(steps) == len(self):
                 break
+            smoothed = item.F.T @ np.linalg.solve(item.predicted.covariance, xi - item.predicted.mean)
+            item = self._keyframes[-1 - len(steps)]
+            xi = item.filtered.mean + item.filtered.covariance @ smoothed
+        if steps:
+            self._stale = len(self) - len(steps)
+            items = self._keyframes[self._stale :]
+            for item, T in zip(items, moved(np.array([item.T for item in items]), np.array(steps[::-1])), strict=True):
+                item.T = T
+        return bool(steps)
 
-    def _noise(self, measured: _Gaussian) -> Any:
-        return self._gtsam.noiseModel.Gaussian.Covariance(measured.covariance)
-
-    def _add_motion(self, key: int) -> None:
-        item = self._keyframes[key]
-        assert item.between is not None  # all but the first have one
-        pose = self._gtsam.Pose3(item.between.T)
-        self._values.insert(key, self._gtsam.Pose3(item.T))
-        self._factors.add(self._gtsam.BetweenFactorPose3(key - 1, key, pose, self._noise(item.between)))
-
-    def _add_correction(self, key: int, measured: _Gaussian) -> None:
-        robust = self._gtsam.noiseModel.Robust.Create(self._kernel, self._noise(measured))
-        self._factors.add(self._gtsam.PriorFactorPose3(key, self._gtsam.Pose3(measured.T), robust))
-
-
-@dataclass(frozen=True, eq=False)
-class Constraint:
-    """Measured pose of one node of a graph, on the map or relative to another node."""
-
-    source: int  # index of the measured node
-    target: int  # index of the node that it is measured from; -1: the map
-    T: Pose  # (4, 4) pose of the source's body, relative to the target's body or to the map's origin
-    covariance: Floats  # (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body
-
-
-class BatchGraph:
-    """Graph of any constraints, solved at once: the most probable poses, and the covariance of each."""
-
-    def __init__(self, poses: Poses, feature: str) -> None:
-        """Begin at poses (N, 4, 4) of the nodes.
-
-        Raises:
-            DependencyError: gtsam is missing, which ``feature`` needs.
-        """
-        self._gtsam: Any = require_library("gtsam", "gtsam>=4.3", feature)
-        self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
-        for k, T in enumerate(poses):
-            self._values.insert(k, self._gtsam.Pose3(T))
-
-    def add(self, constraints: Sequence[Constraint], kernel: tuple[str, float] | None = None) -> None:
-        """Add constraints, under a kernel of gtsam's (``"Huber"``, ``"Cauchy"``) with its width in sigmas."""
-        gtsam = self._gtsam
-        robust = None if kernel is None else getattr(gtsam.noiseModel.mEstimator, kernel[0]).Create(kernel[1])
-        for c in constraints:
-            noise = gtsam.noiseModel.Gaussian.Covariance(c.covariance)
-            noise = noise if robust is None else gtsam.noiseModel.Robust.Create(robust, noise)
-            T = gtsam.Pose3(c.T)
-            if c.target < 0:
-                self._factors.add(gtsam.PriorFactorPose3(c.source, T, noise))
-            else:
-                self._factors.add(gtsam.BetweenFactorPose3(c.target, c.source, T, noise))
-
-    def solve(self) -> Poses:
-        """Return the most probable poses (N, 4, 4)."""
-        self._values = self._gtsam.LevenbergMarquardtOptimizer(self._factors, self._values).optimize()
-        return np.array([self._values.atPose3(k).matrix() for k in range(self._values.size())]).reshape(-1, 4, 4)
-
-    def covariances(self) -> Floats:
-        """Return the covariance (N, 6, 6) of each pose over (rx, ry, rz, x, y, z), along the axes of its body."""
-        marginals = self._gtsam.Marginals(self._factors, self._values)
-        return np.array([marginals.marginalCovariance(k) for k in range(self._values.size())]).reshape(-1, 6, 6)
+    def _filter(self) -> None:
+        """Linearise the stale keyframes, and filter from the first of them on."""
+        items = self._keyframes[self._stale :]
+        if not items:
+            return
+        before = self._keyframes[self._stale - 1] if self._stale else None
+        T = np.array([np.eye(4) if before is None else before.T, *(item.T for item in items)])
+        steps, owners = relative(T[:-1], T[1:]), [k for k, item in enumerate(items) for _ in item.corrections]
+        measured = [*(item.between for item in items), *(each for item in items for each in item.corrections)]
+        gaps, D = log_se3(relative(np.array([each.T for each in measured]), np.concatenate([steps, T[1:][owners]])))
+        spread = np.array([each.covariance for each in measured])
+        sigmas = np.sqrt((gaps * np.linalg.solve(spread, gaps[..., None])[..., 0]).sum(axis=-1))
+        sigmas[: len(items)] = 0.0  # no kernel on odometry
+        J = np.linalg.inv(D)
+        means = -(J @ gaps[..., None])[..., 0]
+        covariances = J @ spread @ np.swapaxes(J, -1, -2) * np.maximum(1.0, sigmas / self.config.huber)[:, None, None]
+        F, correction = adjoint(relative(steps, np.eye(4))), len(items)
+        mean, P = (np.zeros(6), np.zeros((6, 6))) if before is None else before.filtered
+        for k, item in enumerate(items):
+            mean, P = F[k] @ mean + means[k], F[k] @ P @ F[k].T + covariances[k]
+            item.F, item.predicted = F[k], _Step(mean, P)
+            for _ in item.corrections:
+                C = covariances[correction]
+                G = np.linalg.solve(P + C, P).T
+                mean, P = mean + G @ (means[correction] - mean), G @ C
+                P, correction = 0.5 * (P + P.T), correction + 1
+            item.filtered = _Step(mean, P)
+        self._stale = len(self)
