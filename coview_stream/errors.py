@@ -81,7 +81,6 @@ EXTRA_OF = {
     "tqdm": "node",
     "taichi": "taichi",
     "quadrants": "node",
-    "gtsam": "node",
     "laspy": "node",
     "lazrs": "node",
     "rosbags": "messages",

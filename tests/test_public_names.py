@@ -35,7 +35,7 @@ def test_import_loads_no_heavy_library(statement):
 @pytest.mark.parametrize("part", ["engines", "serve"])
 def test_processes_of_a_node_load_no_library_that_they_do_not_use(part):
     """SciPy takes up to 37 MB and a third of a second, in each of three processes."""
-    unused = ("scipy", "gtsam", "pandas", "rosbags", "pyproj", "laspy", "open3d", "matplotlib")
+    unused = ("scipy", "pandas", "rosbags", "pyproj", "laspy", "open3d", "matplotlib")
     script = f"from coview_stream.stream.node import {part}\nfrom coview_stream.messages import CLOUD_CODECS, prepare\n"
     script += f"import sys; print('loaded:', *sorted({{*{unused}}} & set(sys.modules)))"
     assert run_python(script) == ["loaded:"]

@@ -51,8 +51,6 @@ def run(args: argparse.Namespace) -> int:
     open_map_argument(args)
     check_name(args.output, [args.map, *(path for pair in pairs for path in (pair.run, pair.trajectory, pair.result))])
     check_picture("--picture", args.picture)
-    if args.joint:
-        require_library("gtsam", "gtsam>=4.3", "--joint")
     if args.picture is not None:
         require_library("matplotlib", "matplotlib>=3.8", "--picture")
     given = mount_of(args)

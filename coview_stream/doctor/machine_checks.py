@@ -40,7 +40,7 @@ _CODECS = {
 """Modules that decode a robot's messages, and the package of each."""
 
 _PARTS = {
-    "node": (("scipy", "gtsam"), "serve, locate, replay"),
+    "node": (("scipy", "lazrs"), "serve, locate, replay"),
     "build": (("pyproj", "laspy"), "build, simulate, demo"),
     "plot": (("matplotlib",), "pictures"),
 }

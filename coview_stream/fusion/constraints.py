@@ -21,7 +21,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, along_body, boxminus, inverse, pose_from, yaw_of
 from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.register import register, registration_covariance, remove_prior
-from coview_stream.localization.tracking.pose_graph import Constraint
+from coview_stream.localization.tracking.batch_graph import Constraint
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 STEP = 4.0  # metres driven from keyframe to keyframe

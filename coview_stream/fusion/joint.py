@@ -1,6 +1,6 @@
 """Joint adjustment: the poses of several runs, from their registrations to the map, to each other, and odometry.
 
-The unknowns are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), gtsam finds the most probable ones given
+The unknowns are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), they become the most probable ones given
 
 * registrations to the map: e(Y_k, X_k) ~ N(0, R_k)
 * odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q measured from the registrations, as while tracking
@@ -18,15 +18,14 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.errors import require_library
 from coview_stream.fusion.constraints import AGREE, Registrar, Submap, off_by, overlapping, path_of, submaps_of
 from coview_stream.fusion.fuse import Progress
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, along_body, along_map, boxminus, interpolate, inverse
 from coview_stream.localization.registration.clouds import LocalMaps
+from coview_stream.localization.tracking.batch_graph import BatchGraph, Constraint
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
-from coview_stream.localization.tracking.pose_graph import BatchGraph, Constraint
 
 # chosen by hand
 _KERNEL = 3.0  # sigmas, of Cauchy's weights
@@ -109,10 +108,8 @@ def adjust(
         relative: use registrations between submaps; False for a comparison with the map and odometry alone.
 
     Raises:
-        DependencyError: gtsam is missing.
         CloudError: a frame cannot be read.
     """
-    require_library("gtsam", "gtsam>=4.3", "fuse --joint")
     submaps: list[Submap] = []
     for number, run in enumerate(runs):
         submaps += submaps_of(run, number, base_map.origin)
@@ -184,7 +181,7 @@ def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[C
 
 def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: Sequence[Constraint]) -> Floats:
     """Return the most probable poses (S, 4, 4)."""
-    graph = BatchGraph(np.array([submap.T_map_body for submap in submaps]), "fuse --joint")
+    graph = BatchGraph(np.array([submap.T_map_body for submap in submaps]))
     anywhere = np.diag(_ANYWHERE**2)
     graph.add([Constraint(k, -1, submap.T_map_body, anywhere) for k, submap in enumerate(submaps)])
     graph.add([*on_map, *relative], ("Cauchy", _KERNEL))

@@ -6,7 +6,7 @@ them too, but importing it takes half a second, of the two in which a node shoul
 
 A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body turns about its own
 origin, then it is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the
-right, ``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes; gtsam's Pose3 has the same. To
+right, ``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes. To
 first order, which is all that a covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a
 covariance goes from one to the other by the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its
 lever arm [t]x R, would belong to turning about the map's origin.)

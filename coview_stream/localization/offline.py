@@ -19,7 +19,7 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
-from coview_stream.errors import CloudError, InputError, RunError, require_library
+from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import LEVELS, ProtectionLevel, one_in
 from coview_stream.geometry.transforms import Poses, pose_from, pose_from_tum
@@ -229,12 +229,9 @@ def locate(
         smooth: add poses by the whole run, also of frames that had none live (``smoothed``).
 
     Raises:
-        DependencyError: gtsam is missing.
         InputError: no frame could be used (the message ends with the first frame's), or the map has no ground at the
             guess.
     """
-    if smooth:
-        require_library("gtsam", "gtsam>=4.3", "smoothing")  # before the run
     if run.mount is not None and not run.mount.drawn:
         config = replace(config or LocalizerConfig(), mount_drawn=False)
     localizer = RecordingLocalizer(base_map, config) if smooth else Localizer(base_map, config)

@@ -39,8 +39,8 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.odometry_history import OdometryHistory
 from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.registration.register import swap_rotation_translation
+from coview_stream.localization.tracking.batch_graph import BatchGraph, Constraint
 from coview_stream.localization.tracking.motion import Drift
-from coview_stream.localization.tracking.pose_graph import BatchGraph, Constraint
 from coview_stream.recordings.run import Run
 
 
@@ -230,7 +230,7 @@ class _Chain:
         """Solve the graph; return the poses in the frame of the map's sources, whose origin is ``origin`` (3,)."""
         nodes, start = self._nodes()
         number = {k: at for at, k in enumerate(nodes)}
-        graph = BatchGraph(start, "locate --smooth")
+        graph = BatchGraph(start)
         graph.add([
             Constraint(at, at - 1, inverse(self.odometry[k - 1]) @ self.odometry[k], along_body(self.spread[k], T))
             for at, (k, T) in enumerate(zip(nodes, start, strict=True))

@@ -72,7 +72,6 @@ def test_other_formats_are_clouds_that_this_package_reads(site, world_run, tmp_p
 
 @pytest.mark.slow
 def test_joint_writes_trajectories_and_says_what_it_kept(site, world_run, tmp_path, capsys):
-    pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")
     pair = f"{world_run}:{site / 'out'}"
     out = tmp_path / "f.npy"
     assert main(["fuse", str(site / "site.coview"), pair, pair, "-o", str(out), "--joint"]) == 0

@@ -144,7 +144,7 @@ def test_robot_side_alone_is_all_right_and_says_what_more_there_is():
 
 
 def test_part_without_one_of_its_modules_is_a_warning_with_its_remedy():
-    found = machine.parts_finding(machine.lacking_modules(lambda name: None if name == "gtsam" else object()))
+    found = machine.parts_finding(machine.lacking_modules(lambda name: None if name == "lazrs" else object()))
     assert found.verdict == "warn"
-    assert "node lacks gtsam" in found.found
+    assert "node lacks lazrs" in found.found
     assert "[node]" in found.remedy

@@ -13,7 +13,6 @@ from coview_stream.fusion.joint import Joint, Judgement, adjust
 from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
 from coview_stream.recordings.open_run import open_run
 
-pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")
 pytestmark = pytest.mark.filterwarnings("ignore:.*which map:UserWarning")
 
 

@@ -212,13 +212,26 @@ def test_body_and_map_axes_conversions_are_inverse():
 
 
 def test_gtsam_tangent_is_the_body_tangent():
-    import gtsam
-
+    gtsam = pytest.importorskip("gtsam", reason="the oracle of this test")
     xi = np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.1])
     pose = gtsam.Pose3(T)
     np.testing.assert_allclose(pose.retract(xi).matrix(), T @ exp_of(xi), atol=1e-9)
     np.testing.assert_allclose(pose.localCoordinates(pose.retract(xi)), xi, atol=1e-12)
     np.testing.assert_allclose(adjoint(T), pose.AdjointMap(), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.029, 0.031, 0.3, 2.5, 3.1])
+def test_logarithm_of_a_pose_and_its_derivative(angle):
+    xi = np.array([0.48 * angle, -0.64 * angle, 0.6 * angle, 1.0, 2.0, -3.0])
+    T = exp_of(xi)
+    found, D = g.log_se3(np.stack([T, T]))
+    np.testing.assert_allclose(found[1], xi, atol=1e-8)
+    for column in range(6):
+        step = 1e-5 * np.eye(6)[column]
+        ahead, behind = (g.log_se3(T @ exp_of(sign * step))[0] for sign in (1, -1))
+        np.testing.assert_allclose(D[1][:, column], (ahead - behind) / 2e-5, atol=2e-6)
+        np.testing.assert_allclose(g.moved(T, 0.1 * step), T @ exp_of(0.1 * step), atol=1e-11)
+    np.testing.assert_allclose(g.relative(T, T @ exp_of(step)), exp_of(step), atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 2.5, np.pi - 1e-6])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from trackers import garbage
 from coview_stream.cli import build_parser
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.errors import ConfigError
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.backward import BelievedRegistration, RecordedFrame, RecordingLocalizer
@@ -29,7 +28,6 @@ from coview_stream.localization.state import State
 from coview_stream.recordings.run import Run
 from coview_stream.report.export import csv, trajectory_of
 
-pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")
 BLIND = np.tile(np.float32([0.6, 0.0, 0.0]), (15, 1))
 
 
@@ -274,12 +272,6 @@ def test_files_mark_each_pose_and_keep_the_live_ones(world_map, way, tmp_path):
     write(RunResult(1, [Fix(0.0, State.SEARCHING)]), world_map, tmp_path)
     assert not (tmp_path / "filtered.tum").exists()
     assert json.loads((tmp_path / "result.json").read_text())["smoothed"] is None
-
-
-def test_without_gtsam_the_extra_is_named_before_the_run(monkeypatch, world_map, world_drive):
-    monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(DependencyError, match=r"smoothing.*pip install 'coview-stream\[node\]'"):
-        locate(world_map, run_of(world_drive.clouds[:1], world_drive.T_odom_body[:1]), smooth=True)
 
 
 @pytest.mark.parametrize("words", [("serve", "site.coview"), ("replay", "run", "--robot", "rover")])

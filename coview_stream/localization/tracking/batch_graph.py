@@ -4,8 +4,9 @@ The unknowns are poses X_k. With e(A, B) = log(A^-1 B) and the covariance C of a
 
     rho(|C^-1/2 e(Z, X_target^-1 X_source)|)        X_target = I for the map
 
-with rho(d) = d^2 / 2, Huber's or Cauchy's. Levenberg and Marquardt's method solves (H + l diag H) xi = -g and takes the
-poses to X_k exp(xi_k) where the sum falls. H and g have the weights rho'(d) / d of iteratively reweighted least squares.
+with rho(d) = d^2 / 2, Huber's or Cauchy's. The method of Levenberg and Marquardt solves (H + l diag H) xi = -g and
+takes the poses to X_k exp(xi_k) if the sum falls. H and g have the weights rho'(d) / d of iteratively reweighted least
+squares.
 
 H is factored by blocks of a pose, L D L^T: poses are eliminated in order of their fewest neighbours, as they then are,
 which couples these neighbours (Dellaert and Kaess, "Factor graphs for robot perception", 2017, chapter 3). A chain
@@ -20,6 +21,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -163,7 +165,7 @@ class _Structure:
             number.update({(k, other): len(number) + n for n, other in enumerate(others)})
         self.pairs, self.order, begin = len(number), list[_Eliminated](), 0
         for k, others in ordered:
-            among = [(a, b, number[others[a], others[b]]) for a in range(len(others)) for b in range(a + 1, len(others))]
+            among = [(a, b, number[others[a], others[b]]) for a, b in combinations(range(len(others)), 2)]
             first, second, pair = np.array(among, dtype=np.int64).reshape(-1, 3).T
             own, begin = slice(begin, begin + len(others)), begin + len(others)
             self.order.append(_Eliminated(k, np.array(others, dtype=np.int64), own, (first, second, pair)))

@@ -22,7 +22,6 @@ from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.localization.tracking.pose_graph import PoseGraph
 from coview_stream.odometry.deskew import deskew
 from coview_stream.odometry.lidar_odometry import KissRegistration, LidarOdometry, ScanRegistration
 from coview_stream.stream.node.engine_queue import FrameJob, FrameResult, Job, Result, SearchJob
@@ -113,8 +112,7 @@ class TrackEngine(Engine):
         self._robots.pop(robot, None)
 
     def prepare_later(self) -> None:
-        """Import the library of the graph of poses, and load the field that a slip of odometry is judged by."""
-        PoseGraph(self.config.graph)
+        """Load the field that a slip of odometry is judged by."""
         _ = self.base_map.field.layers
 
 

@@ -81,9 +81,19 @@ def test_random_graphs_are_solved_as_by_gtsam(seed, kind):
     case = random_graph(seed)
     poses, covariances = solved(*case, kind)
     expected, spreads = by_gtsam(*case, kind)
-    print(np.abs(log_se3(relative(expected, poses))[0]).max())
     for ours, theirs in zip(covariances, spreads, strict=True):
         sigma = np.sqrt(np.diag(theirs))
-        print(np.abs((ours - theirs) / np.outer(sigma, sigma)).max())
         assert np.abs((ours - theirs) / np.outer(sigma, sigma)).max() < 1e-4
     assert np.abs(log_se3(relative(expected, poses))[0]).max() < 1e-6
+
+
+def test_two_measurements_of_one_node_are_weighed_by_their_covariances():
+    at = [pose_from(np.eye(3), [x, 0.0, 0.0]) for x in (0.0, 1e-3)]
+    graph = BatchGraph(np.array([at[1]]))
+    graph.add([Constraint(0, -1, at[0], 4.0 * np.eye(6)), Constraint(0, -1, at[1], np.eye(6))])
+    np.testing.assert_allclose(graph.solve()[0], pose_from(np.eye(3), [0.8e-3, 0.0, 0.0]), atol=1e-9)
+    np.testing.assert_allclose(graph.covariances()[0], 0.8 * np.eye(6), atol=1e-6)
+
+
+def test_empty_graph_is_solved():
+    assert BatchGraph(np.empty((0, 4, 4))).solve().shape == (0, 4, 4)

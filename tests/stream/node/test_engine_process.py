@@ -312,9 +312,9 @@ class Engine:
         pass
     def prepare_later(self):
         self.prepared = ", also later"
-        raise DependencyError("no gtsam")
+        raise DependencyError("no scipy")
     def run(self, job):
-        raise DependencyError("no gtsam" + self.prepared)
+        raise DependencyError("no scipy" + self.prepared)
 work(pipe, "odometry", lambda *args: Engine())
 """
 
@@ -324,8 +324,8 @@ def test_library_that_is_missing_is_the_jobs_error(engine):
     process = engine("odometry", child=Program(LACKING))
 
     def error():
-        with pytest.raises(RejectedError, match="no gtsam") as caught:
+        with pytest.raises(RejectedError, match="no scipy") as caught:
             process.run(job())
         return str(caught.value)
 
-    until(lambda: error() == "no gtsam, also later", 20.0)
+    until(lambda: error() == "no scipy, also later", 20.0)
