@@ -53,6 +53,7 @@ BENCHMARKS = {
     "scale": Benchmark("speed.scale", "the vote of a keyframe on a thousand to a million stations", (1,)),
     "city": Benchmark("speed.city", "a city of 4 km2 as a directory: build, open, find robots, memory"),
     "start": Benchmark("speed.start", "import, first run, ready to serve", _ANY),
+    "memory": Benchmark("speed.memory", "memory of serve with one robot, process by process, on 0.05 to 4 km2"),
     "peers": Benchmark("peers.peers", "other libraries on the same queries", _ANY),
     "accuracy": Benchmark("accuracy.accuracy", "errors, runs localized and false fixes in held-out worlds"),
     "conditions": Benchmark("accuracy.conditions", "real runs: leaning sensor, bad odometry, airborne-like maps"),

@@ -133,8 +133,8 @@ def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Point
     return kernels.transform_unique(cloud, T_odom_body, config.voxel, config.range_min)[0]
 
 
-MAX_CROP_BYTES = 64_000_000
-"""Bytes of crops that are kept though nobody holds them: six of a dense survey, at 10 MB."""
+MAX_CROP_BYTES = 32_000_000
+"""Bytes of crops that are kept though nobody holds them: three of a dense survey, at 10 MB."""
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 
 
@@ -195,6 +195,10 @@ class LocalMaps:
         while len(self._recent) > 1 and sum(kept.nbytes for kept in self._recent) > self._max_bytes:
             self._recent.popitem(last=False)
         return crop
+
+    def clear(self) -> None:
+        """Drop the crops that nobody holds."""
+        self._recent.clear()
 
     def _cut(self, key: tuple[int, int]) -> LocalMap | None:
         centre = np.array(key) * _CROP_STEP

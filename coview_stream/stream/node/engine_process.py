@@ -39,6 +39,7 @@ odometry."""
 
 _POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
 _PARENT_INTERVAL = 2.0  # seconds between two checks of an idle child whether its parent lives
+_REST = 3  # such checks: a robot that is searched for sends a keyframe every few seconds
 
 
 class RejectedError(Exception):
@@ -377,16 +378,17 @@ def work(
             gc.enable()
         pipe.send(("prepared", None))
         _set_group_nice(NICE[kind])
-        steps.append(engine.prepare_later)
+        steps.extend((engine.prepare_later, return_free_memory))
         while True:
             use_pause()
-            worked = True
+            pauses = 0
             while not pipe.poll(_PARENT_INTERVAL):
                 if parent not in (None, os.getppid()):  # its pipe may live on in a process that the parent has forked
                     return 0
-                if worked:
+                pauses += 1
+                if pauses == _REST:
+                    engine.rest()
                     return_free_memory()
-                worked = False
             pipe.send(attempt(engine, pipe.recv()))
     return 0
 

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 
+from coview_kernels.mapped import release
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import Trust
 from coview_stream.config import LocalizerConfig
@@ -52,6 +53,9 @@ class Engine(ABC):
 
     def prepare_later(self) -> None:  # noqa: B027 - likewise
         """Prepare for later jobs, in the first pause."""
+
+    def rest(self) -> None:  # noqa: B027 - likewise
+        """Give back memory that later jobs read or make again, in a longer pause."""
 
 
 class TrackEngine(Engine):
@@ -146,6 +150,16 @@ class SearchEngine(Engine):
     def prepare(self) -> None:
         """Prepare the stations' index, the learned features and the field for the first query."""
         GlobalSearch(self.base_map, self.config, self._local_maps, self._index).prepare()
+        self.rest()
+
+    def rest(self) -> None:
+        """Drop crops of the map, and the pages of its file: the system keeps these, an eighth of a second a gigabyte.
+
+        Searches have looked at the whole map, and while robots are tracked none comes.
+        """
+        self._local_maps.clear()
+        for array in self.base_map.arrays.values():
+            release(array)
 
 
 class OdometryEngine(Engine):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -104,6 +105,31 @@ def test_engines_name_the_kernels_that_they_launch(world_map, world_file, world_
         fresh.prepare_later()
         # the field judges slips of odometry, sorted points show moved parts, and none happened
         assert asked[engine] | {"field" if engine is track else "nearest"} == launched
+
+
+def test_search_engine_that_has_rested_keeps_no_page_of_the_map_and_finds_the_same(engines, world_file, world_drive):
+    jobs, watched = [], SimpleNamespace(run=lambda job: jobs.append(job) or engines[1].run(job))
+    Follower(engines[0], watched, "rests").follow(world_drive, range(FRAMES))
+
+    def resident():
+        lines, total, ours = Path("/proc/self/smaps").read_text().splitlines(), 0, False
+        for line in lines:
+            ours = str(world_file) in line if line[0] in "0123456789abcdef" and "-" in line.split()[0] else ours
+            total += int(line.split()[1]) if ours and line.startswith("Rss:") else 0
+        return total
+
+    found = []
+    for rests in (False, True):
+        engine = SearchEngine(BaseMap.load(world_file))
+        for job in jobs:
+            found.append(engine.run(job))
+            before = resident()
+            if rests:
+                engine.rest()
+                assert resident() < before
+    half = len(found) // 2
+    for one, other in zip(found[:half], found[half:], strict=True):
+        np.testing.assert_array_equal(one.leader, other.leader)
 
 
 @pytest.mark.slow
