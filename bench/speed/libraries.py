@@ -1,8 +1,8 @@
 """Quadrants beside Taichi, and prepared launches beside public calls: processes that take turns, the least of each.
 
 Start, compilation and loading are in seconds of processor time; kernels, at the sizes of a localizer step, in
-milliseconds of wall time. A public call checks and converts its arguments every time, on the owner thread; see
-:mod:`coview_kernels.launch`.
+milliseconds of wall time on one thread. A public call checks and converts its arguments every time, on the owner
+thread; see :mod:`coview_kernels.launch`.
 """
 
 from __future__ import annotations
@@ -106,5 +106,5 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     for row in (row for row in rows if row.details):
         least = [row.details.get(side, math.nan) for side in SIDES]
         cells = (*(number(value, 3) for value in least), *(number(value / least[0], 2) for value in least[1:]))
-        lines.append([row.name.removeprefix("libraries/"), *cells])
+        lines.append([row.name.removeprefix("libraries/").removesuffix(", 1 thread"), *cells])
     return {"": table(head, lines)} if lines else {}
