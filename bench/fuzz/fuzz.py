@@ -24,7 +24,7 @@ from bench.harness.rows import Row
 from coview_stream.errors import InputError
 
 CORPUS = ROOT / "tests" / "corpus"
-_SPARE_S = 60.0  # for the imports of a child
+_SPARE_S = 180.0  # for the imports of a child, and its first map
 
 
 def options(parser: argparse.ArgumentParser) -> None:
