@@ -8,6 +8,7 @@ gets its input, once per place in the code. Memory is limited, and an input that
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import faulthandler
 import functools
@@ -17,6 +18,7 @@ import logging
 import os
 import random
 import resource
+import shutil
 import sys
 import tempfile
 import threading
@@ -64,7 +66,9 @@ LOG = logging.getLogger("coview_stream")
 def _folder() -> Path:
     """Make a folder, in memory where the machine has /dev/shm."""
     memory = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    folder = Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _file(name: str, read: Callable[[Path], object], data: bytes) -> object:

@@ -100,7 +100,7 @@ class Robot(Driver):
 
 
 def lateness_until(condition):
-    """Wait for it, and return the seconds by which this thread was late meanwhile: others of the machine are as well."""
+    """Wait for it, and return the seconds by which this thread was late meanwhile, as others of the machine are."""
     late, begin = 0.0, time.monotonic()
     while not condition():
         due = time.monotonic() + 0.01
