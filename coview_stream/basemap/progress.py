@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 Progress = Callable[[int, int], None]
@@ -30,3 +30,29 @@ def progress_bar(title: str, show: bool | None = None, unit: str = "", scale: bo
             bar.update(done - bar.n)
 
         yield step
+
+
+@contextmanager
+def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[str], Progress]]:
+    """Show one bar of successive stages, with the time that is left, and yield the function that begins a stage.
+
+    Args:
+        shares: of the whole time, by stage, in order.
+        show: whether there is a bar.
+    """
+    from tqdm import tqdm
+
+    form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left"
+    with tqdm(total=sum(shares.values()), disable=not show, leave=False, bar_format=form) as bar:
+
+        def begin(stage: str) -> Progress:
+            before = sum(share for name, share in list(shares.items())[: list(shares).index(stage)])
+            bar.set_description(stage)
+            bar.update(max(0.0, before - bar.n))
+
+            def step(done: int, total: int) -> None:
+                bar.update(max(0.0, before + shares[stage] * min(done / max(total, 1), 1.0) - bar.n))
+
+            return step
+
+        yield begin

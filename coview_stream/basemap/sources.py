@@ -15,7 +15,13 @@ import numpy.typing as npt
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.cloud_head import CloudHead, read_head
 from coview_stream.clouds.files import expand_cloud_paths, read_cloud
-from coview_stream.clouds.reference_system import flaw_of_name, flaw_of_system, unchecked_system
+from coview_stream.clouds.reference_system import (
+    flaw_of_name,
+    flaw_of_system,
+    same_system,
+    short_name,
+    unchecked_system,
+)
 from coview_stream.errors import CloudError, ConfigError, MapError, warn
 from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
@@ -103,6 +109,17 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
             path = next(source.path for source in sources if source.path.resolve() == place)
             raise MapError(f"{path}: given twice; name every source once")
     return sources
+
+
+def warn_of_other_systems(sources: Sequence[Source], heads: Sequence[CloudHead]) -> None:
+    """Warn that the system given for files is not that of files which state their own."""
+    others = [h for s, h in zip(sources, heads, strict=True) if s.crs is not None and not same_system(s.crs, h.crs)]
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        warn(
+            f"{others[0].path}{more}: in {short_name(others[0].crs)}, as the file states; the given system "
+            f"{short_name(sources[0].crs)} is for files that state none, and ignored"
+        )
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:

@@ -26,7 +26,7 @@ _SAMPLED = 100_000  # points
 _STRAY = 0.1  # per cent of the points at either end of the heights that may be birds or pits
 
 # Limits of the warnings, set by hand; they decide nothing. docs/results.md has the table of densities.
-_THIN = 8.0  # points per m2: from 8 on real runs were found at once or as late as on the whole survey
+_THIN = 8.0  # points per m2 of a survey: from 8 on real runs were found at once or as late as on the whole survey
 _LOW = 1.0  # metres: nothing that stands is lower
 _BARE = 0.02  # share of the squares on which something has to stand
 _FLAT_SHARE = 2.0  # times as many surfaces as face up face another way, where another axis is the vertical one
@@ -58,10 +58,11 @@ class MapSummary:
         width: metres along x. depth: along y.
         area: m2 that hold points, in squares of a metre.
         lowest, highest: heights in the source's frame, metres, but for a few stray points.
-        density: points of the source per m2 of that area; None if the file does not say how many there were.
+        density: points kept per m2 of that area: one of each voxel, so that strips and files that overlap count once.
         crs: name of the reference system; "unknown" if none is stated.
-        bytes: of all arrays.
+        bytes: of all arrays, or of the tiles.
         warnings: one sentence for each feature of the map that will make robots fail.
+        form: that has these bytes: one file, or tiles.
     """
 
     width: float
@@ -69,19 +70,19 @@ class MapSummary:
     area: float
     lowest: float
     highest: float
-    density: float | None
+    density: float
     crs: str
     bytes: int
     warnings: tuple[str, ...]
+    form: str = "one file"
 
     def __str__(self) -> str:
         """Return one line."""
-        density = "" if self.density is None else f", {self.density:.3g} points/m2"
         area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
         return (
-            f"{self.width:.0f} x {self.depth:.0f} m with points on {area}{density}, "
+            f"{self.width:.0f} x {self.depth:.0f} m with points on {area}, {self.density:.3g} points/m2 kept, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "
-            f"{self.bytes / 1e6:.0f} MB as one file ({self.bytes / self.area / 1e3:.2g} GB per km2)"
+            f"{self.bytes / 1e6:.0f} MB as {self.form} ({self.bytes / self.area / 1e3:.2g} GB per km2)"
         )
 
 
@@ -112,14 +113,8 @@ def summary(base_map: SummarizedMap) -> MapSummary:
     covered = np.zeros(rows * columns, dtype=bool)
     covered[index] = True
     area = float(covered.sum()) * _CELL**2
-    read = base_map.parameters.get("source_points")
-    density = read / area if isinstance(read, int) and read > 0 else None
-    thin = None
-    if density is not None and density < _THIN:
-        thin = (
-            f"{density:.2g} points/m2 are few: on {_THIN:.0f} and less the first pose may come after 100 m of driving, "
-            "or not at all; use a denser survey if there is one"
-        )
+    density = len(points) / area
+    thin = too_thin(density, base_map.config.voxel)
     warnings = _upright(base_map), thin, _structured(points, index, covered), _covered(base_map)
     return MapSummary(
         float(high[0] - low[0]),
@@ -131,6 +126,17 @@ def summary(base_map: SummarizedMap) -> MapSummary:
         crs=short_name(base_map.crs),
         bytes=base_map.nbytes,
         warnings=tuple(filter(None, warnings)),
+    )
+
+
+def too_thin(density: float, voxel: float) -> str | None:
+    """Return a warning where fewer points per m2 were kept than of 8 spread at random (``voxel``: its edge, metres)."""
+    area = voxel**2
+    if density >= (1.0 - math.exp(-_THIN * area)) / area:  # the share of squares that are hit
+        return None
+    return (
+        f"{density:.2g} points/m2 are few: on surveys of {_THIN:.0f} and less the first pose may come after 100 m of "
+        "driving, or not at all; use a denser survey if there is one"
     )
 
 

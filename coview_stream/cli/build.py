@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from coview_stream.cli.map_argument import check_map_name
 from coview_stream.cli.options import add_shared
 
 if TYPE_CHECKING:
@@ -33,10 +36,15 @@ Clouds: TypeAlias = "Sequence[str | os.PathLike[str]]"
 _FIELDS = {"block_size": "block"}
 _MAX_WORKERS = 8  # by default: each may take 2 GB
 
+# of two airborne towns, 1.0 and 1.5 km2 of 3.6 and 3.2 points/m2, on two cores
+_SECONDS_PER_POINT, _SECONDS_PER_KM2 = 12e-6, 78.0
+_GB_PER_KM2, _TILES_GB_PER_KM2 = 0.37, 0.09
+_WORTH_SAYING = 30.0  # seconds
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    kinds = "las, laz, copc, e57, ply, pcd, xyz, pts, asc, txt, csv, npy, bin"
+    kinds = "las, laz, copc, e57, ply, pcd, npy, bin; xyz, pts, asc, txt, csv, also .gz"
     parser.add_argument(
         "maps", nargs="+", metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them, http(s):// addresses"
     )
@@ -92,14 +100,44 @@ def run(args: argparse.Namespace) -> int:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = args.learned
     tiles = args.output.endswith("/") or output.is_dir()
+    check_map_name(args.output, tiles)
     if not tiles and (args.workers is not None or args.dask is not None or args.keep_going):
         raise ConfigError(
             "--workers, --dask and --keep-going build directories of tiles; end the name of -o with a slash"
         )
     with local_clouds(args.maps, args.window) as clouds:
+        _announce(clouds, tiles)
         if tiles:
             return _build_site(clouds, args, output, map_preset(args.preset, **options), key)
         return _build_file(clouds, args, output, options, key)
+
+
+def _announce(clouds: Clouds, tiles: bool) -> None:
+    """Say on stderr how long it will take and how large the map will be, where the files' heads tell."""
+    import numpy as np
+
+    from coview_stream.basemap.sources import sources_of
+    from coview_stream.errors import CoViewError, CoViewWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CoViewWarning)  # the build reads the heads again, and tells
+        try:
+            heads = [source.head() for source in sources_of(clouds)]
+        except CoViewError:
+            return
+    boxes = [np.prod(h.high[:2] - h.low[:2]) for h in heads if h.low is not None and h.high is not None]
+    if len(boxes) < len(heads):
+        return
+    points, area = sum(head.points for head in heads), float(sum(boxes)) / 1e6
+    seconds = points * _SECONDS_PER_POINT + area * _SECONDS_PER_KM2
+    if seconds > _WORTH_SAYING:
+        size = area * (_TILES_GB_PER_KM2 if tiles else _GB_PER_KM2)
+        smaller = "" if tiles else " (as a directory, -o NAME/, a quarter)"
+        print(
+            f"{points / 1e6:.1f} million points on {area:.2g} km2: {math.ceil(seconds / 60)} min on two idle cores; "
+            f"a map of {size:.1g} GB{smaller}",
+            file=sys.stderr,
+        )
 
 
 def _build_file(
@@ -133,6 +171,7 @@ def _build_site(
 ) -> int:
     from coview_stream.basemap.site.executors import DaskExecutor, Executor, ProcessExecutor
     from coview_stream.basemap.site.site_build import build_site
+    from coview_stream.errors import warn
 
     begin = time.perf_counter()
     workers = args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1)
@@ -152,16 +191,16 @@ def _build_site(
     finally:
         executor.close()
     site = built.manifest
-    area, stations = (sum(counts) for counts in zip(*((t.area, t.stations) for t in site.tiles), strict=True))
     print(
         f"{output}: {built.source_points} points read, {sum(tile.points for tile in site.tiles)} kept, "
-        f"{stations} stations, {time.perf_counter() - begin:.1f} s, {site.nbytes} bytes"
-        + ("" if key is None else f", signed with {key.fingerprint}")
+        f"{sum(tile.stations for tile in site.tiles)} stations, {time.perf_counter() - begin:.1f} s, "
+        f"{site.nbytes} bytes" + ("" if key is None else f", signed with {key.fingerprint}")
     )
-    print(
-        f"{len(site.tiles)} tiles of {site.tile:g} m, {built.reused} of them as they were, points on {area} m2: "
-        f"{site.nbytes / max(area, 1):.0f} MB per km2; manifest {site.sha256[:12]}"
-    )
+    print(f"{len(site.tiles)} tiles of {site.tile:g} m, {built.reused} as they were; manifest {site.sha256[:12]}")
+    covered = built.summary()
+    for warning in covered.warnings:
+        warn(warning)
+    print(covered)
     for line in built.skipped:
         print(f"left out: {line}", file=sys.stderr)
     return 1 if built.skipped else 0

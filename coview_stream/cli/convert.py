@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.map_argument import check_map_name
+
 if TYPE_CHECKING:
     from coview_stream.basemap.site.manifest import Manifest
 
@@ -37,13 +39,10 @@ def run(args: argparse.Namespace) -> int:
     output, directory = Path(args.output), args.output.endswith("/")
     if not args.map.exists():
         raise ConfigError(f"{args.map}: is not there; give SITE.coview, or the directory of a site")
+    check_map_name(args.output, directory=args.light or not args.map.is_dir())
     if args.light:
         if not args.map.is_dir():
             raise ConfigError(f"{args.map}: is no directory of tiles; convert it to one first, then that with --light")
-        if output.suffix == ".coview" and not directory:
-            raise ConfigError(
-                f"{output}: a light copy is a directory, {output.stem}/; only a file is called NAME.coview"
-            )
         with naming_missing_libraries("coview-stream convert", "node"), progress_bar("converting", unit="step") as step:
             site = lighten(args.map, output, key, step)
         _tell(output, site)

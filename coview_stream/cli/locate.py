@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     lidar = None if lidar_options is None else LidarOdometry(lidar_options)  # now: its library may be missing
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
+    if args.run_path.is_dir() and args.run_path.resolve() in (here := args.output.resolve(), *here.parents):
+        raise InputError(f"{args.output}: lies in the run, which is only read; give another directory for the results")
     draws = not args.no_pictures and _can_draw()
     open_map_argument(args)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)

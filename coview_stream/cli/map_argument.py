@@ -40,6 +40,20 @@ def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bo
     )
 
 
+def check_map_name(output: str, directory: bool) -> None:
+    """Refuse a name that says another format than the one that is written (ConfigError): a file is ``NAME.coview``."""
+    from coview_stream.clouds.files import is_cloud_name
+
+    path = Path(output)
+    if directory and (path.suffix == ".coview" or is_cloud_name(path)) and not path.is_dir():
+        raise ConfigError(f"{output}: a directory of tiles is written, which is no such file; call it {path.stem}/")
+    if not directory and path.suffix not in ("", ".coview"):
+        raise ConfigError(
+            f"{output}: a map is written, which is no {path.suffix}; call it {path.stem}.coview, or {path.stem}/ for a "
+            "directory of tiles"
+        )
+
+
 def local_map(
     name: str,
     around: str | None = None,

@@ -30,6 +30,7 @@ class CloudHead:
     Attributes:
         path: of the file.
         crs: reference system, as :attr:`Cloud.crs`.
+        points: their number; 0 if the format does not state it.
         low, high: (3,) float64 corners of its extent, metres; None if the format does not state them.
     """
 
@@ -37,6 +38,7 @@ class CloudHead:
     crs: str | None = None
     low: Floats | None = None
     high: Floats | None = None
+    points: int = 0
 
 
 def read_head(path: str | os.PathLike[str]) -> CloudHead:
@@ -51,7 +53,9 @@ def read_head(path: str | os.PathLike[str]) -> CloudHead:
     header = read_header(path)
     low, high = header.mins, header.maxs
     stated = header.point_count > 0 and bool(np.isfinite([low, high]).all())
-    return CloudHead(path, system_of(path, header), low if stated else None, high if stated else None)
+    return CloudHead(
+        path, system_of(path, header), low if stated else None, high if stated else None, int(header.point_count)
+    )
 
 
 def extent_in_words(cloud: Cloud) -> str:

@@ -19,7 +19,7 @@ from coview_stream.clouds.decode import decode_in_child
 from coview_stream.clouds.e57 import require_pye57
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
-from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text
+from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text, suffix_of
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Reals
 
@@ -34,7 +34,7 @@ _WHOLE_READERS: dict[str, Callable[[Path], Cloud]] = {
 CLOUD_SUFFIXES = frozenset(_FORMATS)
 """Suffixes, lower case with their dot, that ``read_cloud`` accepts."""
 
-_ANY_TEXT = frozenset({".txt", ".csv"})  # in a folder such files may be stamps, poses or notes
+_ANY_TEXT = frozenset({".txt", ".csv", ".txt.gz", ".csv.gz"})  # in a folder such files may be stamps, poses or notes
 
 _MAGIC = (
     (b"LASF", "LAS"),
@@ -58,7 +58,7 @@ _FORMAT_BYTE = 104  # of a LAS header
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
     """Return whether a file in a folder is a cloud by its suffix; not hidden files, .txt and .csv."""
     name = Path(path).name
-    return Path(name).suffix.lower() in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
+    return suffix_of(Path(name)) in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
 
 
 def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
@@ -96,7 +96,7 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 def check_format(path: Path) -> str:
     """Return the format that a file's suffix names; CloudError if the first bytes are of another one."""
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
     head = _head(path)
     if suffix not in _FORMATS:
         known = ", ".join(sorted(CLOUD_SUFFIXES))
@@ -105,7 +105,8 @@ def check_format(path: Path) -> str:
     content = sniff(head)
     # raw float rows and text have no magic
     unmarked = content is None and (suffix == ".bin" or (name == "text" and b"\0" not in head))
-    if content != name and not unmarked:
+    expected = "gzip" if suffix.endswith(".gz") else name
+    if content != expected and not (unmarked and expected == name):
         reason = f"is {content}" if content else f"does not begin like {name}"
         remedy = "unpack it" if content in ("zip", "gzip") else "rename it, or get the real file"
         raise CloudError(f"{path}: named {suffix} but its content {reason}; {remedy}")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import os
 import re
+import zlib
 from itertools import islice
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -14,11 +17,13 @@ from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats, Floats32
 
-TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzrgb")
+_PLAIN = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzrgb")
+TEXT_SUFFIXES = (*_PLAIN, *(f"{suffix}.gz" for suffix in _PLAIN))
 """Suffixes, lower case, of text that is read as points."""
 
 _LINES = 100_000  # read at a time
 _MAX_LINE = 4096  # characters of a point
+_MAX_UNPACKED = 30  # times a file's size: digits of points shrink to a third or a tenth
 _MAX_HEAD = 100  # lines of titles and comments before the first point
 _COMMENTS = ("#", "//", ";", "%")
 _TITLES = {
@@ -46,13 +51,52 @@ def read_text(path: Path) -> Cloud:
     ;, and the number of points at the start of a PTS file. CloudError names a line that is no point.
     """
     builder = CloudBuilder()
-    with path.open(encoding="utf-8-sig", errors="replace", newline=None) as stream:
-        separator, columns, rows, number = _begin(path, stream)
-        while rows:
-            builder.add(_numbers(path, rows, separator, columns, number))
-            number += len(rows)
-            rows = list(islice(stream, _LINES))
+    try:
+        with _opened(path) as stream:
+            separator, columns, rows, number = _begin(path, stream)
+            while rows:
+                builder.add(_numbers(path, rows, separator, columns, number))
+                number += len(rows)
+                rows = list(islice(stream, _LINES))
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise CloudError(f"{path}: damaged or truncated gzip ({error}); copy it again") from error
     return builder.finish(os.fspath(path))
+
+
+def _opened(path: Path) -> TextIO:
+    if path.suffix.lower() != ".gz":
+        return path.open(encoding="utf-8-sig", errors="replace", newline=None)
+    unpacked = io.BufferedReader(_Unpacked(path))
+    return io.TextIOWrapper(unpacked, encoding="utf-8-sig", errors="replace", newline=None)
+
+
+class _Unpacked(io.RawIOBase):
+    """Bytes of a gzip file, not more than a text of points can have."""
+
+    def __init__(self, path: Path) -> None:
+        self._file, self._path = gzip.GzipFile(path), path
+        self._left = _MAX_UNPACKED * path.stat().st_size + _LINES
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise CloudError(f"{self._path}: unpacks to more than {_MAX_UNPACKED} times its size: no text of points")
+        buffer[: len(data)] = data
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def suffix_of(path: Path) -> str:
+    """Return a cloud's suffix in lower case, with both parts of ``.xyz.gz``."""
+    suffix = path.suffix.lower()
+    return Path(path.stem).suffix.lower() + suffix if suffix == ".gz" else suffix
 
 
 def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], list[str], int]:
@@ -72,7 +116,7 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
         if all(map(_is_number, cells)):
             if len(cells) >= 3:
                 return separator, columns, [line], number
-            if len(cells) == 1 and path.suffix.lower() == ".pts":  # the number of points
+            if len(cells) == 1 and suffix_of(path).startswith(".pts"):  # the number of points
                 continue
             raise CloudError(f"{path}:{number}: {text[:60]!r} has {len(cells)} columns; a point needs x, y and z")
         titled = _titled_columns(text)
@@ -84,7 +128,7 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
 
 def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[int, ...], number: int) -> Floats:
     """Return (N, 3) of lines, without blank lines, comments, and a PTS file's numbers of points."""
-    counted = path.suffix.lower() == ".pts"
+    counted = suffix_of(path).startswith(".pts")
     # not stripped: an empty first cell of a row of tabs is a column, too
     rows = [
         "" if (text := row.strip()).startswith(_COMMENTS) or (counted and text.isdecimal()) else row for row in rows

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
+from coview_stream.clouds.rows import suffix_of
 from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError
 from coview_stream.geometry.arrays import Floats
@@ -53,7 +54,7 @@ def find_layout(path: Path) -> Layout:
     if not path.exists():
         raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
     if path.is_file():
-        if path.suffix.lower() not in CLOUD_SUFFIXES:
+        if suffix_of(path) not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
     for folder, names in _FOLDERS.items():

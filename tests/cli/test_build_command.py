@@ -10,6 +10,7 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
+from coview_stream.cli.build import _announce
 from coview_stream.clouds.files import write_cloud
 
 
@@ -104,23 +105,84 @@ def test_directory_of_tiles_is_built_converted_and_shown(cloud, tmp_path, capsys
     assert "end the name of -o with a slash" in refused("build", cloud, "-o", tmp_path / "x.coview", "--workers", "2")
     site = f"{tmp_path}/site/"
     assert main(["build", str(cloud), "-o", site, "--workers", "1", "--no-learned"]) == 0
-    assert re.search(r"\d+ tiles of 320 m, 0 of them as they were.* MB per km2", capsys.readouterr().out)
+    assert re.search(r"\d+ tiles of 320 m, 0 as they were", out := capsys.readouterr().out)
+    assert re.search(r"^1\d x 1\d m with points on .* points/m2 kept, heights .*, crs unknown, .* as tiles", out, re.M)
     assert main(["info", site, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["site"]["tiles"] > 0
     assert main(["convert", site, str(tmp_path / "one.coview")]) == 0
     assert main(["convert", str(tmp_path / "one.coview"), str(tmp_path / "back")]) == 0
     assert "tiles of 320 m" in capsys.readouterr().out
-    assert "no coview map" in refused("convert", site, cloud)
+    (tmp_path / "thesis").write_text("years of work")
+    assert "no coview map" in refused("convert", site, tmp_path / "thesis")
 
 
 def test_only_a_map_file_is_overwritten(cloud, tmp_path, refused):
     before = cloud.read_bytes()
     assert "one of the scans" in refused("build", cloud, "-o", cloud)
     assert "given twice" in refused("build", cloud, cloud, "-o", tmp_path / "site.coview")
-    other = tmp_path / "thesis.txt"
+    other = tmp_path / "thesis"
     other.write_text("years of work")
     assert "no coview map" in refused("build", cloud, "-o", other)
     assert "not a regular file" in refused("build", cloud, "-o", "/dev/null")
     assert cloud.read_bytes() == before
     assert other.read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("command", "output", "right"),
+    [
+        ("build", "site.las", "site.coview"),
+        ("build", "out.txt", "out.coview"),
+        ("build", "site.coview/", "site/"),
+        ("convert", "two.coview", "two/"),
+        ("convert", "one.laz", "one/"),
+    ],
+)
+def test_map_has_no_name_of_another_format(cloud, world_file, tmp_path, refused, command, output, right):
+    words = [cloud, "-o"] if command == "build" else [world_file]
+    assert f"call it {right}" in refused(command, *words, f"{tmp_path}/{output}")
+    assert not (tmp_path / output).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("output", ["site.coview", "site/"])
+def test_reference_system_that_a_file_does_not_have_is_warned_of(map_points, tmp_path, capsys, output):
+    pytest.importorskip("pyproj")
+    near = map_points[(np.abs(map_points[:, :2]) < 9.0).all(axis=1)]
+    write_las(tmp_path / "site.las", np.add(near, (448_000.0, 5_400_000.0, 90.0)), "EPSG:32632")
+    words = ["build", str(tmp_path / "site.las"), "-o", f"{tmp_path}/{output}", "--no-learned", "--crs"]
+    assert main([*words, "EPSG:25833"]) == 0
+    said = capsys.readouterr()
+    assert "site.las: in EPSG:32632" in said.err
+    assert "ignored" in said.err
+    assert "crs EPSG:32632" in said.out
+    assert main([*words, "EPSG:32632"]) == 0
+    assert "ignored" not in capsys.readouterr().err
+
+
+def write_las(path, points, system):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(points.min(axis=0))
+    header.add_crs(pytest.importorskip("pyproj").CRS(system))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    las.write(str(path))
+
+
+def test_bar_of_a_build_is_one_and_never_goes_back(cloud, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr("tqdm.tqdm.refresh", lambda bar, *_, **__: shown.append((bar.desc, bar.n)))
+    BaseMap.build(cloud, radius=20.0, progress=True)
+    stages = list(dict.fromkeys(desc.rstrip(": ") for desc, _ in shown if desc))
+    assert stages == ["reading", "cleaning and normals", "ground", "describing stations", "likelihood field"]
+    shares = [n for _, n in shown]
+    assert shares == sorted(shares)
+
+
+def test_large_build_says_how_long_it_takes(tmp_path, capsys):
+    corners = np.array([[0.0, 0.0, 0.0], [2000.0, 1000.0, 10.0]])
+    write_cloud(tmp_path / "town.las", corners, origin=[448_000.0, 5_400_000.0, 90.0])
+    _announce([str(tmp_path / "town.las")], tiles=False)
+    assert re.search(r"0\.0 million points on 2 km2: 3 min .* a map of 0\.7 GB", capsys.readouterr().err)

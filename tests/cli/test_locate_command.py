@@ -140,6 +140,8 @@ def test_bad_paths_and_options_are_one_line(world_file, world_run, tmp_path, ref
         ([str(world_file), str(tmp_path / "none"), *out], "none"),
         ([str(world_file), str(tmp_path), *out], tmp_path.name),
         ([str(world_file), str(world_run), "-o", str(tmp_path / "file")], "is a file"),
+        ([str(world_file), str(world_run), "-o", str(world_run)], "lies in the run"),
+        ([str(world_file), str(world_run), "-o", str(world_run / "out")], "lies in the run"),
         ([str(world_file), str(world_run), *out, "--odometry", str(tmp_path / "no.tum")], "no.tum"),
         ([str(world_file), str(world_run), *out, "--odometry", str(wheel)], "wheel.tum"),
         ([str(world_file), str(world_run), *out, "--reloc", "magic"], "--reloc"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+
 import numpy as np
 import pytest
 
@@ -130,3 +132,19 @@ def test_small_and_flat_files_are_taken_as_they_are_named(tmp_path):
     assert likely_columns(np.random.default_rng(2).normal(size=900).astype("<f4"), 4) == 4
     noise = np.random.default_rng(2).normal(size=84_000).astype("<f4")
     assert likely_columns(noise, 4) == 4
+
+
+def test_packed_text_is_read_and_a_bomb_is_not(tmp_path):
+    packed = tmp_path / "a.xyz.gz"
+    packed.write_bytes(gzip.compress(lines(POINTS).encode()))
+    assert is_cloud_name(packed)
+    np.testing.assert_allclose(read_cloud(packed).map_points(), POINTS, atol=2e-3)
+    packed.write_bytes(gzip.compress(lines(POINTS).encode())[:-200])
+    with pytest.raises(CloudError, match=r"a\.xyz\.gz: damaged or truncated gzip"):
+        read_cloud(packed)
+    packed.write_bytes(gzip.compress(b"1 2 3\n" * 5_000_000))
+    with pytest.raises(CloudError, match=r"a\.xyz\.gz: unpacks to more than"):
+        read_cloud(packed)
+    packed.write_bytes(lines(POINTS).encode())
+    with pytest.raises(CloudError, match="its content is text"):
+        read_cloud(packed)

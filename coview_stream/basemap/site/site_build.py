@@ -14,20 +14,25 @@ from typing import Any, TypeVar
 import numpy as np
 
 from coview_stream.basemap.ground import ground_filter
-from coview_stream.basemap.progress import progress_bar
+from coview_stream.basemap.progress import Progress, staged_bar
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.executors import Executor
 from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
-from coview_stream.basemap.sources import Given, Source, short_names, sources_of
+from coview_stream.basemap.sources import Given, Source, short_names, sources_of, warn_of_other_systems
+from coview_stream.basemap.summary import MapSummary, too_thin
 from coview_stream.clouds.cloud_head import CloudHead, check_together
-from coview_stream.config import MapConfig
+from coview_stream.clouds.reference_system import short_name
+from coview_stream.config import MapConfig, config_of_map
 from coview_stream.errors import CoViewError, InputError, MapError, warn
 from coview_stream.geometry.arrays import Floats
 
 WORK = ".build"
 """Folder in a site's directory for intermediate results; its small records stay after the build."""
+
+_SHARES = {"looking": 0.01, "measuring": 0.04, "reading": 0.15, "thinning": 0.15, "building tiles": 0.65}
+"""Of the time of a build, for its bar."""
 
 _MIN_POINTS = 1000  # as for a map in one file
 
@@ -44,12 +49,30 @@ class SiteBuilt:
         source_points: points read.
         reused: tiles that existed already.
         skipped: sources and tiles that failed, and the reason, one line each.
+        low, high: (3,) corners of the sources, metres.
     """
 
     manifest: Manifest
     source_points: int
     reused: int
     skipped: tuple[str, ...]
+    low: Floats
+    high: Floats
+
+    def summary(self) -> MapSummary:
+        """Return what the manifest tells of the map, without a look at its points."""
+        site = self.manifest
+        area = max(1, sum(tile.area for tile in site.tiles))
+        density = sum(tile.points for tile in site.tiles) / area
+        thin = too_thin(density, config_of_map(site.parameters["config"]).voxel)
+        width, depth, _ = (self.high - self.low).tolist()
+        return MapSummary(
+            width, depth, area=area,
+            lowest=min(tile.low for tile in site.tiles) + site.origin[2],
+            highest=max(tile.high for tile in site.tiles) + site.origin[2],
+            density=density, crs=short_name(site.crs), bytes=site.nbytes, form="tiles",
+            warnings=(thin,) if thin else (),
+        )  # fmt: skip
 
 
 def build_site(
@@ -73,7 +96,7 @@ def build_site(
         key: signs the manifest.
         executor: runs the steps; None runs them in this process.
         keep_going: skip sources and tiles that fail, instead of ending.
-        progress: show bars on stderr.
+        progress: show a bar on stderr.
 
     Raises:
         CloudError: a source cannot be read. MapError: nothing to stand on, or the directory cannot be used.
@@ -95,31 +118,34 @@ def build_site(
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise MapError(f"{directory}: cannot be written ({error.strerror}); choose a writable place") from error
-    run = _Run(executor or Executor(), keep_going, progress)
-    sources, low, high = _extent(sources, run)
-    before = Manifest.load(directory) if is_site(directory) else None
-    origin = before.origin if before is not None and before.tile == TILE else origin_of(low, high)
-    grid = SiteGrid(origin, TILE, config)
+    with staged_bar(_SHARES, progress) as stage:
+        run = _Run(executor or Executor(), keep_going, stage)
+        sources, low, high = _extent(sources, run)
+        before = Manifest.load(directory) if is_site(directory) else None
+        origin = before.origin if before is not None and before.tile == TILE else origin_of(low, high)
+        grid = SiteGrid(origin, TILE, config)
 
-    names = list(sources)
-    jobs = [(sources[name], name, grid, work / "parts" / f"{k:06d}") for k, name in enumerate(names)]
-    parts = run("reading", partition, jobs, names)
-    if not parts:
-        raise MapError(f"{directory}: no source could be read")
-    warn(check_together([CloudHead(Path(part.name), part.crs) for part in parts]))
-    keys = sorted({key for part in parts for key in part.tiles}, key=lambda key: (key[1], key[0]))
-    thin_jobs = [ThinJob(grid, key, tuple(part for part in parts if key in part.tiles), work / "thin") for key in keys]
-    counts = run("thinning", thin, thin_jobs, ["tile {}, {}".format(*job.key) for job in thin_jobs])
-    if sum(counts) < _MIN_POINTS:
-        raise MapError(
-            f"{names[0]}: {sum(counts)} points are left; a base map needs {_MIN_POINTS}: are they in metres?"
-        )
-    thinned = {job.key: (job.key, job.file, job.digest) for job in thin_jobs if job.file.is_file()}
-    tile_jobs = [
-        TileJob(grid, key, tuple(thinned[k] for k in grid.around(key) if k in thinned), directory, work / "records")
-        for key in thinned
-    ]
-    built = run("building tiles", build_tile, tile_jobs, ["tile {}, {}".format(*job.key) for job in tile_jobs])
+        names = list(sources)
+        jobs = [(sources[name], name, grid, work / "parts" / f"{k:06d}") for k, name in enumerate(names)]
+        parts = run("reading", partition, jobs, names)
+        if not parts:
+            raise MapError(f"{directory}: no source could be read")
+        warn(check_together([CloudHead(Path(part.name), part.crs) for part in parts]))
+        keys = sorted({key for part in parts for key in part.tiles}, key=lambda key: (key[1], key[0]))
+        thin_jobs = [
+            ThinJob(grid, key, tuple(part for part in parts if key in part.tiles), work / "thin") for key in keys
+        ]
+        counts = run("thinning", thin, thin_jobs, ["tile {}, {}".format(*job.key) for job in thin_jobs])
+        if sum(counts) < _MIN_POINTS:
+            raise MapError(
+                f"{names[0]}: {sum(counts)} points are left; a base map needs {_MIN_POINTS}: are they in metres?"
+            )
+        thinned = {job.key: (job.key, job.file, job.digest) for job in thin_jobs if job.file.is_file()}
+        tile_jobs = [
+            TileJob(grid, key, tuple(thinned[k] for k in grid.around(key) if k in thinned), directory, work / "records")
+            for key in thinned
+        ]
+        built = run("building tiles", build_tile, tile_jobs, ["tile {}, {}".format(*job.key) for job in tile_jobs])
     manifest = _manifest(grid, parts, in_order(entry for entry, _ in built if entry is not None), directory)
     if key is not None:
         manifest = manifest.signed(key)
@@ -131,7 +157,9 @@ def build_site(
     for path in (work / "records").glob("*.json"):
         if path not in records:
             path.unlink(missing_ok=True)
-    return SiteBuilt(manifest, sum(part.points for part in parts), sum(old for _, old in built), tuple(run.skipped))
+    return SiteBuilt(
+        manifest, sum(part.points for part in parts), sum(old for _, old in built), tuple(run.skipped), low, high
+    )
 
 
 def check_directory(directory: Path) -> None:
@@ -152,6 +180,7 @@ def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], F
     if not usable:
         raise MapError(f"{names[0]}: no source could be read")
     warn(check_together(heads))
+    warn_of_other_systems(list(usable.values()), heads)
     unknown = [source for source, head in zip(usable.values(), heads, strict=True) if head.low is None]
     extents = [(head.low, head.high) for head in heads if head.low is not None and head.high is not None]
     measured = run("measuring", extent_of, unknown, [str(source.path) for source in unknown])
@@ -186,8 +215,8 @@ class _Run:
         left_out: names of these.
     """
 
-    def __init__(self, executor: Executor, keep_going: bool, progress: bool) -> None:
-        self.executor, self.keep_going, self.progress = executor, keep_going, progress
+    def __init__(self, executor: Executor, keep_going: bool, stage: Callable[[str], Progress]) -> None:
+        self.executor, self.keep_going, self.stage = executor, keep_going, stage
         self.skipped: list[str] = []
         self.left_out: set[str] = set()
 
@@ -197,17 +226,17 @@ class _Run:
         """Return the results in the order of the items, without those that failed if that is allowed."""
         results: dict[int, Result] = {}
         failed: dict[int, Exception] = {}
-        with progress_bar(title, self.progress and bool(items)) as step:
-            for done, (number, result) in enumerate(self.executor.run(function, items), start=1):
-                step(done, len(items))
-                if not isinstance(result, Exception):
-                    results[number] = result
-                    continue
-                if not isinstance(result, CoViewError | OSError):
-                    raise result
-                if not self.keep_going:
-                    raise _naming(names[number], result) from result
-                failed[number] = result
+        step = self.stage(title)
+        for done, (number, result) in enumerate(self.executor.run(function, items), start=1):
+            step(done, len(items))
+            if not isinstance(result, Exception):
+                results[number] = result
+                continue
+            if not isinstance(result, CoViewError | OSError):
+                raise result
+            if not self.keep_going:
+                raise _naming(names[number], result) from result
+            failed[number] = result
         for number in sorted(failed):
             self.left_out.add(names[number])
             self.skipped.append(str(_naming(names[number], failed[number])))

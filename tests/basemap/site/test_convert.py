@@ -79,7 +79,7 @@ def test_light_copy_is_made_from_a_directory_to_another(site, tmp_path, capsys):
     for words, said in (
         ([tmp_path / "none.coview", tmp_path / "light", "--light"], "is not there"),
         ([tmp_path / "one.coview", tmp_path / "light", "--light"], "is no directory of tiles"),
-        ([site, tmp_path / "light.coview", "--light"], "a light copy is a directory"),
+        ([site, tmp_path / "light.coview", "--light"], "a directory of tiles is written"),
         ([site, f"{tmp_path}/copy/"], "name a file, NAME.coview, or add --light"),
     ):
         capsys.readouterr()
