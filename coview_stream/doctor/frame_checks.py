@@ -18,7 +18,7 @@ from coview_stream.doctor.finding import Finding, Verdict
 from coview_stream.errors import install_command
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import one_in
-from coview_stream.geometry.transforms import Points, Pose, rot_z, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.witness.conventions import (
     AS_SENT_WORDS,
     AXES,
@@ -33,6 +33,7 @@ from coview_stream.localization.witness.conventions import (
     SCALE,
     STILL,
     SURE,
+    SWAPPED,
     UP,
     Fit,
     Pair,
@@ -51,6 +52,13 @@ _SWAY = math.radians(9.0)
 _MOVING = 1.0  # metres
 
 _MIN_PAIRS = 3
+_FAR = 5.0  # metres from the middle of the way: the middle of a cloud is off by some
+_ABOVE = 1.0  # metres of a lidar above the ground, about
+IN_ODOMETRY = Reading(
+    "clouds are in odometry's frame: they were moved there already, as FAST-LIO's /cloud_registered are",
+    "send them in the body's frame, as they are seen (/cloud_registered_body)",
+)
+IN_MAP = Reading("clouds are in a map's frame, and do not move with the robot", IN_ODOMETRY.remedy)
 _GROUND_FRAMES = 16
 
 
@@ -98,11 +106,10 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
             yield _ground_finding(ground, robot)
         return
     seen = None if ground is None else fit(pairs)
-    if ground is None or ground.axis or unit != 1.0 or seen is None or seen.odds < SURE:
-        explanation = _explanation(frames, ground, pairs, seen, robot, unit)
-        if explanation is not None:
-            yield explanation
-            return
+    explanation = _explanation(frames, ground, pairs, seen, robot, unit)
+    if explanation is not None:
+        yield explanation
+        return
     if ground is None:
         remedy = "is z up, are points in metres, and are those on the ground sent too? `coview-stream help reasons`"
         yield Finding("warn", "ground", "none is seen below the sensor", remedy, robot)
@@ -166,10 +173,12 @@ def _explanation(
     ``unit`` is the metres of the clouds' unit, by which they have been multiplied.
     """
     candidates: list[tuple[float, Finding]] = []
+    sent = seen is not None and ground is not None and not ground.axis and unit == 1.0
+    as_sent = max(0.0, seen.odds) if sent and seen is not None else 0.0
 
     def consider(reading: Reading, finding: Finding | None = None) -> None:
         as_read = fit(pairs, reading)
-        if as_read.odds <= SURE:
+        if as_read.odds <= as_sent + SURE:
             return
         if finding is None:
             found = f"{reading.found}: read so, it follows the lidar to {as_read.misfit:.2f} m"
@@ -184,9 +193,18 @@ def _explanation(
             )
         if unit != 1.0:
             consider(MILLIMETRES)
-        for reading in (BOTH_CAMERA,) if ground.axis else (MIRRORED, *ODOMETRY):
+        for reading in (
+            () if candidates and unit != 1.0 else (BOTH_CAMERA,) if ground.axis else (MIRRORED, SWAPPED, *ODOMETRY)
+        ):
             consider(reading)
-    if not candidates:
+    if not candidates and as_sent <= SURE:
+        as_they_came = [replace(frame, points=frame.points / np.float32(unit)) for frame in frames]
+        for reading, frames_of_body in _of_fixed_frames(as_they_came):
+            ground = _ground(frames_of_body)
+            if not candidates and ground is not None and not ground.axis:
+                pairs = _pairs(frames_of_body, ground)[0]
+                consider(reading)
+    if not candidates and as_sent <= SURE:
         scaled = [replace(frame, points=frame.points * np.float32(FOOT)) for frame in frames]
         ground = _ground(scaled)
         if ground is not None and not ground.axis:
@@ -208,13 +226,33 @@ _GUESSED = (
 )
 
 
+def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, list[SeenFrame]]]:
+    """Yield what clouds are in that stay where they are while the robot moves, and the frames by the body then.
+
+    The middle of the points moves with the robot, which tells about where a map's frame has its origin and x axis.
+    """
+    poses = np.array([frame.T_odom_body for frame in frames])
+    middles = np.array([np.median(frame.points, axis=0) for frame in frames], dtype=np.float64)
+    at, seen = poses[:, :2, 3] @ [1.0, 1.0j], middles[:, :2] @ [1.0, 1.0j]
+    turned = np.vdot(at - at.mean(), seen - seen.mean())
+    if float(np.abs(at - at.mean()).max()) < _FAR or abs(turned) < 1e-9:
+        return
+    low = float(np.median([np.quantile(frame.points[:, 2], 0.1) for frame in frames]))
+    T = pose_from(rot_z(float(np.angle(turned))), np.zeros(3))
+    shift = seen.mean() - at.mean() * turned / abs(turned)
+    T[:3, 3] = shift.real, shift.imag, low + _ABOVE - float(np.median(poses[:, 2, 3]))
+    for reading, T_frame_odom in ((IN_ODOMETRY, np.eye(4)), (IN_MAP, T)):
+        moved = np.linalg.inv(T_frame_odom @ poses)
+        yield reading, [replace(f, points=transform(M, f.points)) for f, M in zip(frames, moved, strict=True)]
+
+
 def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:
-    turned = f"turned by {mount.yaw:.0f} degrees"
+    turned = f"turned by {math.degrees(mount.yaw):.0f} degrees"
     if not axis:
         found = f"the lidar is {turned} against the motion of the body"
     else:
         found = "the lidar is upside down" if axis == 1 else f"the lidar's {AXIS_NAMES[axis]} axis points up, not its z"
-        found += f", {turned} about the vertical" if abs(mount.yaw) > math.degrees(HEADING) else ""
+        found += f", {turned} about the vertical" if abs(mount.yaw) > HEADING else ""
     return Finding("FAIL", "mount", found, f"set --mount={mount.option}; {_GUESSED}", robot)
 
 

@@ -15,7 +15,16 @@ from coview_stream.config.mount import parse_mount
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.map_checks import seen_frames
 from coview_stream.errors import CloudError
-from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
+from coview_stream.geometry.transforms import (
+    exp_so3,
+    inverse,
+    pose_from,
+    quat_to_matrix,
+    quaternion_of,
+    rot_z,
+    transform,
+    yaw_of,
+)
 from coview_stream.localization.witness.conventions import RIVALS
 from coview_stream.recordings.open_run import open_run
 
@@ -46,6 +55,15 @@ def camera(f):
     )
 
 
+def quaternion_shifted(T):
+    """A pose whose quaternion is written w, x, y, z and read x, y, z, w."""
+    return pose_from(quat_to_matrix(quaternion_of(T)[[3, 0, 1, 2]]), T[:3, 3])
+
+
+def in_frame(T_frame_odom):
+    return lambda f: SeenFrame(f.stamp, transform(T_frame_odom @ f.T_odom_body, f.points), f.T_odom_body)
+
+
 PITCH = exp_so3([0.0, np.radians(10.0), 0.0])
 FAULTS = {
     "lidar tilted": (clouds(PITCH), "lean"),
@@ -59,6 +77,12 @@ FAULTS = {
     "transposed": (odometry(RIVALS["transposed"]), "transposed"),
     "millimetres": (scaled(1000.0), "millimetres"),
     "feet": (scaled(3.2808), "feet"),
+    "x and y of clouds": (lambda f: SeenFrame(f.stamp, f.points[:, [1, 0, 2]], f.T_odom_body), "x and y of one"),
+    "north before east": (odometry(lambda P: pose_from(P[:3, :3], P[[1, 0, 2], 3])), "x and y are swapped"),
+    "clockwise": (odometry(lambda P: pose_from(rot_z(np.pi / 2 - 2 * yaw_of(P)) @ P[:3, :3], P[:3, 3])), "clockwise"),
+    "quaternion": (odometry(quaternion_shifted), "written w, x, y, z"),
+    "odometry's frame": (in_frame(np.eye(4)), "in odometry's frame"),
+    "map's frame": (in_frame(pose_from(rot_z(0.7), [600.0, -300.0, 12.0])), "in a map's frame"),
     "left-handed": (lambda f: SeenFrame(f.stamp, f.points * np.float32([1, -1, 1]), f.T_odom_body), "left-handed"),
 }
 

@@ -26,6 +26,8 @@ from coview_stream.geometry.transforms import (
     log_so3,
     norms,
     pose_from,
+    quat_to_matrix,
+    quaternion_of,
     rot_z,
     wrap_angle,
     yaw_of,
@@ -62,6 +64,16 @@ RIVALS: dict[str, Change] = {
     "feet": lambda T: pose_from(T[:3, :3], FOOT * T[:3, 3]),
 }
 """Usual mistakes in odometry, each by the change that mends it."""
+
+
+def _order_mended(T: Pose) -> Pose:
+    """Return a pose (4, 4) whose quaternion was written w, x, y, z and read x, y, z, w."""
+    return pose_from(quat_to_matrix(quaternion_of(T)[[1, 2, 3, 0]]), T[:3, 3])
+
+
+def _heading_mended(T: Pose) -> Pose:
+    """Return a pose (4, 4) whose heading was counted from y towards x."""
+    return pose_from(rot_z(math.pi / 2.0 - 2.0 * yaw_of(T)) @ T[:3, :3], T[:3, 3])
 
 
 class Pair(NamedTuple):
@@ -112,6 +124,10 @@ ODOMETRY = (
     Reading("odometry's z points down (north-east-down)", f"send it with {AS_SENT_WORDS}", change=RIVALS["z down"]),
     Reading("odometry has a camera's axes (z forward, y down)", f"send it with {AS_SENT_WORDS}",
             change=RIVALS["camera"]),
+    Reading("odometry's quaternion is written w, x, y, z", "send x, y, z, w", change=_order_mended),
+    Reading("odometry's x and y are swapped (north before east)", "send x before y, left of it",
+            change=lambda T: pose_from(T[:3, :3], T[[1, 0, 2], 3])),
+    Reading("odometry's heading is counted clockwise from north", "count it from x towards y", change=_heading_mended),
     Reading("odometry is in millimetres", "send metres", change=RIVALS["millimetres"]),
     Reading("odometry is in feet", "send metres", change=RIVALS["feet"]),
 )  # fmt: skip
@@ -123,6 +139,10 @@ MILLIMETRES = Reading("clouds are in millimetres", "send metres")
 MIRRORED = Reading(
     "clouds and odometry mirror each other: the axes of one are left-handed (y points right)",
     f"send both with {AS_SENT_WORDS}", mirrored=True,
+)  # fmt: skip
+SWAPPED = Reading(
+    "clouds and odometry mirror each other: x and y of one are swapped", f"send both with {AS_SENT_WORDS}",
+    heading=math.pi / 2.0, mirrored=True,
 )  # fmt: skip
 BOTH_CAMERA = Reading(
     "clouds and odometry have a camera's axes (z forward, y down)", f"send both with {AS_SENT_WORDS}",

@@ -35,6 +35,7 @@ from coview_stream.localization.witness.conventions import (
     ODOMETRY,
     RIVALS,
     SURE,
+    SWAPPED,
     UP,
     Pair,
     Reading,
@@ -252,7 +253,7 @@ class Conventions:
             return float(np.logaddexp.reduce([unrelated, *(odds for odds, reading in weighed if reading not in but)]))
 
         right = next((odds for odds, reading in weighed if reading is AS_SENT), -math.inf)
-        self.plausible = self.plausible or right - odds(AS_SENT, MIRRORED, *ODOMETRY) > 2.0 * SURE
+        self.plausible = self.plausible or right - odds(AS_SENT, MIRRORED, SWAPPED, *ODOMETRY) > 2.0 * SURE
         self.settled = right - odds(AS_SENT) > 2.0 * SURE
         self.doubtful = not self.plausible and right < odds(AS_SENT)
         (best, reading), (second, other) = weighed[:2]
@@ -275,5 +276,5 @@ class Conventions:
             yield _ODD + _ANY_HEADING, turned_clouds(self._axis, seen.yaw)
         if AXIS_NAMES[self._axis] == "-y":
             yield _ODD, BOTH_CAMERA
-        others = (*((FEET,) if self._pairs_in_feet else ()), MIRRORED, *ODOMETRY)
+        others = (*((FEET,) if self._pairs_in_feet else ()), MIRRORED, SWAPPED, *ODOMETRY)
         yield from ((_ODD if sent else 2.0 * _ODD, reading) for reading in others)
