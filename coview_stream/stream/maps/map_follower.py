@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +19,8 @@ PERIOD = 10.0
 """Seconds between two questions to the source, and from a change that failed to the next try."""
 
 _LOOK = 1.0  # seconds between two looks at the outcome of a change
-_MOST_DOUBLINGS = 5  # of the time to the next try
+_MOST_DOUBLINGS = 5  # of the time to the next try, or question
+_HOUR = 3600.0  # seconds in which changes are counted: each doubles the time between two questions
 _SETTLED = ("changed", "unchanged")
 
 
@@ -38,14 +40,16 @@ class MapFollower:
     ) -> None:
         """Follow the opened mirrors of all sites of the node's map, asking their sources every ``period`` seconds.
 
-        ``take_over`` asks the node to load the map again. ``outcome`` returns the result of that: ``changed``,
-        ``unchanged``, ``loading`` (the mirrors stay as they are meanwhile), or another word for a failure. A change
-        that failed is asked for again, each time later.
+        Each change within an hour doubles the time between two questions, up to 32 times. ``take_over`` asks the node
+        to load the map again. ``outcome`` returns the result of that: ``changed``, ``unchanged``, ``loading`` (mirrors
+        stay as they are meanwhile), or another word for a failure. A change that failed is asked for again, each time
+        later.
         """
         self._mirrors, self._take_over, self._outcome = mirrors, take_over, outcome
         self._period = period
         self._guard = RateLimitedErrors(log)
         self._asked, self._again_at, self._tries, self._pending = time.monotonic(), 0.0, 0, False
+        self._changes: deque[float] = deque(maxlen=_MOST_DOUBLINGS)  # times of the newest ones
         self.name = ", ".join(mirror.source.name for mirror in mirrors)
         self.last: dict[str, Any] = {}
         self._note("unreachable" if self._offline else "current", self._offline or None)
@@ -72,11 +76,13 @@ class MapFollower:
         if outcome in _SETTLED:
             self._pending, self._tries = False, 0
         changed = False
-        if now - self._asked >= self._period:
+        recent = sum(now - at < _HOUR for at in self._changes)  # a source may go to and fro: engines start each time
+        if now - self._asked >= self._period * 2**recent:
             self._asked = now
             changed = self._refresh()
         if changed:
             self._tries = 0
+            self._changes.append(now)
         elif not self._pending or now < self._again_at:
             return
         log.info("%s: %s", self.name, "it has changed" if changed else "once more")

@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from coview_stream.basemap.site.working_file import working_path
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import ConfigError, TransportError
+from coview_stream.stream.maps import map_follower
 from coview_stream.stream.maps.fetch_map import prepare_map, source_of
 from coview_stream.stream.maps.map_follower import MapFollower
 from coview_stream.stream.maps.map_server import MapServer
@@ -208,6 +210,18 @@ def test_follower_survives_any_error_of_a_source_and_of_the_node(site, error):
     finally:
         stopping.set()
         thread.join()
+
+
+def test_source_that_goes_to_and_fro_is_asked_more_seldom(monkeypatch):
+    now, taken = [0.0], []
+    monkeypatch.setattr(map_follower, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    mirror = SimpleNamespace(source=SimpleNamespace(name="yard"), offline="", refresh=lambda: True, map_path=None)
+    follower = MapFollower([mirror], lambda: taken.append(now[0]), period=10.0)
+    for second in range(3600):
+        now[0] = float(second)
+        follower._turn()
+    assert taken[:5] == [10.0, 30.0, 70.0, 150.0, 310.0]
+    assert len(taken) < 20
 
 
 def test_refusal_that_is_no_text_is_one_error(endpoint, source):
