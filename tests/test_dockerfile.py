@@ -29,7 +29,7 @@ def test_what_is_copied_is_there():
 def test_what_the_package_is_built_of_is_copied():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     needed = [project["project"]["readme"], *project["project"]["license-files"]]
-    needed += [path.split("/")[0] for path in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]]
+    needed += [path.split("/")[0] for path in project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]]
     for name in needed:
         assert re.search(rf"^COPY .*\b{re.escape(name)}\b", TEXT, re.MULTILINE), name
 

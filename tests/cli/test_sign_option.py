@@ -22,11 +22,16 @@ def site(tmp_path_factory, world_map, world_drive):
     damaged = bytearray((folder / "signed.coview").read_bytes())
     damaged[-50] ^= 4
     (folder / "damaged.coview").write_bytes(damaged)
+    (folder / "run").mkdir()
     return folder
 
 
 def command(name, site, map_name, key):
-    more = {"serve": ["--robot", "r1", "--no-state"], "locate": [str(site), "-o", str(site / "out")], "info": []}[name]
+    more = {
+        "serve": ["--robot", "r1", "--no-state"],
+        "locate": [str(site / "run"), "-o", str(site / "out")],
+        "info": [],
+    }[name]
     return [name, str(site / map_name), *more, "--verify-key", str(site / key)]
 
 

@@ -72,7 +72,7 @@ def test_missing_odometry_is_ok_when_node_computes_it():
         (Sample(KEYS.cloud, cloud(0.0).payload, "video/h264"), "video/h264", "--cloud-encoding cdr"),
         (Sample(KEYS.cloud, cloud(0, codec="foxglove").payload), "no encoding is set", "--cloud-encoding foxglove"),
         (Sample(KEYS.cloud, SWEEP.tobytes(), "", ns(0).to_bytes(8, "little")), "no encoding", "--cloud-encoding xyz"),
-        (Sample(KEYS.cloud, SWEEP.tobytes(), "application/octet-stream;layout=xyz"), "no stamp", "wire.md"),
+        (Sample(KEYS.cloud, SWEEP.tobytes(), "application/octet-stream;layout=xyz"), "no stamp", "help wire"),
         (Sample(KEYS.cloud, bytes(17 << 20)), "bytes", "--max-payload"),
     ],
 )
