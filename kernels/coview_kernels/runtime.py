@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -31,7 +32,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
@@ -123,6 +124,7 @@ def _init(library: Any) -> None:
         del misc.print
 
 
+@functools.cache
 def _cache_folder(library: Any) -> Path:
     """Return the folder of compiled kernels: quadrants' own, as one finds a kernel by its source (see :func:`kernel`).
 
@@ -149,9 +151,38 @@ def _cache_folder(library: Any) -> Path:
     return folder if is_private(folder) else _folder_for_this_process()
 
 
+def mark_of(names: Sequence[str]) -> Path | None:
+    """Return the file that says that kernels have been stored for processes like this one; None if none are kept."""
+    name = _choose()
+    if _backend is not None or name == "numpy":
+        return None
+    library = _import(name)
+    folder = _cache_folder(library)
+    if any(folder.is_relative_to(each) for each in _temporary):
+        return None
+    version = ".".join(map(str, library.__version__))
+    digest = hashlib.sha256(" ".join(names).encode()).hexdigest()[:8]
+    return folder / f"stored-{name}-{version}-{workers()}-{digest}"
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock among processes, where the system has them: two that store at once would get in each other's way."""
+    with path.open("w") as file:
+        with contextlib.suppress(ImportError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+_temporary: set[Path] = set()
+
+
 def _folder_for_this_process() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="coview-kernels."))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    _temporary.add(folder)
     return folder
 
 

@@ -349,8 +349,10 @@ def work(
     """
     _set_group_nice(NICE[kind])
     from coview_kernels import warm_up
+    from coview_kernels.warm_up import compile_once
     from coview_stream.stream.node import engines
 
+    compile_once(*engines.KINDS[kind].kernels, *engines.KINDS[kind].later_kernels)
     for name in engines.KINDS[kind].kernels:
         if pipe.poll():  # the node waits for its engines, or soon a robot for its search: no more standing back
             _set_group_nice(0)

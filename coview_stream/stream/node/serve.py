@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
+
+_SLOW = 3.0  # seconds, after which a start says why it takes long
 
 
 @dataclass(frozen=True)
@@ -125,9 +128,18 @@ def open_node(
             if (guess := options.guesses.get(session.keys.robot)) is not None:
                 session.guess_place(guess)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
+        slow = begin + _SLOW
+
+        def said_and_cancelled() -> bool:
+            nonlocal slow
+            if time.monotonic() > slow:
+                slow = math.inf
+                log.info("preparing: on the first start, kernels are compiled for this machine, some seconds of work")
+            return cancelled()
+
         for name, engine in engines.items():
             if name != "search":  # the search engine may become ready later
-                engine.wait_ready(cancelled)
+                engine.wait_ready(said_and_cancelled)
         _give_up_if(cancelled)
         node.start(_services(options, node, notifier))
     except BaseException as error:
