@@ -159,17 +159,15 @@ def _live(recorded: Run, out: Path, shown: bool, web: str | None) -> RunResult:
 
 def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
     """Write trajectory, evidence and pictures; return the evaluation of what was written."""
-    import numpy as np
-
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.localization.offline import write
     from coview_stream.report.evaluation import evaluate, frame_errors
-    from coview_stream.report.plots import draw_run, plot_errors, plot_map
+    from coview_stream.report.plots import draw_run, plot_errors
+    from coview_stream.report.relief import plot_map
 
     write(located, base_map, out)
     draw_run(located, base_map, out, truth[1][:, :3, 3])
-    points = base_map.points.astype(np.float64) + base_map.origin
-    plot_map(points, base_map.stations + base_map.origin, out / "map.png")
+    plot_map(base_map, out / "map.png")
     estimate = read_tum(out / "trajectory.tum")
     errors = frame_errors(estimate, truth)
     plot_errors(errors.distance, errors.e_t, errors.e_r, out / "errors.png")

@@ -22,7 +22,7 @@ HELP = "show the contents of a base map file"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add_map(parser)
-    parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the map and its stations")
+    parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the map from above; F.tif: a GeoTIFF")
     parser.add_argument(
         "--ambiguity",
         action="store_true",
@@ -37,11 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the map's contents, parameters and hash."""
-    import numpy as np
-
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.file_format import signer
     from coview_stream.basemap.site.manifest import Manifest, site_directory
+    from coview_stream.clouds.reference_system import short_name
     from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError
 
@@ -65,16 +64,16 @@ def run(args: argparse.Namespace) -> int:
     facts["signature"] = f"by {by}, {verified}" if by else "none"
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
+    if args.plot:
+        with naming_missing_libraries("coview-stream info --plot", "plot"):
+            from coview_stream.report.relief import plot_map
+
+            plot_map(base_map, args.plot, args.map.name)
     if args.json:
         print(json.dumps({"format": 1} | facts, indent=1))
     else:
+        facts["crs"] = short_name(base_map.crs)  # not a page of WKT
         print("\n".join(f"{name:<14} {_text(value)}" for name, value in facts.items()))
-    if args.plot:
-        with naming_missing_libraries("coview-stream info --plot", "plot"):
-            from coview_stream.report.plots import plot_map
-
-        points = base_map.points.astype(np.float64) + base_map.origin
-        plot_map(points, base_map.stations + base_map.origin, args.plot, args.map.name)
     return 0
 
 

@@ -108,6 +108,13 @@ def short_name(text: str | None) -> str:
     return printable(named.group(1) if named else " ".join(text.split()))[:60]
 
 
+def epsg_of(text: str | None) -> int | None:
+    """Return the EPSG number of a system's horizontal part; None if it has none, or without pyproj."""
+    system = None if text is None else _parse(text)
+    code = None if system is None else _parts(system)[0].to_epsg()
+    return None if code is None else int(code)
+
+
 def _like_degrees(low: Floats, high: Floats) -> bool:
     return bool(np.abs([low[:2], high[:2]]).max() <= 360.0)
 

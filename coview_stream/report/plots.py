@@ -167,25 +167,6 @@ def _even_marks(legend: Any) -> None:
             handle.set_sizes([28.0])
 
 
-def plot_map(base: Reals, stations: Reals, path: str | os.PathLike[str], title: str = "Base map") -> None:
-    """Draw the base map (N, 3) in grey, shaded by height, and its stations (M, 3).
-
-    Raises:
-        InputError: the picture cannot be written.
-    """
-    with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
-        shift = draw_base_map(axes, base)
-        if len(stations):
-            at = np.asarray(stations, dtype=np.float64) - shift
-            size = float(np.clip(12_000.0 / len(at), 1.2, 12.0))
-            label = f"{len(at):,} stations".replace(",", " ")
-            axes.scatter(at[:, 0], at[:, 1], s=size, c=STATE_COLOURS["TRACKING"], linewidths=0, label=label)
-        else:
-            draw_notice(axes, "no stations")
-        axes.set_title(title)
-        legend_below(drawing, axes)
-
-
 def plot_trajectory(
     base: Reals, positions: Reals, states: Sequence[str], path: str | os.PathLike[str], truth: Reals | None = None
 ) -> None:

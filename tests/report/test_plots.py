@@ -41,18 +41,6 @@ def has_colour(picture, name):
 
 
 @pytest.mark.slow
-def test_map_plot_shows_base_map_and_stations(base, tmp_path):
-    plots.plot_map(base, base[::100], tmp_path / "map.png")
-    picture = pixels(tmp_path / "map.png")
-    assert has_colour(picture, plots.STATE_COLOURS["TRACKING"])
-    grey = np.ptp(picture[:, :, :3], axis=2) < 0.01
-    dark = grey & (np.abs(picture[:, :, 0] - 0.38) < 0.02)
-    pale = grey & (np.abs(picture[:, :, 0] - 0.93) < 0.02)
-    assert dark.sum() > 2_000  # the block
-    assert pale.sum() > 10 * dark.sum()  # the ground
-
-
-@pytest.mark.slow
 def test_trajectory_is_coloured_by_state(base, tmp_path):
     line = np.column_stack([np.linspace(-15, 15, 40), np.zeros(40), np.zeros(40)])
     states = ["SEARCHING"] * 10 + ["TRACKING"] * 30
@@ -124,7 +112,7 @@ def test_utm_coordinates_get_a_rounded_plot_offset(base):
 
 def test_unwritable_plot_names_its_file(tmp_path):
     with pytest.raises(InputError, match=r"missing/map\.png"):
-        plots.plot_map(NO_POINTS, NO_POINTS, tmp_path / "missing" / "map.png")
+        plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "missing" / "map.png")
 
 
 @pytest.mark.slow
