@@ -6,7 +6,9 @@ import argparse
 import importlib.util
 import json
 import logging
+import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,6 +82,7 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
 
 
 def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
+    from coview_stream.basemap.progress import progress_bar
     from coview_stream.config import LocalizerConfig
     from coview_stream.doctor.finding import Finding, from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory
@@ -118,7 +121,10 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
         else:
             notes = (note.removeprefix(f"{recorded.path}: ") for note in recorded.notes)
             yield from (Finding("ok", "recording", note) for note in notes)
-            yield from run_findings(recorded, base_map, LocalizerConfig(cloud_delay=args.cloud_delay or 0.0))
+            config = LocalizerConfig(cloud_delay=args.cloud_delay or 0.0)
+            drawn = sys.stderr.isatty() and importlib.util.find_spec("tqdm") is not None
+            with progress_bar("judging", unit="frame") if drawn else nullcontext() as follow:
+                yield from run_findings(recorded, base_map, config, follow)
     if connect is not None and zenoh:
         yield from _network(args, connect, keys, sha256)
 

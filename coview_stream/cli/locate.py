@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     formats = () if args.export is None else chosen_formats(args.export)
     mount = mount_of(args)
     guess = initial_guess(args.initial, args.within)
-    lidar_options = lidar_config(args.odometry, args.gravity)
+    lidar_options = lidar_config(args.odometry, args.gravity, delay=args.cloud_delay)
     config = LocalizerConfig(
         acceptance=acceptance, sensor_leans=lidar_options is None, cloud_delay=args.cloud_delay or 0.0
     )

@@ -162,6 +162,16 @@ def host_port(option: str, example: str) -> Callable[[str], str]:
 ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
 
+
+def _delay(text: str) -> float:
+    from coview_stream.config.localizer import MAX_DELAY
+
+    seconds = float(text)
+    if not abs(seconds) <= MAX_DELAY:
+        raise argparse.ArgumentTypeError(f"{text}: give seconds, from -{MAX_DELAY:g} to {MAX_DELAY:g}")
+    return seconds
+
+
 SHARED: dict[str, dict[str, Any]] = {
     "run_path": {"type": Path, "metavar": "RUN", "help": "run directory, cloud file, or rosbag2, mcap, bag"},
     "--cloud-topic": {"metavar": "TOPIC", "help": "clouds of a recording with several such topics"},
@@ -185,7 +195,7 @@ SHARED: dict[str, dict[str, Any]] = {
         "help": "pose of the lidar on the body: degrees, metres; --mount=180,0,0: upside down (of a bag: /tf_static)",
     },
     "--cloud-delay": {
-        "type": float,
+        "type": _delay,
         "metavar": "S",
         "help": "seconds that clouds are stamped later than odometry, if known; negative: odometry is late (0)",
     },
@@ -330,14 +340,18 @@ def mount_of(args: argparse.Namespace) -> Mount | None:
     return None if args.mount is None else parse_mount(args.mount)
 
 
-def lidar_config(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:
+def lidar_config(
+    odometry: str, gravity: str | None, max_speed: float = 50.0, delay: float | None = None
+) -> LidarOdometryConfig | None:
     """Return how odometry is made of the clouds; None if ``odometry`` is not kiss-icp.
 
     ``max_speed`` is the robot's, metres per second. Raises ConfigError where ``gravity`` is no direction, or comes with
-    other odometry.
+    other odometry, and where ``delay`` comes with this.
     """
     from coview_stream.config.odometry import LidarOdometryConfig, parse_gravity
 
+    if odometry == KISS_ICP and delay:
+        raise ConfigError(f"--cloud-delay goes with a clock of odometry's own: that of {KISS_ICP} is the clouds'")
     if odometry != KISS_ICP:
         if gravity is not None:
             raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")

@@ -233,7 +233,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
     table = {"max_speed": node.max_speed} | tables["lidar_odometry"]
     odometry = with_table(LidarOdometryConfig(), table, f"{args.config}: [lidar_odometry]")
-    lidar = lidar_config(args.odometry, args.gravity, node.max_speed)
+    lidar = lidar_config(args.odometry, args.gravity, node.max_speed, args.cloud_delay)
     if lidar is not None:
         gravity = odometry.gravity if args.gravity is None else lidar.gravity
         lidar = replace(odometry, gravity=gravity, max_speed=args.max_speed or odometry.max_speed)

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import EncodingError, MessageError
@@ -54,6 +55,7 @@ class CapturedMessage:
     sweep: tuple[float, float] | None = None
     T_odom_body: Pose | None = None  # (4, 4) odometry, None for clouds
     cloud: Points | None = None  # (N, 3) float32 sample of the finite points; None past the first clouds
+    doubles: bool = False  # rows of float32 that make sense as float64 alone
 
 
 @dataclass
@@ -139,6 +141,7 @@ def capture_cloud(
         points=len(distances),
         distance=float(np.median(distances)) if len(distances) else float("nan"),
         sweep=sweep,
+        doubles=captured.codec in ("xyz", "xyzi") and _are_doubles(sample.payload, message.points),
         cloud=np.array(finite[:: -(-len(finite) // _MAX_KEPT) or 1], dtype=np.float32),
     )
 
@@ -182,9 +185,23 @@ def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: 
             continue
         if isinstance(message, OdometryMessage):
             return name
-        size = np.abs(message.points)
-        # denormal numbers and integers read as float32 are next to zero, text and protobuf beyond all lidars
-        possible = np.isnan(size) | (size == 0) | ((size > 1e-6) & (size < _MAX_COORDINATE))
-        if len(size) > 0 and possible.all():
+        if len(message.points) > 0 and _plausible(message.points):
             return name
     return ""
+
+
+def _plausible(numbers: npt.NDArray[Any]) -> bool:
+    """Return whether all numbers may be coordinates, metres.
+
+    Denormal numbers and integers read as float32 are next to zero, text and protobuf beyond all lidars.
+    """
+    size = np.abs(numbers)
+    return bool((np.isnan(size) | (size == 0) | ((size > 1e-6) & (size < _MAX_COORDINATE))).all())
+
+
+def _are_doubles(payload: bytes, points: Points) -> bool:
+    """Return whether rows of float32 are of float64: as such alone they may be coordinates."""
+    if len(points) < 2 or len(payload) % 8 or _plausible(points):
+        return False
+    with np.errstate(invalid="ignore"):
+        return _plausible(np.frombuffer(payload, "<f8"))

@@ -235,15 +235,17 @@ def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, lis
     middles = np.array([np.median(frame.points, axis=0) for frame in frames], dtype=np.float64)
     at, seen = poses[:, :2, 3] @ [1.0, 1.0j], middles[:, :2] @ [1.0, 1.0j]
     turned = np.vdot(at - at.mean(), seen - seen.mean())
-    if float(np.abs(at - at.mean()).max()) < _FAR or abs(turned) < 1e-9:
+    moved = float(np.vdot(at - at.mean(), at - at.mean()).real)
+    # it moves as far as the robot; that of a scan which is repeated does not move
+    if float(np.abs(at - at.mean()).max()) < _FAR or abs(turned) < 0.5 * moved:
         return
     low = float(np.median([np.quantile(frame.points[:, 2], 0.1) for frame in frames]))
     T = pose_from(rot_z(float(np.angle(turned))), np.zeros(3))
     shift = seen.mean() - at.mean() * turned / abs(turned)
     T[:3, 3] = shift.real, shift.imag, low + _ABOVE - float(np.median(poses[:, 2, 3]))
     for reading, T_frame_odom in ((IN_ODOMETRY, np.eye(4)), (IN_MAP, T)):
-        moved = np.linalg.inv(T_frame_odom @ poses)
-        yield reading, [replace(f, points=transform(M, f.points)) for f, M in zip(frames, moved, strict=True)]
+        levelled = np.linalg.inv(T_frame_odom @ poses)
+        yield reading, [replace(f, points=transform(M, f.points)) for f, M in zip(frames, levelled, strict=True)]
 
 
 def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from coview_stream.recordings.run import Frame, Run
 
     Judge = Callable[[Frame], tuple[str, str] | None]
+    Progress = Callable[[int, int], None]
 
 _NETWORK_MEMORY = 0.04 * GB  # of the network and SciPy, in the process that searches
 _INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, the rest of a search's results
@@ -89,8 +90,10 @@ _BETWEEN = 0.21  # seconds, at most, between frames that are watched: odometry i
 _WATCHED = 1500  # frames: five minutes
 
 
-def run_findings(run: Run, base_map: BaseMap | None = None, config: LocalizerConfig | None = None) -> Iterator[Finding]:
-    """Judge a run of several frames and, with a map, whether it is localized there."""
+def run_findings(
+    run: Run, base_map: BaseMap | None = None, config: LocalizerConfig | None = None, progress: Progress | None = None
+) -> Iterator[Finding]:
+    """Judge a run of several frames and, with a map, whether it is localized there; ``progress``: of the frames."""
     config = config or LocalizerConfig()
     if run.mount is not None and not run.mount.drawn:
         config = replace(config, mount_drawn=False)
@@ -104,7 +107,7 @@ def run_findings(run: Run, base_map: BaseMap | None = None, config: LocalizerCon
     wrong = [finding.what for finding in found if finding.verdict == "FAIL"]
     sensors = []
     if len(run) > 1 and wrong in ([], ["motion"]):
-        sensors = list(sensor_findings(run, None if wrong else base_map, config))
+        sensors = list(sensor_findings(run, None if wrong else base_map, config, progress))
     lies = any(finding.verdict == "FAIL" for finding in sensors)
     yield from (finding for finding in found if not (lies and finding.what == "motion"))  # named better below
     if lies or not wrong:
@@ -191,7 +194,9 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
     return Finding("FAIL" if sure else "warn", "place", found, remedy)
 
 
-def sensor_findings(run: Run, base_map: BaseMap | None, config: LocalizerConfig) -> Iterator[Finding]:
+def sensor_findings(
+    run: Run, base_map: BaseMap | None, config: LocalizerConfig, progress: Progress | None = None
+) -> Iterator[Finding]:
     """Hold clouds, odometry and, with a map, registrations to it against each other over the run.
 
     Yields the fault of most of the frames that speak for one, and the calibration at the end, both as while tracking.
@@ -204,7 +209,9 @@ def sensor_findings(run: Run, base_map: BaseMap | None, config: LocalizerConfig)
     stride -= stride % 2 == 0  # two drivers may take turns
     indices = range(0, len(run), stride)[:_WATCHED]
     told = list[tuple[str, str]]()
-    for index in indices:
+    for done, index in enumerate(indices, start=1):
+        if progress is not None:
+            progress(done, len(indices))
         try:
             fault = judge(run.read(index))
         except (CloudError, RunError):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 
-from coview_stream.doctor.capture import Codecs, Wait, capture_robots
+from coview_stream.doctor.capture import Codecs, Wait, capture_cloud, capture_odometry, capture_robots
 from coview_stream.doctor.finding import Finding
 from coview_stream.doctor.frame_checks import frame_findings
 from coview_stream.doctor.robot_checks import (
@@ -20,6 +20,7 @@ from coview_stream.doctor.robot_checks import (
     odometry_findings,
 )
 from coview_stream.errors import ConfigError
+from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import RobotKeys, robot_keys
 from coview_stream.stream.transport.rmw import dds_type
 from coview_stream.stream.transport.transport import Transport
@@ -37,6 +38,7 @@ _KEYS = (
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
 _LISTEN = 2.0  # seconds: clouds come at 5 Hz or more
+_CLOUD = 100  # points at least
 _MAX_LISTED = 3  # candidates in one line
 _MAX_CANDIDATES = 200  # a large site has more than anyone reads
 
@@ -50,19 +52,32 @@ class Candidate:
     options: str  # options of serve and doctor that subscribe to it
 
 
-def discover(transport: Transport, wait: Callable[[float], object] = time.sleep) -> list[Candidate]:
+def discover(
+    transport: Transport, wait: Callable[[float], object] = time.sleep, robots: Iterable[str] = ()
+) -> list[Candidate]:
     """Return the clouds and odometry on the network, sorted.
 
-    Listens for two seconds to the keys of all robots (all their clouds come here meanwhile), then asks for tokens.
+    Listens for two seconds to the keys of all robots (all their clouds come here meanwhile), and to any key with the
+    name of one of ``robots``, whose messages are judged by their content; then asks for tokens.
     """
     candidates: set[Candidate] = set()
+    seen: set[str] = set()
+
+    def add_sample(sample: Sample) -> None:
+        if sample.key not in seen and len(seen) < _MAX_CANDIDATES:
+            seen.add(sample.key)
+            candidate = from_key(sample.key)
+            guessed = candidate is None or (candidate.options.startswith("--preset ros2dds") and _is_json(sample))
+            add(from_content(sample) if guessed else candidate)
 
     def add(candidate: Candidate | None) -> None:
         if candidate is not None and len(candidates) < _MAX_CANDIDATES:
             candidates.add(candidate)
 
     for key in _KEYS:
-        transport.subscribe(key, lambda sample: add(from_key(sample.key)), "newest")
+        transport.subscribe(key, add_sample, "newest")
+    for robot in robots:
+        transport.subscribe(f"**/{robot}/**", add_sample, "newest")
     wait(_LISTEN)
     for expression in _TOKENS:
         for token in transport.tokens(expression):
@@ -119,6 +134,24 @@ def from_key(key: str) -> Candidate | None:
         return _named("keelson", channel, key, parts[at + 1], "/".join(parts[:at]))
     if parts[-1] in ("points", "odom") and len(parts) > 1:
         return _ros_topic("ros2dds", "cloud" if parts[-1] == "points" else "odometry", key)
+    return None
+
+
+def _is_json(sample: Sample) -> bool:
+    return sample.payload[:1] == b"{"
+
+
+def from_content(sample: Sample) -> Candidate | None:
+    """Read a sample on a key of no preset; None if it is neither clouds nor odometry, or a node's own."""
+    if "/out/" in sample.key or "/rpc/" in sample.key:
+        return None
+    for channel, capture in (("odometry", capture_odometry), ("cloud", capture_cloud)):
+        message = capture(sample, 0.0)
+        codec = message.codec or message.readable_as
+        if codec and (channel == "odometry" or message.readable_as or message.points >= _CLOUD):
+            option = "--cloud-key" if channel == "cloud" else "--odometry-key"
+            named = "" if message.codec else f" --{channel}-encoding {codec}"
+            return Candidate(channel, sample.key, f"{option} {sample.key}{named}")
     return None
 
 
@@ -213,7 +246,7 @@ def robots_findings(
     """Listen to all robots at once and judge each; without any, or if one is silent, look for others."""
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
-    candidates = discover(transport, wait=wait) if silent or not keys else []
+    candidates = discover(transport, wait, [k.robot for k in keys]) if silent or not keys else []
     # robots of any base whose node holds a liveliness token
     tokens = transport.tokens("**/alive") if candidates else ()
     served = {token.split("/")[-2] for token in tokens if "/" in token}

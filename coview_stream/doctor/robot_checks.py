@@ -122,7 +122,10 @@ def _clouds(messages: list[CapturedMessage], capture: RobotCapture) -> Finding:
     found = f"{_described(messages)}, {points} points, half of them within {distance:.1f} m, "
     found += f"with times over {longest:.3f} s" if sweeps else "no time per point"
     verdict: Verdict = "warn"
-    if not points:
+    if doubles := sum(m.doubles for m in messages):
+        found += f"; {doubles} of {len(messages)} make sense as float64 alone"
+        verdict, remedy = "FAIL", "send float32: rows of 12 or 16 bytes, little-endian"
+    elif not points:
         verdict, remedy = "FAIL", "no finite points: does the sensor see anything?"
     elif not _MIN_DISTANCE <= distance <= _MAX_DISTANCE:
         remedy = "points have to be in metres, in the sensor's frame"

@@ -81,7 +81,7 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robot = "a"\n[node.mount]\nroll = 3\n', "mount cannot be set here: set it above"),
         ('robot = "a"\n[lidar_odometry]\nnonsense = 3\n', "unknown key 'nonsense'"),
         ("cloud_delay = 0.1\n[localizer]\ncloud_delay = 0.2\n", "cloud_delay and [localizer] cloud_delay: set one of"),
-        ('robot = "a"\ncloud_delay = 3\n', "cloud_delay is 3.0; it must be seconds, from -1 to 1"),
+        ('robot = "a"\ncloud_delay = 3\n', "cloud_delay is 3: 3: give seconds, from -1 to 1"),
         ("max_outage = 4\n[node]\nmax_outage = 3\n", "max_outage and [node] max_outage: set one of them"),
         ("risk = 1e-3\n[localizer.acceptance]\nrisk = 1e-5\n", "risk and [localizer.acceptance] risk: set one of them"),
     ],

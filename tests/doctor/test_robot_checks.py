@@ -41,6 +41,18 @@ def test_healthy_robot_is_ok():
     assert "moved 6.0 m" in findings[2].found
 
 
+def test_rows_of_float64_are_named():
+    def sent(kind):
+        payload, encoding = SWEEP.astype(kind).tobytes(), "application/octet-stream;layout=xyz"
+        stamps = [ns(0.1 * k).to_bytes(8, "little") for k in range(10)]
+        return clouds_of([Sample(KEYS.cloud, payload, encoding, stamp) for stamp in stamps])["clouds"]
+
+    assert sent("<f8").verdict == "FAIL"
+    assert "10 of 10 make sense as float64 alone" in sent("<f8").found
+    assert sent("<f8").remedy.startswith("send float32")
+    assert sent("<f4").verdict == "ok"
+
+
 def test_silent_channel_suggests_other_keys():
     found = clouds_of([], "clouds come on x: try y")
     assert found.keys() == {"clouds"}

@@ -135,6 +135,13 @@ class RobotState:
             return None
         return evidence or self._restart_reason or "too little has been seen"
 
+    def searched(self) -> str:
+        """Return why a place that was lost is not found again; empty where nothing has been searched since."""
+        fix = self._fix
+        if not self._lost or fix is None or fix.state.has_place or fix.evidence is None:
+            return ""
+        return "" if fix.evidence.reason == self._loss_reason else fix.evidence.reason
+
     @property
     def correction(self) -> OdomCorrection | None:
         """Correction of odometry that is in force; None unless TRACKING."""

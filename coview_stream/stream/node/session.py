@@ -288,8 +288,12 @@ class Session:
             state, reason = self.robot_state.state, self.robot_state.reason()
             if reason is None:
                 reason = self.inputs.waiting_for()
-            elif state in (State.SEARCHING, State.AMBIGUOUS) and (silent := self.inputs.silent(self._now)):
-                reason = f"{silent}; before: {reason}"  # the reason of a loss names the missing input itself
+            elif not state.has_place:
+                now = self.inputs.silent(self._now) or self.robot_state.searched()
+                if now and now.partition(" for ")[0] == reason.partition(" for ")[0]:
+                    reason = now  # of the same input, which is silent since
+                elif now:
+                    reason = f"{now}; before: {reason}"
             return state, reason
 
     def last_place(self) -> LastPlace | None:
@@ -303,4 +307,5 @@ class Session:
 
     def _record_state(self) -> None:
         """Add the state to the history, wherever it may have changed."""
-        self.history.add(*self.state(), self.robot_state.last_frame_ns, self.robot_state.evidence)
+        reason = self.robot_state.reason() or self.inputs.waiting_for()
+        self.history.add(self.robot_state.state, reason, self.robot_state.last_frame_ns, self.robot_state.evidence)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking
+from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
@@ -168,7 +168,7 @@ def test_dead_reckoning_ends_after_timeout():
         robot.moved(0.05 * k)
         robot.session.tick(robot.now)
     assert robot.session.pose() is None
-    assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
+    assert robot.session.state() == (State.LOST, "no clouds for 2 s; before: no usable frame for 2 s")
     assert robot.job_for(2.19).require_verification
 
 
@@ -217,6 +217,22 @@ def test_restarted_sender_clock_may_publish_older_stamps():
     robot.saw(1.42, now=1102.0)
     robot.answered(tracking, 1102.0)
     assert robot.session.pose().stamp_ns == ns(1.45)
+
+
+def test_reason_of_a_lost_robot_is_the_newest_and_the_loss_stays_in_the_history():
+    robot = Robot().localized(100.0)
+    for k in range(30):
+        robot.moved(0.05 * k, now=1100.1 + 0.05 * k)
+        robot.session.tick(robot.now)
+    robot.saw(1.42, now=1102.0)
+    robot.answered(lambda job: unknown(job, reason="no place stands out"), 1102.0)
+    loss = "the sender's clock started anew"
+    assert robot.session.state() == (State.LOST, f"no place stands out; before: {loss}")
+    robot.session.tick(1142.0)
+    silent, _, before = reason(robot).partition("; before: ")
+    assert silent.startswith("no clouds for 40 s and no odometry for 4")
+    assert before == loss
+    assert [change["reason"] for change in robot.session.history.to_json()][-1] == loss
 
 
 def test_one_stamp_never_gets_two_poses():

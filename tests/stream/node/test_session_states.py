@@ -196,7 +196,7 @@ def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(an
     for k in range(17, 80):
         robot.moved(0.05 * k, x=0.3)
         robot.session.tick(robot.now)
-    assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
+    assert robot.session.state() == (State.LOST, "no clouds for 4 s; before: no usable frame for 2 s")
     assert robot.counters.losses == 1
     job = robot.job_for(3.9, now=robot.now)
     assert job.stamp_ns == ns(3.9)
