@@ -32,6 +32,7 @@ RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its
 _PORTION = 512  # stations at a time: 7 MB of bins
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
+_MAX_STOREYS = 1024  # a kilometre from the lowest indoor station to the highest
 _MAX_LEVELS = 128  # stations above one another: no building has more floors
 LEVEL_GAP = 2.5
 """Metres: stations farther apart in height are on different storeys."""
@@ -178,6 +179,9 @@ def describe_storeys(
         config: of the descriptors.
         progress: called with stations done and all stations.
         wanted: (K,) numbers of the stations to describe, in the order of the result; None takes all.
+
+    Raises:
+        MapError: they stand on more than 1,024 storeys.
     """
     indoors = below_another(stations, block)
     if wanted is not None:
@@ -189,7 +193,10 @@ def describe_storeys(
     shape = (len(stations), config.rings, config.sectors)
     described: Described = {name: np.zeros(shape, dtype=np.float16) for name in config.channels}
     done = 0
-    for floor in np.unique(storey):
+    floors = np.unique(storey)
+    if len(floors) > _MAX_STOREYS:  # each has a raster of its own
+        raise MapError(f"the map's stations stand on {len(floors)} storeys, {_MAX_STOREYS} at most; build it again")
+    for floor in floors:
         chosen = np.flatnonzero(storey == floor)
         part = points
         if np.isfinite(floor):

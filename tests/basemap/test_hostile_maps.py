@@ -120,6 +120,15 @@ def test_stations_of_storeys_without_points_are_described_as_empty(small: Any, t
     assert np.isfinite(BaseMap.load(tmp_path / "a.coview").descriptors("coview")).all()
 
 
+def test_stations_on_a_thousand_storeys_are_refused(small: Any, tmp_path: Path) -> None:
+    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
+    places = np.repeat(arrays["stations"][:20], 100, axis=0)
+    places[:, 2] = 3.0 * np.arange(len(places))
+    file_format.save(tmp_path / "a.coview", arrays | {"stations": places}, small[1])
+    with pytest.raises(MapError, match="storeys, 1024 at most"):
+        BaseMap.load(tmp_path / "a.coview").descriptors("coview")
+
+
 def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path) -> None:
     arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
     arrays["stations"] = np.repeat(arrays["stations"][:1], 200, axis=0)

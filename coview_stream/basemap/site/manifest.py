@@ -40,6 +40,7 @@ MAX_LAYER = 1 << 28  # bytes
 _MAX_HEAD = 1 << 21  # bytes of all but the tiles: 18,000 sources
 _MAX_TAIL = 64  # bytes behind the tiles: the version
 _MAX_ENTRY = 2048  # bytes of a tile, which has 450
+_MOST_PACKED = 4  # points in a byte of a cloud: ten times as many as positions that are measured can be packed to
 _MAX_OVERHEAD = 1 << 17  # bytes of a layer besides its arrays
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
@@ -213,6 +214,8 @@ class Manifest:
                     limit = most_bytes(kind, entry.points, entry.stations, tile, grid.config.voxel)
                     if layer.bytes > limit + limit // 8 + _MAX_OVERHEAD:
                         raise ValueError(f"a layer has {layer.bytes} bytes, and unpacks to {limit} at most")
+                if entry.points > _MOST_PACKED * entry.layers["cloud"].bytes:
+                    raise ValueError(f"a tile's {entry.points} points are in {entry.layers['cloud'].bytes} bytes")
             signed = signer.decode(), signature.decode()
             manifest = cls(origin, tile, crs, parameters, tuple(tiles), *signed, int(data["version"]))
             _ = manifest.sha256  # can be written again

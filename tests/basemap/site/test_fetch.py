@@ -159,7 +159,7 @@ def test_state_that_no_map_can_be_made_of_does_not_replace_the_one_that_was_open
     stations = len(BaseMap.load(mirror.open()))
     good = Manifest.load(place)
     store, tile = TileStore(place), good.tiles[0]
-    for content in (b"no layer", b"nor this one", b"nor that one"):  # older states are pruned
+    for content in (b"no layer" * 999, b"nor this one" * 999, b"nor that one" * 999):  # older states are pruned
         layer = LayerEntry(store.put(content), len(content))
         bad = replace(good, tiles=(replace(tile, layers=tile.layers | {"cloud": layer}), *good.tiles[1:]))
         bad.save(place)
