@@ -37,7 +37,7 @@ from coview_stream.sim import SimulationConfig
 
 TRACKED_MB, SEARCHED_MB = 350.0, 500.0  # targets, on up to 1 km2
 SIDES = {"0.05": 0, "1": 2, "4": 4}  # towns of 500 m along each edge by km2; 0: one of 220 m
-_IDLE, _SEARCHES, _TRACKS, _EVERY, _PATIENCE = 5.0, 25.0, 20.0, 0.25, 120.0  # seconds
+_IDLE, _SEARCHES, _TRACKS, _EVERY, _PATIENCE = 10.0, 25.0, 20.0, 0.25, 120.0  # seconds
 _SMALL = SimulationConfig("town", seed=9101, size=220.0, length=60.0, density=8.0)
 _LARGE = SimulationConfig("town", seed=9103, size=500.0, length=40.0, density=8.0)
 _STRANGER = SimulationConfig("town", seed=9102, size=220.0, length=60.0, density=8.0)
@@ -167,6 +167,8 @@ def measured(site: Path, home: Path, stranger: Path, log: Path) -> dict[str, Mem
     try:
         if not wait_until(lambda: bool(observed.state()), _PATIENCE):
             raise TimeoutError(f"the node is not ready: {log}")
+        # on the first start a process compiles the kernels
+        wait_until(lambda: all(part != "other" for part, _ in observed.node.family()), _PATIENCE)
         out = {"idle": observed.watch(_IDLE)[-1]}
         sender = observed.drive(stranger)
         out["searching"] = max(observed.watch(_SEARCHES), key=total)
