@@ -45,8 +45,6 @@ _STRANGER = SimulationConfig("town", seed=9102, size=220.0, length=60.0, density
 CONTENTS = {
     "map": r"\.coview\b",
     "kernels": r"quadrants|taichi|qdcache|ticache",
-    "onnxruntime": r"onnxruntime",
-    "gtsam": r"gtsam",
     "zenoh": r"zenoh",
     "NumPy, SciPy": r"numpy|scipy",
     "packages": r"-packages",
@@ -197,7 +195,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             most = {"tracking": TRACKED_MB, "searching": SEARCHED_MB}.get(doing)
             judged = most is not None and float(km2) <= 1.0
             row = bounded(name, megabytes, "MB", most or 0.0) if judged else informs(name, megabytes, "MB")
-            row.details.update(km2=km2, doing=doing, parts=sample)
+            row.details.update(km2=km2, doing=doing, parts={part: dict(counts) for part, counts in sample.items()})
             yield row
 
 
