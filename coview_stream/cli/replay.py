@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 
 from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_of
 
@@ -26,7 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--encoding", metavar="NAME", help="xyz, xyzi, foxglove or cdr (the preset's)")
     parser.add_argument("--odometry-encoding", metavar="NAME", help="json or cdr (the preset's)")
     parser.add_argument(
-        "--odometry-rate", type=float, metavar="HZ", help="odometry per second, interpolated (one per frame)"
+        "--odometry-rate",
+        type=float,
+        metavar="HZ",
+        help="odometry per second, interpolated (one per frame, more if those are rarer than 0.4 s)",
     )
     parser.add_argument(
         "--odometry",
@@ -48,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.errors import ConfigError
     from coview_stream.recordings.lidar_runs import open_bare_run
     from coview_stream.recordings.open_run import open_run
-    from coview_stream.stream.client.replay import ReplayConfig, odometry_spacing, replay
+    from coview_stream.stream.client.replay import ReplayConfig, enough_odometry, odometry_spacing, replay
     from coview_stream.stream.client.sender import Sender
     from coview_stream.stream.transport.keys import robot_keys
     from coview_stream.stream.transport.zenoh_transport import open_client
@@ -76,10 +80,13 @@ def run(args: argparse.Namespace) -> int:
     try:
         sender = Sender(transport, keys, args.encoding, args.odometry_encoding)
         if not bare and (spacing := odometry_spacing(recorded, config)) > _MAX_SPACING:
-            print(
-                f"one odometry sample in {spacing:.2f} s is too few for a node's defaults; see --odometry-rate",
-                file=sys.stderr,
-            )
+            rate = enough_odometry(recorded, config)
+            said = f"one odometry sample in {spacing:.2f} s is too few for a node's defaults"
+            if args.odometry_rate is None:
+                config = replace(config, odometry_rate=rate)
+                print(f"{said}: {rate:g} a second are sent, interpolated", file=sys.stderr)
+            else:
+                print(f"{said}; use --odometry-rate {rate:g}", file=sys.stderr)
         with stop_on_signals() as stop:
             heard = transport.await_subscriber(sender.cloud_key, args.wait, stop.wait)
             if not heard and not stop.requested:

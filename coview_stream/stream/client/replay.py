@@ -19,6 +19,7 @@ from coview_stream.messages.types import Encoded
 from coview_stream.recordings.run import Run
 from coview_stream.stream.client.sender import Sender, nanoseconds
 
+_USUAL_RATE = 20.0  # Hz, of odometry
 _SINGLE_FRAME_PERIOD = 0.1  # seconds between repetitions of a run of one frame
 
 
@@ -103,6 +104,12 @@ def odometry_spacing(run: Run, config: ReplayConfig) -> float:
     real = _period(dues, 0.0)
     parts = max(1, round(real * (config.odometry_rate or 0.0)))
     return max(real, _period(run.stamps, 0.0)) / parts
+
+
+def enough_odometry(run: Run, config: ReplayConfig) -> float:
+    """Return odometry samples per second that are 0.05 s apart, of sensor time or of real time, the longer of both."""
+    parts = max(1, round(_USUAL_RATE * odometry_spacing(run, replace(config, odometry_rate=None))))
+    return parts / max(_period(frame_times(run, config), 1.0), 1e-3)
 
 
 def _period(times: Floats, single: float) -> float:

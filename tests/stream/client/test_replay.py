@@ -17,7 +17,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z, yaw_of
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
-from coview_stream.stream.client.replay import ReplayConfig, odometry_spacing, replay
+from coview_stream.stream.client.replay import ReplayConfig, enough_odometry, odometry_spacing, replay
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -225,6 +225,9 @@ def test_odometry_spacing(run, run_folder):
     assert odometry_spacing(run, ReplayConfig(odometry_rate=50.0)) == pytest.approx(0.02)
     assert odometry_spacing(run, ReplayConfig(speed=0.1)) == pytest.approx(1.0)
     assert odometry_spacing(run, ReplayConfig(rate=100.0)) == pytest.approx(0.1)  # the stamps stay what they are
+    for sparse in (ReplayConfig(speed=0.1), ReplayConfig(rate=100.0)):  # 1 s of real time, 0.1 s of sensor time
+        enough = ReplayConfig(sparse.rate, sparse.speed, enough_odometry(run, sparse))
+        assert odometry_spacing(run, enough) == pytest.approx(0.05)
     assert odometry_spacing(open_run(run_folder / "frames" / "000000.ply"), ReplayConfig()) == 0.0
 
 
