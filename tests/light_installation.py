@@ -21,6 +21,8 @@ import sys
 from importlib.machinery import PathFinder
 
 class Finder:
+    find_distributions = PathFinder.find_distributions
+
     @staticmethod
     def find_spec(name, path=None, target=None):
         return None if name.partition(".")[0] in BLOCKED else PathFinder.find_spec(name, path, target)
