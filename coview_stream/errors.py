@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,12 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
             raise DependencyError(_not_installed(library, purpose, EXTRA_OF[library])) from error
         missing = "is not installed" if absent else f"cannot be loaded ({error})"
         raise DependencyError(f"{purpose}: {_spelt(library)} {missing}; pip install '{requirement}'") from error
+
+
+def require_installed(module: str, purpose: str) -> None:
+    """Raise DependencyError if a module that an extra brings is not there; it is not imported."""
+    if find_spec(module) is None:
+        raise DependencyError(_not_installed(module, purpose, EXTRA_OF[module]))
 
 
 @contextmanager

@@ -112,7 +112,6 @@ def check_client() -> None:
             lacks("messages", lambda robot=robot: robot.send_cloud(cloud, 1.0))
     import coview_stream
 
-    lacks("node", lambda: coview_stream.Localizer)
     lacks("build", lambda: coview_stream.BaseMap.build("cloud.npy"))
 
 

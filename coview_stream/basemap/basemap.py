@@ -116,7 +116,8 @@ class BaseMap:
         if not isinstance(config, MapConfig | None):
             raise ConfigError(f"config is a {type(config).__name__}; give a MapConfig, or its fields as options")
         settings = config or map_preset(preset, **options)
-        arrays, parameters = build_arrays(sources_of(sources, crs), settings, progress)
+        with naming_missing_libraries("building a map", "build"):
+            arrays, parameters = build_arrays(sources_of(sources, crs), settings, progress)
         parameters["config"] = asdict(settings)
         # as :meth:`load` will read it: a tuple becomes a list
         return cls(arrays, json.loads(json.dumps(parameters)))

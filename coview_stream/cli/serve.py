@@ -37,7 +37,7 @@ from coview_stream.cli.options import (
 )
 from coview_stream.cli.view import add_view
 from coview_stream.config.node import METRICS_ADDRESS, NodeConfig
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, require_installed
 
 if TYPE_CHECKING:
     from coview_stream.cli.process import Stop
@@ -144,6 +144,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.node.engine_process import start_children
     from coview_stream.stream.node.heap import bound_heaps
 
+    require_installed("scipy", "coview-stream serve")  # before the messages' libraries, which are only a part of [node]
     bound_heaps(2, map_large=True)
     tables = settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
