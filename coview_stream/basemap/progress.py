@@ -42,7 +42,7 @@ def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[st
     """
     from tqdm import tqdm
 
-    form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left"
+    form = "{desc}{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left"
     with tqdm(total=sum(shares.values()), disable=not show, leave=False, bar_format=form) as bar:
 
         def begin(stage: str) -> Progress:

@@ -57,7 +57,7 @@ class SavedState:
             file.write(json.dumps(document, indent=1).encode())
 
     def load_state(self: _Localizer, path: str | os.PathLike[str]) -> bool:
-        """Begin with what :meth:`save_state` wrote; call it before the first frame. False if there is no file.
+        """Begin with the file of :meth:`save_state`; call it before the first frame. False if there is no file.
 
         The pose is a hint, which the search judges like any other place (:meth:`Localizer.hint_pose`): the robot may
         have been carried. InputError if the file is damaged, of another version, or something else.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import coview_kernels as ck
-from coview_kernels import distinct, launch, reference, runtime
+from coview_kernels import launch, reference
 
 
 @pytest.mark.parametrize(("size", "count"), [(1, 5), (300, 40), (300, 1000), (2000, 256)])
@@ -34,18 +34,23 @@ def test_kernel_agrees_with_numpy():
         np.testing.assert_array_equal(ck.distinct_poses(poses[:, :3], n, 50, 3.0, 0.5), expected)
 
 
-def test_launch_is_prepared_with_this_library_and_equals_a_public_call(monkeypatch):
-    if runtime.backend() == "numpy":
-        pytest.skip("no kernels here")
+@pytest.mark.skipif(ck.backend() == "numpy", reason="no kernels here")
+@pytest.mark.parametrize("known", [True, False])
+def test_launch_is_prepared_with_this_library_and_equals_a_public_call(known, monkeypatch):
+    if not known:
+        monkeypatch.setitem(launch.TESTED_VERSIONS, ck.backend(), ())
     rng = np.random.default_rng(3)
-    arguments = rng.integers(-9, 9, (80, 3)), rng.normal(size=80), 20, 3.0, 0.5
-    prepared = [ck.distinct_poses(*arguments) for _ in range(2)][1]
-    assert distinct._launch.ready(), "add this version to launch.TESTED_VERSIONS once its launch context is tried"
-    monkeypatch.setattr(launch, "tested", lambda library: False)
-    monkeypatch.setattr(distinct, "_launch", launch.Launch(*distinct._launch._name, *distinct._launch._arguments))
-    monkeypatch.setattr(launch, "_compiled", {})
-    np.testing.assert_array_equal(ck.distinct_poses(*arguments), prepared)
-    assert not distinct._launch.ready()
+    poses = np.column_stack([rng.integers(-9, 9, (80, 3)), np.cos(yaw := rng.normal(size=80)), np.sin(yaw)])
+    poses = (poses - [*poses[0, :3], 0, 0]).astype(np.float32)
+    kept, chosen, number = np.zeros(100, np.float32), np.zeros(20, np.int32), np.zeros(1, np.int32)
+    settings = len(poses), 20, 9.0, float(np.cos(0.5))
+    run = launch.Launch("distinct", "distinct", poses.reshape(-1), kept, chosen, number, *settings)
+    ck.shutdown()  # the next program has compiled nothing
+    for _ in range(2):
+        ck.submit(run)
+        expected = reference.distinct_poses(poses, 20, 9.0, settings[3])
+        np.testing.assert_array_equal(chosen[: number[0]], expected)
+    assert run.ready() == known, "add this version to launch.TESTED_VERSIONS once its launch context is tried"
 
 
 def test_headings_are_compared_around_the_circle():

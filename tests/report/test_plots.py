@@ -16,6 +16,14 @@ from coview_stream.report.plots import draw_run
 NO_POINTS = np.zeros((0, 3))
 
 
+@pytest.fixture
+def said(monkeypatch):
+    """Notices drawn in place of a plot."""
+    notices = []
+    monkeypatch.setattr(plots, "draw_notice", lambda axes, text: notices.append(text))
+    return notices
+
+
 @pytest.fixture(scope="module")
 def base():
     """A flat square with one block on it, three points a square metre."""
@@ -51,9 +59,7 @@ def test_trajectory_is_coloured_by_state(base, tmp_path):
     assert not has_colour(picture, plots.STATE_COLOURS["LOST"])
 
 
-def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, monkeypatch):
-    said = []
-    monkeypatch.setattr(plots, "draw_notice", lambda axes, text: said.append(text))
+def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, said):
     plots.plot_trajectory(base, np.full((3, 3), np.nan), ["SEARCHING"] * 3, tmp_path / "none.png")
     plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "empty.png")
     assert [text.split(":")[0] for text in said] == ["not localized", "not localized"]
@@ -78,9 +84,7 @@ def test_false_poses_are_highlighted(tmp_path):
     assert has_colour(pixels(tmp_path / "false.png"), plots.STATE_COLOURS["LOST"])
 
 
-def test_error_plot_without_errors_shows_a_note(tmp_path, monkeypatch):
-    said = []
-    monkeypatch.setattr(plots, "draw_notice", lambda axes, text: said.append(text))
+def test_error_plot_without_errors_shows_a_note(tmp_path, said):
     plots.plot_errors(np.zeros(0), np.zeros(0), np.zeros(0), tmp_path / "none.png")
     assert said == ["no pose to compare"] * 2
     pixels(tmp_path / "none.png")

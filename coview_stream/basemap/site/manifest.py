@@ -2,7 +2,7 @@
 
 The manifest is a JSON file, ``manifest.json``. Its hash identifies the state of the whole site; a signature (ed25519)
 covers every byte of the layers. Readers verify it before they read anything, then check all numbers and names, tile by
-tile: another thread never waits longer than for one tile, and what is refused has needed no memory.
+tile: another thread never waits longer than for one tile, and a refused manifest has taken no memory.
 """
 
 from __future__ import annotations

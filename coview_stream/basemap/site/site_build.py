@@ -60,7 +60,7 @@ class SiteBuilt:
     high: Floats
 
     def summary(self) -> MapSummary:
-        """Return what the manifest tells of the map, without a look at its points."""
+        """Summarise the map from its manifest, without a look at its points."""
         site = self.manifest
         area = max(1, sum(tile.area for tile in site.tiles))
         density = sum(tile.points for tile in site.tiles) / area

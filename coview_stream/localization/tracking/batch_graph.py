@@ -134,7 +134,7 @@ class _Eliminated(NamedTuple):
 
 
 class _Structure:
-    """What of a graph depends on no pose: its constraints as arrays, and the order of elimination."""
+    """The part of a graph that depends on no pose: its constraints as arrays, and the order of elimination."""
 
     def __init__(self, count: int, constraints: Sequence[Constraint]) -> None:
         self.source = np.array([c.source for c in constraints], dtype=np.int64)  # (M,)

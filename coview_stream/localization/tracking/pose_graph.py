@@ -87,7 +87,7 @@ class _Step(NamedTuple):
 
 @dataclass
 class _Keyframe:
-    """One pose of the chain; what the filter makes of it is as of its last run."""
+    """One pose of the chain; its filtered estimate is as of the last run."""
 
     T: Pose  # (4, 4) T_map_body, where it is linearised
     between: _Gaussian  # this body in the frame of the previous one, or of the map for the first

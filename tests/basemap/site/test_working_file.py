@@ -25,13 +25,21 @@ def taken(caplog):
     return lambda: [record.args[1] for record in caplog.records if "tiles are copied" in record.msg]
 
 
+@pytest.fixture
+def learned_from(monkeypatch):
+    """Return a function that sets the least number of stations from which codes are learned."""
+    return lambda count: monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", count)
+
+
 def keys_of(site):
     return [(tile.column, tile.row) for tile in Manifest.load(site).tiles]
 
 
 @pytest.mark.slow
-def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, taken, monkeypatch, tmp_path):
-    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
+def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(
+    site, cache, taken, learned_from, monkeypatch, tmp_path
+):
+    learned_from(1)
     some = set(keys_of(site)[1:3])
     part = file_format.open_file(working_file(site, keys=some)).arrays
     whole = file_format.open_file(working_file(site)).arrays
@@ -51,8 +59,8 @@ def test_tiles_that_are_the_same_are_taken_and_the_map_is_the_same(site, cache, 
 
 
 @pytest.mark.slow
-def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, monkeypatch):
-    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 10**6)
+def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, learned_from):
+    learned_from(10**6)
     some = set(keys_of(site)[:2])
     part = file_format.open_file(working_file(site, keys=some)).arrays
     whole = file_format.open_file(working_file(site)).arrays
@@ -61,8 +69,8 @@ def test_codes_learned_from_too_few_stations_are_made_anew(site, cache, taken, m
 
 
 @pytest.mark.slow
-def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken, monkeypatch):
-    monkeypatch.setattr("coview_kernels.StationCodes.LEARNED", 1)
+def test_codes_in_an_earlier_files_terms_find_the_same_stations(site, cache, taken, learned_from):
+    learned_from(1)
     working_file(site, keys=set(keys_of(site)[:1]))
     base_map = BaseMap.load(site)
     assert taken() == [1]

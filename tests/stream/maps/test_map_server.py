@@ -215,11 +215,14 @@ def test_follower_survives_any_error_of_a_source_and_of_the_node(site, error):
 def test_source_that_goes_to_and_fro_is_asked_more_seldom(monkeypatch):
     now, taken = [0.0], []
     monkeypatch.setattr(map_follower, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    mirror = SimpleNamespace(source=SimpleNamespace(name="yard"), offline="", refresh=lambda: True, map_path=None)
-    follower = MapFollower([mirror], lambda: taken.append(now[0]), period=10.0)
-    for second in range(3600):
-        now[0] = float(second)
-        follower._turn()
+    source = SimpleNamespace(name="yard", close=lambda: None)
+    mirror = SimpleNamespace(source=source, offline="", refresh=lambda: True, map_path=None)
+
+    def wait(seconds):
+        now[0] += seconds
+        return now[0] > 3600.0
+
+    MapFollower([mirror], lambda: taken.append(now[0]), period=10.0).run(SimpleNamespace(wait=wait))
     assert taken[:5] == [10.0, 30.0, 70.0, 150.0, 310.0]
     assert len(taken) < 20
 

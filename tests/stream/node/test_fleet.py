@@ -72,7 +72,8 @@ class Member(Site):
     def __init__(self, net, name, robots):
         super().__init__(*robots, net=net, shared=True)
         self.node.declare()
-        self.fleet = Fleet(PREFIX, name, self.node.endpoints, net)
+        self.ready = True
+        self.fleet = Fleet(PREFIX, name, self.node.endpoints, net, ready=lambda: self.ready)
 
     @staticmethod
     def look(*nodes):
@@ -147,7 +148,7 @@ def test_node_without_engines_gives_its_robots_up_while_there_are_others():
     before = a.serves
     assert before
     assert b.serves == set(robots) - before
-    a.fleet._ready = lambda: False
+    a.ready = False
 
     def looks(number):
         for k in range(number):
@@ -164,7 +165,7 @@ def test_node_without_engines_gives_its_robots_up_while_there_are_others():
     looks(5)
     assert a.serves == set(robots)  # nobody else would
     net.announce(f"{PREFIX}/nodes/b")
-    a.fleet._ready = lambda: True
+    a.ready = True
     looks(20)
     assert a.serves == before
 
