@@ -227,7 +227,7 @@ _GUESSED = (
 
 
 def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, list[SeenFrame]]]:
-    """Yield findings about clouds that stay in place while the robot moves, and their frames moved to the body.
+    """Yield each fixed frame that the clouds may be in instead of the lidar's, and the clouds moved to the body.
 
     The middle of the points moves with the robot, which tells about where a map's frame has its origin and x axis.
     """

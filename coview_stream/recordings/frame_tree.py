@@ -54,7 +54,7 @@ class FrameTree:
     """Tree of a recording's frames.
 
     Attributes:
-        lidar: frame of the clouds, once it is known; only the moving frames above it are kept.
+        lidar: frame of the clouds, once it is known; only the moving transforms above it are kept.
     """
 
     def __init__(self) -> None:

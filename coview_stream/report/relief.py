@@ -47,7 +47,7 @@ class Relief:
 
 
 def relief(base_map: BaseMap) -> Relief:
-    """Shade a map's highest points by the sun, and colour objects on the ground: roofs are smooth and planar, crowns are not."""
+    """Shade a map's highest points by the sun, and colour roofs, which are smooth and planar, apart from crowns."""
     every = max(1, -(-len(base_map.points) // _MAX_POINTS))
     points = np.array(base_map.points[::every])
     planarity = np.linalg.norm(base_map.arrays["normals"][::every].astype(np.float32), axis=1) / np.float32(127.0)
