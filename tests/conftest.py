@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from contextlib import contextmanager
 
 import numpy as np
@@ -15,6 +16,9 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.localization.localizer import Localizer
 
 RADIUS = 30.0
+
+# where tests run in the background of a shell it is ignored, and the processes that they start would inherit that
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
