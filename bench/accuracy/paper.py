@@ -69,7 +69,7 @@ class LocalScan:
         return cls(thin, on_ground(thin, position), index)
 
 
-def local_scans(run: Run, sigma_d: float = BLOCK, voxel: float = DescriptorConfig().voxel) -> Iterator[LocalScan]:
+def local_scans(run: Run, sigma_d: float = BLOCK) -> Iterator[LocalScan]:
     """VLS of every ``sigma_d`` metres of odometry, of the frames since the last; the first frame makes one, too.
 
     Coordinates are relative to the first frame's position.
@@ -85,7 +85,7 @@ def local_scans(run: Run, sigma_d: float = BLOCK, voxel: float = DescriptorConfi
         pending.append(kernels.transform_unique(frame.points, T, _FRAME_VOXEL, _NEAR)[0])
         if last is None or np.linalg.norm(T[:3, 3] - last) >= sigma_d:
             last = T[:3, 3]
-            yield LocalScan.of(np.concatenate(pending), last, voxel, frame.index)
+            yield LocalScan.of(np.concatenate(pending), last, DescriptorConfig().voxel, frame.index)
             pending = []
 
 
@@ -151,9 +151,9 @@ class Reference:
         return trimmed_icp(source, target.astype(np.float64), T, overlap)
 
 
-def consistent(points: Floats, target: Points, cell: float = BLOCK) -> Bools:
-    """Mask points (N, 3) within a metre of the height of some target point (M, 3) in their ``cell``-sized square."""
-    size = np.array([cell, cell, _LEVEL])
+def consistent(points: Floats, target: Points) -> Bools:
+    """Mask points (N, 3) within a metre of the height of some target point (M, 3) in their square of a block."""
+    size = np.array([BLOCK, BLOCK, _LEVEL])
     low = np.floor(target.min(axis=0) / size).astype(np.int64) - 2
     shape = np.floor(target.max(axis=0) / size).astype(np.int64) - low + 3
     taken = np.zeros(shape, dtype=bool)

@@ -68,12 +68,12 @@ def _host() -> str:
 
 
 @contextmanager
-def atomic_file(path: Path, *, sync: bool = False, temporary: Path | None = None) -> Iterator[BinaryIO]:
+def atomic_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a binary stream that becomes ``path`` at the end of the block (:func:`atomic_path`); OSError if it cannot.
 
     With ``sync`` it is flushed to disk before renaming; otherwise a power cut may leave an empty file.
     """
-    with atomic_path(path, temporary) as part, part.open("wb") as stream:
+    with atomic_path(path) as part, part.open("wb") as stream:
         yield stream
         if sync:
             stream.flush()

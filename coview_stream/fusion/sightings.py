@@ -86,13 +86,13 @@ def _pixels(rays: Points) -> tuple[Ints, Floats32, Bools]:
     return row * _COLUMNS + column, far, (far > 0.3) & (np.abs(up) < _STEEPEST)
 
 
-def looks_at(stamps: Floats, positions: Floats, metres: float = 0.5, seconds: float = 1.0) -> Bools:
-    """Choose frames (K,) to look from: ``metres`` or ``seconds`` after the previous chosen frame."""
+def looks_at(stamps: Floats, positions: Floats) -> Bools:
+    """Choose frames (K,) to look from: half a metre or a second after the previous chosen frame."""
     chosen = np.zeros(len(stamps), dtype=bool)
     last = -1
     for k in range(len(stamps)):
-        far = last < 0 or float(np.linalg.norm(positions[k] - positions[last])) >= metres
-        if far or stamps[k] - stamps[last] >= seconds:
+        far = last < 0 or float(np.linalg.norm(positions[k] - positions[last])) >= 0.5
+        if far or stamps[k] - stamps[last] >= 1.0:
             chosen[k], last = True, k
     return chosen
 

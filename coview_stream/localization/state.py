@@ -68,10 +68,3 @@ by :class:`coview_stream.stream.node.robot_state.RobotState`.
 def next_state(state: State, event: Event) -> State:
     """Return the state that an event leads to."""
     return TRANSITIONS.get((state, event), state)
-
-
-def transition_table() -> str:
-    """Return :data:`TRANSITIONS` as the Markdown table of docs/tracking.md."""
-    rows = ["| state | event | next state |", "|---|---|---|"]
-    rows += [f"| {state} | {event.value} | {after} |" for (state, event), after in TRANSITIONS.items()]
-    return "\n".join(rows)

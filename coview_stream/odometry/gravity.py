@@ -102,12 +102,12 @@ def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str
     return Ground(up, float(height), share, int(inside.sum()))
 
 
-def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
-    """Correct ``up`` (3,), with ``sigma`` radians, by the walls in a cloud (N, 3), metres; and count their patches.
+def gravity_from_walls(points: Reals, up: Floats) -> tuple[Floats, int]:
+    """Correct ``up`` (3,), which ground gave, by the walls in a cloud (N, 3), metres; and count their patches.
 
     Directions that the walls leave open stay.
     """
-    better, _, count = wall_evidence(points, up, sigma)
+    better, _, count = wall_evidence(points, up, SLOPE)
     return better, count
 
 
