@@ -157,6 +157,8 @@ def install_command(extra: str) -> str:
         return f"pip install '{Path(__file__).resolve().parents[1]}[{extra}]'"
     source = loads(own.read_text("direct_url.json") or "{}")
     address = str(source.get("url", ""))
+    if "vcs_info" in source:
+        address = f"{source['vcs_info'].get('vcs')}+{address}@{source['vcs_info'].get('commit_id')}"
     if address.startswith("file://"):
         editable = "-e " if source.get("dir_info", {}).get("editable") else ""
         return f"pip install {editable}'{unquote(address.removeprefix('file://'))}[{extra}]'"

@@ -58,8 +58,8 @@ def interruptible(whole_process: bool) -> Iterator[Interrupt]:
     With ``whole_process`` this is the command's process: after the block nothing is left that SIGINT should not end.
     """
     interrupt = Interrupt()
-    on_main = threading.current_thread() is threading.main_thread()
-    if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    possible = hasattr(signal, "SIGALRM") and threading.current_thread() is threading.main_thread()
+    if not possible or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield interrupt
         return
     if whole_process:

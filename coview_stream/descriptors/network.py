@@ -96,6 +96,10 @@ class Network:
         layers = self._layers["stem"].weight.shape[2] // 4
         if layers != LAYERS:
             raise InputError(f"{path}: weights of another version ({layers} layers); {_REMEDY}")
+        try:
+            self._encode(np.zeros((LAYERS, _MULTIPLE, _MULTIPLE), dtype=np.uint8), map)
+        except ValueError as error:
+            raise InputError(f"{path}: its layers do not fit each other ({error}); {_REMEDY}") from error
 
     def __call__(self, image: Image) -> Features:
         """Encode an image (LAYERS, H, W); ValueError unless H and W are multiples of 8 cells, i.e. 4 m."""
@@ -165,6 +169,8 @@ class _Layer:
     ) -> Floats32:
         """Convolve with 3 x 3 cells, add ``add`` (bordered) and rectify; bordered images in and out."""
         channels, outputs = self.weight.shape[2:]
+        if x.shape[2] != channels:
+            raise ValueError(f"an image of {x.shape[2]} channels, weights of {channels}")
         height, width = ((n - 2) // stride for n in x.shape[:2])
         down, right, _ = x.strides
         around = as_strided(

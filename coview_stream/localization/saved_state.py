@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from dataclasses import asdict, fields
@@ -37,16 +38,19 @@ class SavedState:
     def save_state(self: _Localizer, path: str | os.PathLike[str]) -> None:
         """Write the pose of the newest frame and the calibration, as JSON, complete or not at all.
 
-        Without a pose, one that the file holds already stays. Call it after frames, as often as you like: a crash or a
-        power cut then costs little. OSError if the file cannot be written.
+        Without a pose, one that the file holds already stays; before the first frame, the whole file. Call it after
+        frames, as often as you like: a crash or a power cut then costs little. OSError if the file cannot be written.
         """
         path = Path(path)
         try:
             T_map_body = self.fix().T_map_body
         except RuntimeError:  # no frame yet
+            if path.exists():
+                return
             T_map_body = None
         if T_map_body is None and path.exists():
-            T_map_body = _read(path)[0]
+            with contextlib.suppress(InputError):
+                T_map_body = _read(path)[0]
         document = {
             "format": _FORMAT,
             "version": _VERSION,

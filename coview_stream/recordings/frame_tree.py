@@ -45,7 +45,11 @@ def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
             sec, nanosec = take("iI", 4)
             parent, child = name(), name()
             numbers = take("7d", 8)
-            yield stamp_join(int(sec), int(nanosec)), parent, child, checked_pose(numbers[:3], numbers[3:])
+            try:
+                T = checked_pose(numbers[:3], numbers[3:])
+            except MessageError:  # of a frame that nobody has set; the others hold
+                continue
+            yield stamp_join(int(sec), int(nanosec)), parent, child, T
     except struct.error as error:
         raise MessageError("the message is truncated") from error
 
@@ -73,7 +77,8 @@ class FrameTree:
                 continue
             if np.abs(T - before[1]).max() > _SAME:
                 self._moved.add(child)
-            if not self.lidar or child in self.above(self.lidar):
+            above = self.above(self.lidar)
+            if len(above) == 1 or child in above:  # all while nothing is known of the lidar's
                 self._samples.setdefault(child, []).append((stamp_ns, T))
 
     def body(self) -> str:

@@ -52,6 +52,8 @@ def compile_once(*names: str) -> None:
         return
     code = "import sys; from coview_kernels import warm_up; warm_up(*sys.argv[1:])"
     with contextlib.suppress(OSError, subprocess.SubprocessError), runtime.locked(mark.with_name("coview.lock")):
+        if mark.is_file():  # another process has, meanwhile
+            return
         subprocess.run(
             [sys.executable, "-P", "-c", code, *names], check=True, stdin=subprocess.DEVNULL, timeout=_PATIENCE
         )

@@ -17,12 +17,14 @@ from coview_stream.localization.state import State
 class Robot(SavedState):
     """A localizer that knows this pose, and notes what it is told."""
 
-    def __init__(self, T_map_body=None, calibration=Calibration()):  # noqa: B008  # frozen
-        self.T_map_body, self.calibration, self.told = T_map_body, calibration, []
+    def __init__(self, T_map_body=None, calibration=Calibration(), frames=1):  # noqa: B008  # frozen
+        self.T_map_body, self.calibration, self.frames, self.told = T_map_body, calibration, frames, []
 
     def fix(self):
-        if self.T_map_body is None:
+        if not self.frames:
             raise RuntimeError("no frame yet")
+        if self.T_map_body is None:
+            return Fix(1.0, State.SEARCHING)
         return Fix(1.0, State.TRACKING, T_map_body=self.T_map_body)
 
     def hint_pose(self, T_map_body):
@@ -55,6 +57,17 @@ def test_pose_of_the_file_stays_while_there_is_none(tmp_path):
     again.load_state(path)
     np.testing.assert_array_equal(again.told[0], place(3.0))
     assert again.told[1].roll == 0.2
+
+
+def test_file_stays_before_the_first_frame_and_a_damaged_one_is_replaced(tmp_path):
+    path = tmp_path / "r1.json"
+    Robot(place(3.0), Calibration(scale=0.03)).save_state(path)
+    saved = path.read_bytes()
+    Robot(frames=0).save_state(path)
+    assert path.read_bytes() == saved
+    path.write_bytes(b"")
+    Robot().save_state(path)
+    assert Robot().load_state(path) is True
 
 
 def test_first_start_has_no_file(tmp_path):

@@ -230,6 +230,17 @@ def test_mount_is_read_from_static_transforms(tmp_path, name):
     np.testing.assert_allclose(run.read(3).points, POINTS + 0, atol=1e-4)
 
 
+def test_transform_that_nobody_has_set_does_not_hide_the_others(tmp_path):
+    static = transforms(START, ("base_link", "camera", np.eye(4)), ("base_link", "livox_frame", MOUNT.T_body_sensor))
+    static.transforms[0].transform.rotation.w = 0.0
+    topics = {
+        "/points": [cloud(ns, POINTS, frame="livox_frame") for ns in CLOUD_NS],
+        "/tf_static": [static],
+        "/odom": [odometry(ns, T_at(ns), "base_link") for ns in ODOMETRY_NS],
+    }
+    assert "--mount=180,0,30,0.2,0,0.5 is taken" in open_run(write_bag(tmp_path / "bag", topics)).notes[0]
+
+
 def test_given_mount_overrides_static_transforms_and_says_so(tmp_path):
     bag = mounted_bag(tmp_path / "bag")
     run = open_run(bag, mount=parse_mount("180,0,0"))

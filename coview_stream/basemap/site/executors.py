@@ -76,24 +76,27 @@ class ProcessExecutor(Executor):
                     except Exception as error:
                         yield futures[future], error
             except BaseException:  # KeyboardInterrupt: nobody wants their results any more
-                for process in multiprocessing.active_children():
-                    process.terminate()
+                self._pool = None
+                _terminate(pool)
                 raise
             if suspects:
                 self.close()
             for number in sorted(suspects):
-                with self._new(1) as alone:
-                    try:
-                        with _deaf_to_interrupts():
-                            only = alone.submit(function, items[number])
-                        yield number, only.result()
-                    except BrokenProcessPool:
-                        yield (
-                            number,
-                            MapError("its process died (killed, or out of memory?); fewer --workers take less"),
-                        )
-                    except Exception as error:
-                        yield number, error
+                yield number, self._alone(function, items[number])
+
+    def _alone(self, function: Callable[[Item], Result], item: Item) -> Result | Exception:
+        """Return the result of an item in a process of its own, or its error."""
+        pool = self._new(1)
+        try:
+            with _deaf_to_interrupts():
+                future = pool.submit(function, item)
+            return future.result()
+        except BrokenProcessPool:
+            return MapError("its process died (killed, or out of memory?); fewer --workers take less")
+        except Exception as error:
+            return error
+        finally:  # it has nothing more to do, or KeyboardInterrupt
+            _terminate(pool)
 
     def close(self) -> None:
         """End the processes."""
@@ -154,9 +157,19 @@ class DaskExecutor(Executor):
         self._client.close()
 
 
+def _terminate(pool: ProcessPoolExecutor) -> None:
+    """End a pool's processes without waiting for their items."""
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)
+
+
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
     """Start processes that no Ctrl-C at the terminal reaches: this one ends them; it is interrupted afterwards."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

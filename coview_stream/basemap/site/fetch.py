@@ -196,11 +196,11 @@ class Mirror:
         except (TransportError, MapError) as error:
             if not is_site(self.directory):
                 raise
-            cached = Manifest.load(self.directory, key=self._verify_key)
             try:
+                cached = Manifest.load(self.directory, key=self._verify_key)
                 wanted = self._wanted(cached)
-            except MapError:
-                raise error from None
+            except MapError as damaged:
+                raise type(error)(f"{error}; and the copy that was fetched before: {damaged}") from error
             if isinstance(error, MapError) and not all(
                 self._store.is_whole(layer.sha256, layer.bytes) for layer, _ in wanted.values()
             ):

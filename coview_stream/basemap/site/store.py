@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -102,6 +103,11 @@ class TileStore:
                 path.unlink(missing_ok=True)
 
 
+_HASH = 40 * "[0-9a-f]"
+_OURS = (f"{_HASH}*.coview", f"joined-{_HASH}*.coview", "parts/*", "sites/[0-9a-f]*/**/*")
+"""Files of the cache, by pattern."""
+
+
 def cache_folder() -> Path:
     """Return the folder of the cache, made if it does not exist; MapError unless it is its user's alone."""
     named = os.environ.get("COVIEW_CACHE")
@@ -120,7 +126,8 @@ def cache_folder() -> Path:
                 )
             if state.st_mode & 0o077:
                 folder.chmod(0o700)
-                for path in folder.rglob("*"):  # made by the umask, which may have let others write them
+                # made by the umask, which may have let others write them; the folder may hold its user's files too
+                for path in itertools.chain.from_iterable(folder.glob(names) for names in _OURS):
                     if path.is_file() and path.stat().st_mode & 0o022:
                         path.unlink()
     except OSError as error:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -32,6 +34,22 @@ EXPECTED = {0: 1, 1: 4, 2: "three is damaged", 3: 16}
 
 def test_steps_in_this_process():
     assert told(Executor().run(step, [1, 2, 3, 4])) == EXPECTED
+
+
+@pytest.mark.slow
+def test_run_that_is_left_ends_its_own_processes_alone():
+    stranger = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,))
+    stranger.start()
+    executor = ProcessExecutor(1)
+    try:
+        results = executor.run(step, [1, 2, 3, 4])
+        next(results)
+        results.close()
+        assert stranger.is_alive()
+        assert told(executor.run(step, [5])) == {0: 25}
+    finally:
+        executor.close()
+        stranger.kill()
 
 
 @pytest.mark.slow

@@ -50,16 +50,18 @@ def test_folder_that_others_may_exchange_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
 def test_files_that_others_could_write_while_the_folder_was_open_are_deleted(folder, tmp_path):
-    ours, theirs, mirrored = folder / "a.coview", folder / "b.coview", folder / "sites" / "x" / "manifest.json"
-    mirrored.parent.mkdir(parents=True)
-    for path, mode in ((ours, 0o644), (theirs, 0o666), (mirrored, 0o664)):
+    ours, theirs = (folder / f"{digit * 40}.1.coview" for digit in "ab")
+    mirrored, letter = folder / "sites" / "a1" / "manifest.json", folder / "thesis" / "letter.txt"
+    for parent in (mirrored.parent, letter.parent):
+        parent.mkdir(parents=True)
+    for path, mode in ((ours, 0o644), (theirs, 0o666), (mirrored, 0o664), (letter, 0o664)):
         path.write_bytes(b"map")
         path.chmod(mode)
     assert cache_folder() == folder
     assert theirs.exists()  # nobody else reaches it
     folder.chmod(0o755)
     assert cache_folder() == folder
-    assert (ours.exists(), theirs.exists(), mirrored.exists()) == (True, False, False)
+    assert (ours.exists(), theirs.exists(), mirrored.exists(), letter.exists()) == (True, False, False, True)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX")
