@@ -42,6 +42,7 @@ with atheris.instrument_imports(include=["coview_stream", "rosbags", "laspy"]) i
     import rosbags.rosbag2  # noqa: F401 - likewise
 
     from bench.fuzz import wrong
+    from coview_kernels import warm_up
     from coview_stream import messages
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.site.manifest import Manifest
@@ -225,6 +226,8 @@ def mutated(rng: random.Random, seeds: list[bytes]) -> bytes:
 def main(names: str, corpus: Path, found: Path, seconds: float, seed: int) -> None:
     """Fuzz one target, or replay several."""
     LOG.setLevel(logging.CRITICAL)
+    if set(names.split(",")) & set(wrong.TARGETS):
+        warm_up("nearest")  # the kernels' library reserves a gigabyte of addresses at its start
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
     if GUIDED and seconds:

@@ -100,7 +100,7 @@ def test_replay_of_clouds_without_odometry(node, run_folder, tmp_path, capsys):
 def test_replay_in_other_encodings_and_to_other_keys(node, run_folder, options, keys):
     node.subscribe(*keys)
     assert node.replay(run_folder, "--rate", "50", *options) == 0
-    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
+    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) >= 6)  # more are interpolated
     assert all(m.points.shape == (500, 3) for m in node.clouds())
 
 
