@@ -200,7 +200,7 @@ class Mirror:
                 cached = Manifest.load(self.directory, key=self._verify_key)
                 wanted = self._wanted(cached)
             except MapError as damaged:
-                raise type(error)(f"{error}; and the copy that was fetched before: {damaged}") from error
+                raise MapError(f"{error}; and the copy that was fetched before: {damaged}") from error
             if isinstance(error, MapError) and not all(
                 self._store.is_whole(layer.sha256, layer.bytes) for layer, _ in wanted.values()
             ):
