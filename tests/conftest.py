@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import small_world
+from hypothesis import settings
 from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
@@ -16,6 +17,9 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.localization.localizer import Localizer
 
 RADIUS = 30.0
+
+settings.register_profile("deterministic", derandomize=True, database=None, deadline=None, max_examples=60)
+settings.load_profile("deterministic")
 
 # where tests run in the background of a shell it is ignored, and the processes that they start would inherit that
 signal.signal(signal.SIGINT, signal.default_int_handler)

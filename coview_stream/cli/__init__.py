@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except Exception:
                 if not interrupt.seen:
                     raise
-            if interrupt.seen:  # whatever became of it
+            if interrupt.seen:  # also if the exception was dropped
                 raise KeyboardInterrupt
     except KeyboardInterrupt:
         code, message = 130, ""
@@ -142,7 +142,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
         sub.set_defaults(run=module.run)
         for action in sub._actions:
             if action.type is Path or not action.option_strings or "FILE" in str(action.metavar):
-                action.complete = _COMPLETE_FILE  # type: ignore[attr-defined]
+                action.complete = _COMPLETE_FILE  # type: ignore[attr-defined]  # read by shtab
     return parser
 
 

@@ -28,7 +28,7 @@ def names_parts(kind: type[Config]) -> type[Config]:
 
     @functools.wraps(made)
     def checked(self: Config, *given: Any, **named: Any) -> None:
-        own = {item.name: item.default_factory for item in fields(kind)}  # type: ignore[arg-type]
+        own = {item.name: item.default_factory for item in fields(kind)}  # type: ignore[arg-type]  # a dataclass
         for name in named.keys() - own.keys():
             for part, inner in own.items():
                 if isinstance(inner, type) and name in inner.__dataclass_fields__:
@@ -38,7 +38,7 @@ def names_parts(kind: type[Config]) -> type[Config]:
             raise ConfigError(f"{kind.__name__} has no {name}; {did_you_mean(name, list(own))}")
         made(self, *given, **named)
 
-    kind.__init__ = checked  # type: ignore[method-assign, assignment]
+    kind.__init__ = checked  # type: ignore[method-assign, assignment]  # of the same fields
     return kind
 
 

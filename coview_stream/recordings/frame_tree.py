@@ -47,7 +47,7 @@ def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
             numbers = take("7d", 8)
             try:
                 T = checked_pose(numbers[:3], numbers[3:])
-            except MessageError:  # of a frame that nobody has set; the others hold
+            except MessageError:  # a rotation of zeros, say; the other transforms are valid
                 continue
             yield stamp_join(int(sec), int(nanosec)), parent, child, T
     except struct.error as error:

@@ -3,12 +3,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from hypothesis import settings
 
 from coview_kernels import mapped
-
-settings.register_profile("deterministic", derandomize=True, database=None, deadline=None, max_examples=60)
-settings.load_profile("deterministic")
 
 
 @pytest.fixture

@@ -75,7 +75,7 @@ class ProcessExecutor(Executor):
                         suspects.append(futures[future])
                     except Exception as error:
                         yield futures[future], error
-            except BaseException:  # KeyboardInterrupt: nobody wants their results any more
+            except BaseException:  # KeyboardInterrupt: the results are not used
                 self._pool = None
                 _terminate(pool)
                 raise

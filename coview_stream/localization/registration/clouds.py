@@ -134,7 +134,7 @@ def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Point
 
 
 MAX_CROP_BYTES = 32_000_000
-"""Bytes of crops that are kept though nobody holds them: three of a dense survey, at 10 MB."""
+"""Bytes of crops that are cached beside those in use: three of a dense survey, at 10 MB."""
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 
 
@@ -197,7 +197,7 @@ class LocalMaps:
         return crop
 
     def clear(self) -> None:
-        """Drop the crops that nobody holds."""
+        """Drop the crops that are not in use."""
         self._recent.clear()
 
     def _cut(self, key: tuple[int, int]) -> LocalMap | None:
