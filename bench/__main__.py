@@ -167,13 +167,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one benchmark, write the results page, or list the names."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     name = words.pop(0) if words else "--list"
-    if name == "results":
+    if name in ("results", "release"):
         from bench.results import main as results
 
-        return results(words)
+        return results(words, release=name == "release")
     if name.startswith("-"):
         print(*(f"{key:14}{entry.about}" for key, entry in BENCHMARKS.items()), sep="\n")
         print(f"{'results':14}run several of them and write docs/results.md")
+        print(f"{'release':14}run all of them on one code, in steps, and write docs/results.md")
         return 0
     if name not in BENCHMARKS:
         print(f"bench: no benchmark {name!r}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)

@@ -1,7 +1,11 @@
-"""Run benchmarks and write their tables into docs/results.md: ``python -m bench results [--only NAME...] [--quick]``.
+"""Run benchmarks and write their tables into docs/results.md.
 
-Every table stands below its command, date, machine and the commit of the code (``+``: with uncommitted changes). A run
-replaces only its own tables; the others stay with their commit. Quick runs have tables of their own.
+``python -m bench results [--only NAME...] [--quick]`` replaces only the tables that it runs; every table stands below
+its command, date, machine and the commit of the code (``+``: with uncommitted changes). Quick runs have tables of their
+own.
+
+``python -m bench release --work DIR [--quick]`` makes a page of one code, for a release: a table is kept in DIR as soon
+as it is there, a second call goes on with those that are missing, and the page is written once all are of one code.
 """
 
 from __future__ import annotations
@@ -13,12 +17,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
 
 from bench.__main__ import BENCHMARKS, BUSY, parser_of, tables_of
-from bench.harness.files import ROOT, commit, environment
+from bench.harness.files import ROOT, commit, environment, fingerprint
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
 from coview_stream.clouds.atomic_file import atomic_path
@@ -45,7 +49,7 @@ COMMANDS = {
     "forest_drives": "forest_drives dense-forest long-forest closed-forest --plots docs/images",
     "forest_times": "forest_drives times",
     "fuzz": "fuzz --seconds 60",
-    "soak": "soak --minutes 600",
+    "soak": "soak --minutes 60",
 }
 """Name of each table, and the command that prints it; ``odometry`` and ``ground`` need files of the user."""
 
@@ -99,9 +103,12 @@ def measured(command: str) -> str:
     return re.sub(r"(?m)^\|.*$", lambda line: re.sub(r" *\| *", "|", line[0]), "\n\n".join(parts))
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str], *, release: bool = False) -> int:
     """Make the tables one after the other; each is written as soon as it is there."""
-    parser = ArgumentParser("python -m bench results", description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    name = "release" if release else "results"
+    parser = ArgumentParser(f"python -m bench {name}", description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    if release:
+        parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of worlds and tables")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(COMMANDS))
     parser.add_argument("--quick", action="store_true", help="smaller sizes, in tables of their own")
     parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE.relative_to(ROOT)})")
@@ -111,20 +118,64 @@ def main(arguments: Sequence[str]) -> int:
     try:
         names = chosen(asked.only)
     except InputError as error:
-        print(f"bench results: {error}", file=sys.stderr)
+        print(f"bench {name}: {error}", file=sys.stderr)
         return 2
+    if release:
+        return _release(asked, names)
     for name in names:
-        command = f"{COMMANDS[name]}{' --quick' * asked.quick}"
-        print(f"=== {command}", file=sys.stderr, flush=True)
-        load = os.getloadavg()[0]
-        if not (text := measured(command)):
+        if not (part := _part(name, asked)):
             missing.append(name)
             continue
         title = f"{name}, quick" if asked.quick else name
-        machine = f"{asked.machine}, load {load:.0f} from other work" if load > BUSY else asked.machine
-        part = block(title, command, text, time.strftime("%Y-%m-%d"), commit(), machine)
         page = asked.page.read_text() if asked.page.is_file() else HEAD
         with atomic_path(asked.page) as file:
             file.write_text(replaced(page, title, part))
     print(f"{len(names) - len(missing)} tables written; not measured: {', '.join(missing) or 'none'}")
     return int(bool(missing))
+
+
+def _part(name: str, asked: Namespace) -> str:
+    """Measure a table; return its part of the page, empty if it failed."""
+    command = f"{COMMANDS[name]}{' --quick' * asked.quick}"
+    print(f"=== {command}", file=sys.stderr, flush=True)
+    load, begin = os.getloadavg()[0], time.monotonic()
+    text = measured(command)
+    print(f"=== {command}: {(time.monotonic() - begin) / 60:.1f} min", file=sys.stderr, flush=True)
+    title = f"{name}, quick" if asked.quick else name
+    machine = f"{asked.machine}, load {load:.0f} from other work" if load > BUSY else asked.machine
+    return text and block(title, command, text, time.strftime("%Y-%m-%d"), commit(), machine)
+
+
+def _release(asked: Namespace, names: Sequence[str]) -> int:
+    """Make the tables of this code that are missing in the folder; write the page if then none is."""
+    os.environ["COVIEW_BENCH"] = str(asked.work / "worlds")
+    code = _code()
+    tables = asked.work / f"tables-{code}{'-quick' * asked.quick}"
+    tables.mkdir(parents=True, exist_ok=True)
+    files = {name: tables / f"{name.replace(' ', '_')}.md" for name in COMMANDS}
+    for name in names:
+        if files[name].is_file():
+            continue
+        part = _part(name, asked)
+        if _code() != code:
+            print(f"bench release: the code changed while {name} ran; begin again", file=sys.stderr)
+            return 2
+        if part:
+            with atomic_path(files[name]) as file:
+                file.write_text(part)
+    missing = [name for name, file in files.items() if not file.is_file()]
+    print(f"code {code}: {len(files) - len(missing)} of {len(files)} tables; missing: {', '.join(missing) or 'none'}")
+    if not missing:
+        with atomic_path(asked.page) as file:
+            file.write_text(introduction(asked.page) + "".join(file.read_text() for file in files.values()))
+    return int(bool(missing))
+
+
+def _code() -> str:
+    """Short hash of the product, the kernels and the benchmarks."""
+    return fingerprint("coview_stream", "coview_kernels", "bench")
+
+
+def introduction(page: Path) -> str:
+    """Return a page's text above its first table."""
+    return page.read_text().partition("\n<!-- results: ")[0] if page.is_file() else HEAD

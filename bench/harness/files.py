@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dis
+import functools
 import hashlib
 import json
 import os
@@ -16,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
+from types import CodeType
 from typing import Any, TypeVar
 
 import coview_kernels
@@ -54,14 +57,37 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dic
 
 
 def fingerprint(*parts: str) -> str:
-    """Short hash of the Python sources below ``parts``, e.g. ``coview_stream/sim`` (none: of the whole product)."""
+    """Short hash of the code and weights below ``parts``, e.g. ``coview_stream/sim`` (none: of the whole product).
+
+    Comments, docstrings and layout do not count: prose does not age a figure.
+    """
     total = hashlib.sha256()
     for part in parts or ("coview_stream", "coview_kernels"):
         root, _, below = part.partition("/")
         path = _ROOTS[root] / below
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            total.update(str(file.relative_to(_ROOTS[root])).encode() + file.read_bytes())
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.suffix in (".py", ".npz"):
+                total.update(str(file.relative_to(_ROOTS[root])).encode() + code_of(file.read_bytes(), file.suffix))
     return total.hexdigest()[:10]
+
+
+@functools.cache
+def code_of(content: bytes, suffix: str = ".py") -> bytes:
+    """Return what the interpreter gets of a Python source; any other file as it is."""
+    return repr(_operations(compile(content, "", "exec", optimize=2))).encode() if suffix == ".py" else content
+
+
+def _operations(code: CodeType) -> tuple[object, ...]:
+    """Return the instructions of a code object with all that they name, without places in the source."""
+    constants = (
+        _operations(value) if isinstance(value, CodeType)
+        else sorted(map(repr, value)) if isinstance(value, frozenset)  # in the same order in every process
+        else value
+        for value in code.co_consts
+    )  # fmt: skip
+    # a docstring leaves an instruction that does nothing
+    pairs = [code.co_code[k : k + 2] for k in range(0, len(code.co_code), 2) if code.co_code[k] != dis.opmap["NOP"]]
+    return b"".join(pairs), code.co_names, code.co_varnames, code.co_freevars, *constants
 
 
 def isolated(work: Callable[..., Result], *args: Any) -> Result:

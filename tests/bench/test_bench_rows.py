@@ -9,7 +9,7 @@ import pytest
 from bench import __main__ as bench
 from bench import results
 from bench.__main__ import BENCHMARKS, Benchmark, run
-from bench.harness.files import fingerprint, remembered
+from bench.harness.files import code_of, fingerprint, remembered
 from bench.harness.rows import Row, against, bounded, failed, informs, judged, reached
 from coview_stream.errors import InputError
 
@@ -42,6 +42,18 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
     assert remembered(file, {"code": "b", "size": (1, 2)}, lambda: {"value": 3}) == {"value": 3}
     parts = ("coview_stream/sim", "coview_stream/descriptors/coview.py", "coview_kernels", "")
     assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
+
+
+def test_prose_does_not_change_the_hash_of_code():
+    source = (
+        b'"""One."""\ndef f(a):\n    """Two."""\n    try:\n'
+        b'        return a in {"b", "c"}  # why\n    except OSError:\n        pass\n'
+    )
+    prose = source.replace(b'    """Two."""\n', b"").replace(b"  # why", b"").replace(b"One", b"Three\n\n")
+    assert code_of(source) == code_of(prose)
+    for old, new in ((b'"c"', b'"d"'), (b"return a", b"return not a"), (b"OSError", b"KeyError"), (b"(a)", b"(a, b)")):
+        assert code_of(source) != code_of(source.replace(old, new))
+    assert code_of(source, ".npz") == source
 
 
 @pytest.fixture
@@ -90,6 +102,34 @@ def test_only_tables_that_were_run_change_the_page():
     assert added.startswith(again.rstrip())
     with pytest.raises(InputError, match="no table"):
         results.chosen(["nothing"])
+
+
+def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(monkeypatch, tmp_path, capsys):
+    code, ran, good = ["1"], [], {"a": True, "b": False}
+    page = tmp_path / "page.md"
+    page.write_text("# Mine\n" + results.block("old", "old", "gone", "2026-01-01", "abc1234"))
+    monkeypatch.setattr(results, "COMMANDS", {"a": "a", "b": "b"})
+    monkeypatch.setattr(results, "fingerprint", lambda *parts: code[0])
+    monkeypatch.setattr(results, "measured", lambda name: ran.append(name) or f"of {name}" * good[name])
+
+    def release() -> int:
+        return results.main(["--work", str(tmp_path / "work"), "--page", str(page)], release=True)
+
+    assert release() == 1
+    assert "code 1: 1 of 2 tables; missing: b" in capsys.readouterr().out
+    assert "gone" in page.read_text()
+    good["b"] = True
+    assert release() == 0
+    assert ran == ["a", "b", "b"]
+    assert page.read_text().startswith("# Mine\n\n<!-- results: a -->")
+    assert "gone" not in page.read_text()
+    code[0] = "2"
+    assert release() == 0
+    assert ran[3:] == ["a", "b"]
+    monkeypatch.setattr(results, "measured", lambda name: code.insert(0, "3") or "other")
+    code[0] = "4"
+    assert release() == 2
+    assert "the code changed while a ran" in capsys.readouterr().err
 
 
 def test_every_benchmark_loads():
