@@ -80,30 +80,7 @@ def _channels(names: Sequence[Channel]) -> str:
 SEARCH: dict[str, dict[str, Choice]] = {
     "channels": {
         **{_channels(names): Choice(_with(channels=names)) for names in CHANNELS},
-        "coview, eq. 2 alone": Choice(_with(channels=("coview",)), strict=True),
         "zero at the sensor": Choice(_with(ground_zero=False)),
-    },
-    "bins": {
-        "default: 20 rings, 60 sectors, 50 m": Choice(),
-        **{f"{n} rings": Choice(_with(rings=n)) for n in (10, 40)},
-        **{f"{n} sectors": Choice(_with(sectors=n)) for n in (30, 120)},
-        **{f"{r:g} m": Choice(_with(radius=r)) for r in (25.0, 80.0)},
-    },
-    "scan": {
-        "default: VLS of all keyframes": Choice(),
-        "of five": Choice(gathered=5),
-        "of two": Choice(gathered=2),
-        "between two keyframes": Choice(gathered=1),
-    },
-    "vote": {
-        "default: all stations, consensus of five": Choice(),
-        "two keyframes vote": Choice(window=2),
-        "ten keyframes vote": Choice(window=10),
-        "single smallest distance of five": Choice(single=True),
-        "eq. 7 over common columns": Choice(common=True),
-        "200 nearest ring keys": Choice(nearest=200),
-        "1000 nearest ring keys": Choice(nearest=1000),
-        "paper, 200 nearest ring keys": Choice(_with(channels=("paper",)), nearest=200),
     },
     "spacing": {f"{'default: ' if m == SPACINGS[0] else ''}L = {m:g} m": Choice(spacing=m) for m in SPACINGS},
 }
@@ -114,11 +91,8 @@ REGISTRATION = {
     **{f"plane, {keep:.0%}": RegistrationChoice(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
     "plane, 15 iterations": RegistrationChoice(RegistrationConfig(iterations=15)),
     "plane, ground and structure trimmed together": RegistrationChoice(apart=False),
-    "plane, facades removed": RegistrationChoice(facades=False),
     "point, same kernel": RegistrationChoice(way="points"),
-    "point, facades removed": RegistrationChoice(way="points", facades=False),
     "the paper's: plain, point, 60 %": RegistrationChoice(RegistrationConfig(keep=0.6), "paper"),
-    "the paper's, facades removed": RegistrationChoice(RegistrationConfig(keep=0.6), "paper", facades=False),
 }
 """Choices of the registration."""
 
@@ -130,7 +104,6 @@ LOCALIZER = {
     "verification off": LocalizerChoice(changed=unverified),
     "risk 0.4": LocalizerChoice(LocalizerConfig(acceptance=AcceptanceConfig(risk=0.4))),
     "calibration off": LocalizerChoice(changed=uncalibrated),
-    "outliers of scans removed": LocalizerChoice(filtered=True),
     "60 % of the pairs": LocalizerChoice(LocalizerConfig(registration=RegistrationConfig(keep=0.6))),
     "frames of two metres registered": LocalizerChoice(
         LocalizerConfig(tracking=TrackingConfig(window=2.0, min_points=50_000))

@@ -8,7 +8,6 @@ degrees, from the truth. The localizer runs as ``coview-stream locate`` does.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -25,7 +24,6 @@ from bench.accuracy import paper
 from coview_stream import BaseMap
 from coview_stream.basemap.stations import StationGrid, describe_storeys, find_stations
 from coview_stream.clouds import read_tum
-from coview_stream.clouds.filters import remove_outliers
 from coview_stream.config import (
     Channel,
     ConsensusConfig,
@@ -35,7 +33,6 @@ from coview_stream.config import (
     RegistrationConfig,
 )
 from coview_stream.config.localizer import MIN_PAIRS
-from coview_stream.descriptors import coview
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.rasters import argsmallest
@@ -62,12 +59,11 @@ from coview_stream.localization.registration.clouds import (
 )
 from coview_stream.localization.registration.register import RESIDUAL_SCALE, register
 from coview_stream.localization.search import acceptance
-from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import exact_distances
 from coview_stream.localization.state import State
 from coview_stream.recordings.open_run import open_run
-from coview_stream.recordings.run import Frame, Run
 from coview_stream.report.evaluation import driven, evaluate
 
 NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a half blocks and shifts
@@ -76,7 +72,6 @@ OFF, TURNED = (0.5, 1.0), float(np.radians(3.0))  # how far registrations start 
 
 _DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
 _SAMPLE = 100_000  # distances that a median is taken of
-_GATHERED = (1, 2, WINDOW, None)  # newest keyframes whose points make a VLS; None: all
 
 
 @dataclass(frozen=True)
@@ -86,29 +81,17 @@ class Choice:
     Attributes:
         descriptor: of stations and keyframes.
         spacing: metres between stations, and between keyframes: L = sigma_d.
-        gathered: newest keyframes whose points make the VLS, 1, 2 or 5; None: all.
-        strict: of co-visibility keep only eq. 2.
-        nearest: stations nearest in ring key that are compared; None: all.
-        window: keyframes that vote together.
-        single: the one smallest distance of these keyframes names the place.
-        common: eq. 7 averages only columns that are occupied on both sides.
     """
 
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
     spacing: float = 2.0
-    gathered: int | None = None
-    strict: bool = False
-    nearest: int | None = None
-    window: int = WINDOW
-    single: bool = False
-    common: bool = False
 
 
 @dataclass(frozen=True)
 class KeyframeView:
     """A keyframe as the search sees it."""
 
-    scans: dict[int | None, Points]  # (N, 3) VLS by the number of keyframes gathered, odometry frame, metres
+    scan: Points  # (N, 3) VLS of all keyframes, odometry frame, metres
     position: Floats  # (3,) of the sensor
     T_map_odom: Pose  # (4, 4) the truth, map frame relative to the map's origin
     submap: Points  # (N, 3) points to register
@@ -132,10 +115,9 @@ class Site:
         own = block == self.map.config.block
         return np.array(self.map.stations) if own else find_stations(self.points, block)
 
-    def _described(self, block: float, descriptor: DescriptorConfig, strict: bool) -> npt.NDArray[np.float16]:
+    def _described(self, block: float, descriptor: DescriptorConfig) -> npt.NDArray[np.float16]:
         """Descriptors (M, R, S) of the stations, of the only channel."""
-        with _co_visibility(strict):
-            return describe_storeys(self.points, self.stations(block), block, descriptor)[descriptor.channels[0]]
+        return describe_storeys(self.points, self.stations(block), block, descriptor)[descriptor.channels[0]]
 
     def _keyframes(self, distance: float) -> list[KeyframeView]:
         """Keyframes of the run in order, every ``distance`` metres."""
@@ -150,47 +132,31 @@ class Site:
             whole = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
             if len(whole) < settings.min_points:
                 continue
-            position = keyframe.position.copy()
-            parts = {n: buffer.recent(n) for n in _GATHERED if n is not None}
-            thin = {n: paper.LocalScan.of(part, position, descriptor.voxel).points for n, part in parts.items()}
             submap = buffer.recent(4)  # as the search registers
-            out.append(KeyframeView({**thin, None: whole}, position, T_map_body @ inverse(T_odom_body), submap))
+            out.append(KeyframeView(whole, keyframe.position.copy(), T_map_body @ inverse(T_odom_body), submap))
         return out
 
     def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32, float]]:
         """Zero (3,) of each keyframe, its distances (M, S) by a choice of one channel, and their processor seconds."""
         descriptor = choice.descriptor
         # the zero is the keyframe's affair: it does not change the stations
-        stations = self.described(choice.spacing, replace(descriptor, ground_zero=True), choice.strict)
-        keys = None if choice.nearest is None else paper.ring_key(np.float32(stations))
+        stations = self.described(choice.spacing, replace(descriptor, ground_zero=True))
         out = []
         for seen in self.keyframes(choice.spacing):
-            begin, scan, z = time.process_time(), seen.scans[choice.gathered], float(seen.position[2])
+            begin, scan, z = time.process_time(), seen.scan, float(seen.position[2])
             centre = np.array([*seen.position[:2], ground_below(scan, seen.position) if descriptor.ground_zero else z])
-            with _co_visibility(choice.strict):
-                query = describe(scan, centre, descriptor)[descriptor.channels[0]]
-            if keys is None:
-                volume = exact_distances(stations, query)
-            else:
-                gap = np.linalg.norm(keys - paper.ring_key(query), axis=1)
-                chosen = np.argsort(gap, kind="stable")[: choice.nearest]
-                volume = np.ones((len(stations), descriptor.sectors), dtype=np.float32)
-                volume[chosen] = exact_distances(stations[chosen], query)
-            if choice.common:
-                volume = over_common(volume, np.float32(stations), query)
+            volume = exact_distances(stations, describe(scan, centre, descriptor)[descriptor.channels[0]])
             out.append((centre, volume, time.process_time() - begin))
         return out
 
     def search(self, choice: Choice) -> dict[str, float]:
         """Count how often a choice names the right place along the run, with the seconds of all distances."""
         channels = choice.descriptor.channels
-        alone = {name: replace(choice, window=1, single=False) for name in channels}
-        singles = [replace(c, descriptor=replace(c.descriptor, channels=(name,))) for name, c in alone.items()]
+        singles = [replace(choice, descriptor=replace(choice.descriptor, channels=(name,))) for name in channels]
         by_channel = [self.volumes(one) for one in singles]
         seconds = sum(took for volumes in by_channel for *_, took in volumes)
         grid = StationGrid(self.stations(choice.spacing), choice.spacing)
-        one, together = (Consensus(grid, replace(ConsensusConfig(), window=n)) for n in (1, choice.window))
-        smallest: deque[Hypothesis] = deque(maxlen=choice.window)
+        one, together = (Consensus(grid, ConsensusConfig(window=n)) for n in (1, WINDOW))
         counts = dict.fromkeys(("keyframes", "top1", "top10", "windows", "coarse"), 0.0)
         for k, seen in enumerate(self.keyframes(choice.spacing)):
             centre = by_channel[0][k][0]
@@ -201,12 +167,9 @@ class Site:
             counts["keyframes"] += 1
             counts["top1"] += best[0]
             counts["top10"] += any(best)
-            mean = sum(volumes[k][1] for volumes in by_channel) / np.float32(len(by_channel))
-            smallest.append(nearest_place(mean, centre, grid.stations))
-            if k + 1 >= min(choice.window, WINDOW):
-                leader = min(smallest, key=lambda place: place.votes) if choice.single else together.hypotheses()[0]
+            if k + 1 >= WINDOW:
                 counts["windows"] += 1
-                counts["coarse"] += right(leader.T_map_odom, seen)
+                counts["coarse"] += right(together.hypotheses()[0].T_map_odom, seen)
         return counts | {"seconds": seconds, "stations": float(len(grid))}
 
     @cached_property
@@ -232,10 +195,6 @@ class Site:
                 continue
             if not choice.apart:
                 source = replace(source, above=np.ones(len(source.points), dtype=bool))
-            if not choice.facades:
-                keep = paper.consistent(transform(start, source.points.astype(np.float64)), target.points)
-                kept = (values[keep] for values in (source.points, source.above, source.height))
-                source = RegistrationCloud(*kept)
             target.prepare()
             begin = time.process_time()
             T = choice.register(source, start, target, seen.position)
@@ -252,7 +211,7 @@ class Site:
             return self.map
         singles = {name: replace(descriptor, channels=(name,)) for name in channels}
         arrays = {name: a for name, a in self.map.arrays.items() if not name.startswith(_DESCRIBED)}
-        arrays |= {f"descriptor.{n}": self.described(self.map.config.block, d, False) for n, d in singles.items()}
+        arrays |= {f"descriptor.{n}": self.described(self.map.config.block, d) for n, d in singles.items()}
         config = self.map.parameters["config"] | {"descriptor": asdict(descriptor)}
         return BaseMap(arrays, self.map.parameters | {"config": config})
 
@@ -264,10 +223,9 @@ class Site:
 
     def located(self, choice: LocalizerChoice) -> dict[str, Any]:
         """Localize the run; figures of ``evaluate``."""
-        run = FilteredRun(**vars(self.run)) if choice.filtered else self.run
         base_map = self._map(choice.channels or self.map.descriptor_config.channels)
         with choice.changed():
-            found = locate(base_map, run, choice.config)
+            found = locate(base_map, self.run, choice.config)
         poses = np.array([fix.T_map_body for fix in found.posed]).reshape(-1, 4, 4)
         estimate = np.array([fix.stamp for fix in found.posed]), poses
         errors = evaluate(estimate, self.truth)
@@ -287,13 +245,11 @@ class RegistrationChoice:
         config: overlap and the rest.
         way: ``product``; ``points``, by the same kernel from point to point, which needs finer stops; ``paper``, plain
             trimmed ICP from point to point, without scales or weights.
-        facades: False: without the points at heights where the map has none.
         apart: False: points on the ground and above it are trimmed together.
     """
 
     config: RegistrationConfig = field(default_factory=RegistrationConfig)
     way: Literal["product", "points", "paper"] = "product"
-    facades: bool = True
     apart: bool = True
 
     def register(self, source: RegistrationCloud, start: Pose, target: LocalMap, centre: Floats) -> Pose | None:
@@ -324,23 +280,12 @@ class LocalizerChoice:
     Attributes:
         config: of the localizer.
         changed: makes the change in the code, until it ends.
-        filtered: frames without statistical outliers.
         channels: of the map's descriptors; none: its own.
     """
 
     config: LocalizerConfig = field(default_factory=LocalizerConfig)
     changed: Callable[[], AbstractContextManager[Any]] = nullcontext
-    filtered: bool = False
     channels: tuple[Channel, ...] = ()
-
-
-class FilteredRun(Run):
-    """A run whose frames have no statistical outliers, removed as from a map."""
-
-    def read(self, index: int, *args: Any, **kwargs: Any) -> Frame:
-        """Read a frame and filter it."""
-        frame = super().read(index, *args, **kwargs)
-        return replace(frame, points=remove_outliers(frame.points, 12, 4.0)[0])
 
 
 def unverified() -> AbstractContextManager[Any]:
@@ -360,10 +305,6 @@ def uncalibrated() -> AbstractContextManager[Any]:
         estimator.calibration = exact
 
     return patch.object(CalibrationEstimator, "_apply", apply)
-
-
-def _co_visibility(strict: bool) -> AbstractContextManager[Any]:
-    return patch.object(coview, "_VERTICAL", "off" if strict else "max")
 
 
 class TableVote:
@@ -400,36 +341,10 @@ class TableVote:
 def robust_zscore(volume: Floats32) -> Floats32:
     """Return the robust standard deviations (M, S) by which each distance exceeds the median; negative is better."""
     every = max(1, volume.size // _SAMPLE)
-    sample = np.empty(0, dtype=np.float32)
-    for rows in (volume[::every], volume):  # ring keys leave most stations at 1, unscored
-        sample = rows[(rows != 1.0).any(axis=1)].ravel()
-        if sample.size >= min(_SAMPLE // 2, volume.size // 2):
-            break
-    if not len(sample):
-        return np.zeros_like(volume)
+    sample = volume[::every].ravel()
     median = np.median(sample)
     deviation = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
-    scores: Floats32 = (volume - median) * np.float32(1.0 / deviation)
-    if median > 1.0:  # unscored stations must not get a negative z-score
-        np.maximum(scores, np.float32(0.0), out=scores, where=volume == 1.0)
-    return scores
-
-
-def over_common(volume: Floats32, stations: Floats32, query: Floats32) -> Floats32:
-    """Return distances (M, S) averaged over the columns that are occupied on both sides, of those of eq. 7."""
-    sectors = volume.shape[1]
-    occupied = [np.float32((one != 0).any(axis=-2, keepdims=True)) for one in (stations, query)]
-    turned = sectors * (1.0 - paper.distances(*occupied))  # columns in common
-    columns = np.roll(turned[:, ::-1], 1, axis=1)  # the product counts shifts the other way round
-    return np.asarray(1.0 - sectors * (1.0 - volume) / np.maximum(columns, 1.0), dtype=np.float32)
-
-
-def nearest_place(volume: Floats32, centre: Floats, stations: Floats32) -> Hypothesis:
-    """Return the place of the smallest of distances (M, S), by eq. 12 about the keyframe."""
-    station, shift = (int(n) for n in np.unravel_index(int(volume.argmin()), volume.shape))
-    turn = rot_z(float(yaw_of_shift(shift, volume.shape[1])))
-    T = pose_from(turn, stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
-    return Hypothesis(T, station, shift, float(volume.min()))
+    return np.asarray((volume - median) * np.float32(1.0 / deviation), dtype=np.float32)
 
 
 def right(T_map_odom: Pose, seen: KeyframeView) -> bool:

@@ -4,7 +4,7 @@ A run is a drive on a map until its first fix, or 60 metres: right (nearer than 
 results of a site stay in ``--work``, so an interrupted benchmark resumes. Runs share sites, at most eight of them one
 map, but never map and drive; beside the share of false runs stands the share of sites with a false run. Bounds are
 Clopper-Pearson's, at 95 %, and hold for these families and this simulator. Stated errors of all searched keyframes are
-noted, and whether the most probable place was right: how often they hold, by payment for looking again and again.
+noted, and whether the most probable place was right: how often they hold.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,6 @@ from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, 
 from bench.integrity.plan import FAMILIES, STATED, Site, plan
 from bench.integrity.run import Result, everywhere
 from coview_stream.errors import InputError
-from coview_stream.geometry.arrays import Floats
 
 OUTCOMES = ("right", "false", "none")  # of a run that counts; a failed run, or one without a street, does not
 
@@ -115,67 +114,29 @@ def family_table(results: Sequence[Result]) -> str:
     return table(("family", "runs", "right", "false", "AMBIGUOUS", "SEARCHING", "false, below"), lines)
 
 
-def nothing(evidence: Floats) -> Floats:
-    """Pay nothing, as searches do: Ville's inequality holds if the evidence is a martingale where all is wrong."""
-    return evidence
-
-
-def looks(evidence: Floats) -> Floats:
-    """Divide by one more than the number of looks at eight keyframes."""
-    return np.asarray(evidence / (1.0 + np.arange(1, len(evidence) + 1) // 8))
-
-
-def each(evidence: Floats) -> Floats:
-    """Divide by j (j + 1): the shares 1 / (j (j + 1)) of the risk add up to one, whatever the keyframes share."""
-    j = np.arange(1, len(evidence) + 1)
-    return np.asarray(evidence / (j * (j + 1.0)))
-
-
-def adjusted(evidence: Floats) -> Floats:
-    """Adjust the largest evidence so far, which is kept: (e - 1 - log e) / log(e)^2 (Shafer and others, 2011)."""
-    most = np.maximum(np.maximum.accumulate(evidence), 1.0 + 1e-3)
-    return np.asarray((most - 1.0 - np.log(most)) / np.log(most) ** 2)
-
-
-PAYMENTS = {"nothing (Ville)": nothing, "1 + j // 8": looks, "j (j + 1)": each, "largest, adjusted": adjusted}
-"""Payments for looking again and again: odds of all places together against none, by keyframe, to paid ones."""
-
-
-def stated_errors(run: Result, payment: Callable[[Floats], Floats]) -> Floats:
-    """Return the errors (J,) that a search would have stated at its keyframes with another payment."""
-    _, error, none, _ = np.array(run["searched"], dtype=np.float64).reshape(-1, 4).T
-    found = np.maximum(1.0 - none, 1e-12)
-    paid = payment(found / np.maximum(none, 1e-300))
-    none = 1.0 / (1.0 + paid)
-    return np.asarray(none + (1.0 - none) * np.maximum(found - (1.0 - error), 0.0) / found)
-
-
 def reliability_table(results: Sequence[Result]) -> str:
-    """Lay out stated against found errors by payment for looking again and again.
+    """Lay out stated against found errors of searches.
 
     A search counts once for each limit, at its first keyframe with a stated error below it, accepted or not. Where no
-    place of the map is right, the share of searches that ever state an error below a limit should be below it. Metres
-    are to a stated error below the limit of the right place.
+    place of the map is right, the share of searches that ever state an error below a limit should be below it (Ville).
+    Metres are to a stated error below the limit of the right place.
     """
     counted = [run for run in results if run["outcome"] in OUTCOMES and run["searched"]]
-    lost = [run["class"] == "outside" or run["family"] == "mirrored" for run in counted]
+    lost = [run for run in counted if run["class"] == "outside" or run["family"] == "mirrored"]
     lines = []
-    for name, payment in PAYMENTS.items():
-        stated = [stated_errors(run, payment) for run in counted]
-        for limit in STATED:
-            first = [(run, int((below < limit).argmax()), below) for run, below in zip(counted, stated, strict=True)]
-            found = [(run["searched"][k], below[k]) for run, k, below in first if below[k] < limit]
-            wrong = sum(not at[3] for at, _ in found)
-            metres = [at[0] for at, _ in found if at[3]]
-            ever = sum(bool(nowhere and (below < limit).any()) for nowhere, below in zip(lost, stated, strict=True))
-            mean = f"{np.mean([error for _, error in found]):.1e}" if found else NOTHING
-            lines.append([
-                name, f"< {limit:g}", str(len(found)), mean, str(wrong), between(wrong, len(found)),
-                f"{ever} of {sum(lost)}", between(ever, sum(lost)),
-                f"{np.median(metres):.1f}, {np.quantile(metres, 0.9):.1f}" if metres else NOTHING,
-            ])  # fmt: skip
+    for limit in STATED:
+        first = [next((at for at in run["searched"] if at[1] < limit), None) for run in counted]
+        found = [at for at in first if at is not None]
+        wrong = sum(not at[2] for at in found)
+        metres = [at[0] for at in found if at[2]]
+        ever = sum(any(at[1] < limit for at in run["searched"]) for run in lost)
+        lines.append([
+            f"< {limit:g}", str(len(found)), f"{np.mean([at[1] for at in found]):.1e}" if found else NOTHING,
+            str(wrong), between(wrong, len(found)), f"{ever} of {len(lost)}", between(ever, len(lost)),
+            f"{np.median(metres):.1f}, {np.quantile(metres, 0.9):.1f}" if metres else NOTHING,
+        ])  # fmt: skip
     head = (
-        "paid", "stated error", "first times", "mean stated", "wrong", "95 %", "no place is right", "95 %",
+        "stated error", "first times", "mean stated", "wrong", "95 %", "no place is right", "95 %",
         "right: median, 90 % m",
     )  # fmt: skip
     return table(head, lines)

@@ -127,7 +127,6 @@ class Searched(NamedTuple):
     """The most probable place of a searched keyframe."""
 
     error: float  # stated
-    none: float  # probability of no place of the map
     T_map_body: Pose
 
 
@@ -150,18 +149,17 @@ class Robot:
             if result.leader is not None and result.considered is not None:
                 T, none = result.leader @ request.T_odom_body, result.considered.none
                 error = max(none, 1.0 - (result.evidence.confidence or 0.0))
-                searched = Searched(error, none, pose_from(T[:3, :3], T[:3, 3] + self.origin))
+                searched = Searched(error, pose_from(T[:3, :3], T[:3, 3] + self.origin))
         return self.localizer.fix(), searched
 
 
 def first_fix(robot: Robot, drive: Drive) -> Result:
     """Follow a drive to its first fix; return outcome, last reason and searched keyframes.
 
-    ``searched`` has for each the metres driven, the stated error, the probability of no place of the map, and whether
-    the most probable place was right.
+    ``searched`` has for each the metres driven, the stated error, and whether the most probable place was right.
     """
     robot.localizer.reset()
-    said, way, searched = "", drive.driven, list[tuple[float, float, float, bool]]()
+    said, way, searched = "", drive.driven, list[tuple[float, float, bool]]()
     out: Result = {"outcome": "none", "state": robot.localizer.state.value, "searched": searched}
     for k, stamp in enumerate(drive.stamps):
         cloud = drive.frame(k)
@@ -172,7 +170,7 @@ def first_fix(robot: Robot, drive: Drive) -> Result:
         truth = None if drive.truth is None else drive.truth[k]
         if place is not None:
             right = judged(place.T_map_body, truth)["outcome"] == "right"
-            searched.append((round(float(way[k]), 2), place.error, place.none, right))
+            searched.append((round(float(way[k]), 2), place.error, right))
         said = fix.evidence.reason if fix.evidence is not None else said
         out |= {"state": fix.state.value, "reason": said, "metres": round(float(way[k]), 2), "frames": k + 1}
         if fix.T_map_body is not None:

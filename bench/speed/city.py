@@ -8,6 +8,7 @@ circle of a prior. In a wrong circle no robot may come to a pose.
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import shutil
@@ -23,16 +24,18 @@ from typing import Any
 import numpy as np
 
 import coview_kernels as kernels
+from bench.accuracy.choices import KeyframeView, Site, right
 from bench.harness.files import PYTHON, environment, fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, against, bounded, informs, judged, reached
 from bench.harness.worlds import MAPPER, prepared_run, world_name
-from bench.speed.scale import described, place_of, timed
 from bench.speed.search import bind_to_one_core
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
-from coview_stream.config import ConsensusConfig
+from coview_stream.config import Channel, ConsensusConfig, KeyframeConfig
+from coview_stream.descriptors.coview import describe, on_ground
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.hints import PlaceGuess
@@ -53,6 +56,9 @@ _CORNER = (400_000.0, 5_600_000.0, 100.0)
 _FRAMES, _DRIVES = 60, 6
 _FALSE = 1.0  # metres
 _SEARCHING = 0.05  # seconds: a shorter step did not search
+
+Keyframe = tuple[KeyframeView, Floats, dict[Channel, Floats32]]
+"""A keyframe, its centre (3,) in the odometry frame on the ground, and its descriptors by channel."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -175,6 +181,33 @@ class _AllCompared(Retrieval):
 
     def compared(self, area: Circle | None = None) -> SearchStations:
         return SearchStations(self.base_map.station_index, self.base_map.station_grid)
+
+
+def described(world: Path, site: BaseMap) -> list[Keyframe]:
+    """Return the keyframes of a world's drive, without their scans."""
+    config, out = site.descriptor_config, list[Keyframe]()
+    for seen in Site(world, math.inf).keyframes(KeyframeConfig().distance):
+        centre = on_ground(seen.scan, seen.position)
+        described = describe(seen.scan, centre, config)
+        out.append((replace(seen, scan=seen.scan[:0], submap=seen.submap[:0]), centre, described))
+    return out
+
+
+def timed(consensus: StationConsensus, keyframes: Sequence[Keyframe], area: Circle | None) -> dict[str, Any]:
+    """Let keyframes vote: milliseconds of each vote with its places, and the rank of the right place, or None."""
+    times, ranks = list[float](), list[int | None]()
+    for seen, centre, descriptors in keyframes:
+        begin = time.perf_counter()
+        consensus.vote(centre, descriptors, area)
+        places = consensus.hypotheses()
+        times.append(1e3 * (time.perf_counter() - begin))
+        ranks.append(next((k for k, place in enumerate(places) if right(place.T_map_odom, seen)), None))
+    return {"ms": times, "ranks": ranks}
+
+
+def place_of(seen: KeyframeView) -> Floats:
+    """Place of a keyframe (3,) in the map."""
+    return np.asarray((seen.T_map_odom @ np.append(seen.position, 1.0))[:3])
 
 
 def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Each kernel beside its NumPy twin: ``python -m bench kernels``.
 
 A row per kernel at the sizes of a localizer step and of a map build; a kernel that does not win here is deleted.
-``libraries`` compares those that the kernels run on; ``match``, ``frame``, ``map_build`` and ``registration`` compare
-with the best formulation known. Run it on idle cores: a busy neighbour slows the kernels, which use all threads, more
+``libraries`` compares those that the kernels run on; ``match`` and ``registration`` compare with the best formulation
+known. Run it on idle cores: a busy neighbour slows the kernels, which use all threads, more
 than NumPy.
 """
 

@@ -149,7 +149,7 @@ Reloc = Literal["auto", "coview", "learned"]
 class LearnedConfig:
     """Search of a scan's learned features among the map's (:mod:`coview_stream.localization.search.learned`).
 
-    Set by hand; ``python -m bench forest`` prints what comes of it, ``bench forest_scale`` what it costs.
+    Set by hand; ``python -m bench forest`` prints the places that it finds.
 
     Attributes:
         reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.

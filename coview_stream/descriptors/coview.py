@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +14,6 @@ from coview_stream.geometry.transforms import Points
 Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
-_VERTICAL: Literal["max", "off"] = "max"  # ``off`` keeps what eq. 2 alone does; bench ablation compares them
 _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
 EYE = 1.7
@@ -42,7 +39,7 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     if name == "paper":
         assert grid.mean_height is not None
         return kernels.paper_context(grid.max_height, grid.count, grid.mean_height)
-    return kernels.coview(grid.max_height, grid.count, vertical=_VERTICAL)
+    return kernels.coview(grid.max_height, grid.count)
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:

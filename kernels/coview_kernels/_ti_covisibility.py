@@ -11,25 +11,21 @@ Integers = ti.types.ndarray(i32, 1)
 SPAN = launch.SPAN
 
 
-OFF, MAX, PAPER = 0, 1, 2
-
-
 @ti.func
 def describe_grid(
-    at: i32, rings: i32, sectors: i32, rule: i32,
+    at: i32, rings: i32, sectors: i32, paper: i32,
     highest: ti.template(), count: ti.template(), mean: ti.template(), value: ti.template(),
 ):  # fmt: skip
     """Write the context of the grid that begins at ``at``.
 
     Slopes are h / (i + 1) with i from 0; they are compared by products that are exact, see reference/. Bins that are
-    vertically visible only have the value 0 (OFF, PAPER) or their greatest height (MAX); bins that are visible both
-    ways have their mean height by PAPER, which also sees bins on the line of sight itself. ``mean`` is read by PAPER.
+    vertically visible only have their greatest height, or 0 by the ``paper``. By the paper bins that are visible both
+    ways have their ``mean`` height, and bins on the line of sight itself are visible, too.
     """
     size = rings * sectors
     points = ti.cast(0, ti.i64)
-    if rule != OFF:
-        for b in range(at, at + size):
-            points += ti.max(count[b], 0)
+    for b in range(at, at + size):
+        points += ti.max(count[b], 0)
     for j in range(sectors):
         best_h = ti.cast(0.0, ti.f64)
         best_a = 0
@@ -42,20 +38,20 @@ def describe_grid(
                 h = ti.cast(top, ti.f64)
                 a = i + 1
                 dense = ti.cast(n, ti.i64) * size >= points
-                if best_a == 0 or h * best_a > a * best_h or (rule == PAPER and h * best_a == a * best_h):
+                if best_a == 0 or h * best_a > a * best_h or (paper == 1 and h * best_a == a * best_h):
                     best_h = h
                     best_a = a
                     out = top
-                    if rule == PAPER and dense:
+                    if paper == 1 and dense:
                         out = mean[b]
-                elif rule == MAX and dense:
+                elif paper == 0 and dense:
                     out = top
             value[b] = out
 
 
 @runtime.kernel
 def coview(
-    grids: i32, chunks: i32, rings: i32, sectors: i32, rule: i32,
+    grids: i32, chunks: i32, rings: i32, sectors: i32, paper: i32,
     highest: Floats, count: Integers, mean: Floats, value: Floats,
 ):  # fmt: skip
     """Write the contexts of all grids."""
@@ -65,4 +61,4 @@ def coview(
             step = (grids + chunks - 1) // chunks
             for m in range(ti.min(grids, c * step), ti.min(grids, (c + 1) * step)):
                 at = m * rings * sectors
-                describe_grid(at, rings, sectors, rule, highest, count, mean, value)
+                describe_grid(at, rings, sectors, paper, highest, count, mean, value)

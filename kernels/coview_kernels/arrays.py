@@ -6,7 +6,7 @@ Every public kernel checks its arguments here before any arithmetic; the error n
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +21,6 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 C64 = npt.NDArray[np.complex64]
 Mask = npt.NDArray[np.bool_]
-
-Vertical = Literal["off", "max"]
-VERTICALS: tuple[Vertical, ...] = get_args(Vertical)
-"""In the order of the numbers that the kernels take for them."""
 
 
 class PolarGrid(NamedTuple):

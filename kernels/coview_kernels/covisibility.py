@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, I32, VERTICALS, Vertical, check_same_shape
+from coview_kernels.arrays import F32, I32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import compiled_by
 
 _MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
-_RULES = (*VERTICALS, "paper")  # in the order of the numbers that the kernel takes for them
 _NOT_READ: F32 = np.zeros(1, dtype=np.float32)
 
 
@@ -49,10 +48,10 @@ def paper_context(max_height: npt.ArrayLike, count: npt.ArrayLike, mean_height: 
     height, points = _checked(max_height, count)
     mean: npt.NDArray[Any] = np.ascontiguousarray(mean_height, dtype=np.float32)
     check_same_shape("mean_height", mean, "max_height", height.shape)
-    return _described("paper", reference.paper_context, height, points, mean)
+    return _described(True, reference.paper_context, height, points, mean)
 
 
-def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical = "max") -> F32:
+def coview(max_height: npt.ArrayLike, count: npt.ArrayLike) -> F32:
     """Our co-view context: the bins that are visible from the ground *or* dense, with their greatest heights.
 
     Unlike :func:`paper_context` it keeps dense bins behind a wall, takes no means, and leaves out bins that lie on the
@@ -61,22 +60,15 @@ def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical =
     Args:
         max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it); ignored in empty bins.
         count: (..., R, S) int32, of voxels: counts of raw points depend on the scan pattern.
-        vertical: value of bins that are dense (eq. 3) only: ``max``, their greatest height, or ``off``, 0.
 
     Returns:
         (..., R, S) float32, metres.
 
     Raises:
-        ValueError: shapes disagree, there are fewer than two axes, or ``vertical`` is unknown.
+        ValueError: shapes disagree, or there are fewer than two axes.
     """
     height, points = _checked(max_height, count)
-    if vertical not in VERTICALS:
-        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")
-
-    def plain(height: F32, points: I32, _: F32) -> F32:
-        return reference.coview(height, points, vertical)
-
-    return _described(vertical, plain, height, points, _NOT_READ)
+    return _described(False, lambda height, points, _: reference.coview(height, points), height, points, _NOT_READ)
 
 
 def _checked(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
@@ -88,8 +80,8 @@ def _checked(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]
     return height, points
 
 
-def _described(rule: str, plain: Callable[[F32, I32, F32], F32], height: F32, count: I32, mean: F32) -> F32:
-    """Describe grids by a rule, in NumPy where they are few."""
+def _described(paper: bool, plain: Callable[[F32, I32, F32], F32], height: F32, count: I32, mean: F32) -> F32:
+    """Describe grids by our rule or the paper's, in NumPy where they are few."""
     if count.size < _MIN_BINS:
         return plain(height, count, mean)
 
@@ -99,7 +91,7 @@ def _described(rule: str, plain: Callable[[F32, I32, F32], F32], height: F32, co
         grids = math.prod(height.shape[:-2])
         Launch(
             *("covisibility", "coview", grids, min(runtime.workers(), max(1, grids)), rings, sectors),
-            _RULES.index(rule),
+            int(paper),
             *(a.reshape(-1) for a in (height, count, mean, value)),
         )()
         return value

@@ -13,8 +13,7 @@ WINDOW = 1 << 25
 """Bytes of a window: 16 launches for half a gigabyte."""
 
 LARGE = 1 << 26
-"""Bytes from which an array is used by windows: a pass takes an eighth of a second for a gigabyte
-(``python -m bench scale``)."""
+"""Bytes from which an array is used by windows: a pass takes an eighth of a second for a gigabyte."""
 
 _CAN_RELEASE = hasattr(mmap.mmap, "madvise") and hasattr(mmap, "MADV_DONTNEED")
 

@@ -6,7 +6,7 @@ of the lowest 32 frequencies: c_f is projected on the first 12 eigenvectors of i
 stations, 4 from frequency 16 on (Karhunen-Loeve transform), and stored as int8 with a step for each number. The query
 is transformed likewise, at higher precision; its channels may be weighted.
 
-The loss is the same at every shift: right places keep nine tenths of their lead, and ``python -m bench scale`` counts
+The loss is the same at every shift: right places keep nine tenths of their lead, and ``python -m bench city`` counts
 the right places that the search loses by it.
 
 Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold frequencies 0 to 15, rows 12 to 15 the higher

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.speed.map_build import baseline, ours, site
+from coview_kernels import reference
 from coview_stream.basemap.stations import (
     StationGrid,
     aligned_corner,
@@ -16,6 +16,8 @@ from coview_stream.basemap.stations import (
     rasterise,
 )
 from coview_stream.config import DescriptorConfig
+
+BLOCK = 2.0
 
 
 def test_raster_cells_hold_max_height_and_voxel_count():
@@ -129,11 +131,25 @@ def test_lower_storey_descriptor_excludes_tower_on_the_roof():
 
 @pytest.fixture(scope="module")
 def both():
-    cloud, stations = site(400_000, 1_000)
-    chosen = np.arange(0, 1_000, 50)
-    _, described = ours(cloud, stations)
-    _, _, exact = baseline(cloud, stations, chosen)
-    return {name: (described[name][chosen].astype(np.float32), exact[name]) for name in exact}
+    """Descriptors of twenty stations among boxes, from the raster and from the highest points of all voxels."""
+    rng, config = np.random.default_rng(1), DescriptorConfig()
+    xy = rng.uniform(0.0, 70.0, (400_000, 2))
+    z = 2.0 * np.sin(xy[:, 0] / 37.0) + 1.5 * np.cos(xy[:, 1] / 51.0) + rng.normal(0.0, 0.02, len(xy))
+    stations = np.column_stack([xy[:20], z[:20]]).astype(np.float32)
+    for middle, size, height in zip(rng.uniform(0, 70, (9, 2)), rng.uniform(4, 10, (9, 2)), range(4, 13), strict=True):
+        inside = (np.abs(xy - middle) < size).all(axis=1)
+        z[inside] += height * rng.choice([rng.random(), 1.0], inside.sum())
+    cloud = np.column_stack([xy, z]).astype(np.float32)
+    raster = rasterise(cloud, aligned_corner(cloud, BLOCK, 0.5), 0.5, config.voxel, 4)
+    thin = cloud[np.argsort(-cloud[:, 2])]
+    thin = thin[np.unique(np.floor(thin / config.voxel), axis=0, return_index=True)[1]]
+    exact = {"scan_context": [], "coview": []}
+    for station in stations.astype(np.float64):
+        grid, _ = reference.polar_bin(thin, station, config.rings, config.sectors, config.radius)
+        exact["scan_context"].append(np.where(grid.count > 0, np.maximum(grid.max_height, 0), 0))
+        exact["coview"].append(reference.coview(grid.max_height, grid.count))
+    found = describe_stations(raster, stations, config)
+    return {name: (found[name].astype(np.float32), np.stack(values)) for name, values in exact.items()}
 
 
 @pytest.mark.parametrize(("channel", "share", "distance"), [("scan_context", 0.05, 0.06), ("coview", 0.07, 0.1)])
@@ -143,9 +159,6 @@ def test_raster_descriptor_bins_are_close_to_exact_bins(both, channel, share, di
     found, exact = found.reshape(len(found), -1), exact.reshape(len(exact), -1)
     cosine = (found * exact).sum(axis=1) / np.linalg.norm(found, axis=1) / np.linalg.norm(exact, axis=1)
     assert (1 - cosine).mean() < distance
-
-
-BLOCK = 2.0
 
 
 def stations_of(side=6, z=0.0):

@@ -6,7 +6,7 @@ import pytest
 
 from bench.harness.rows import upper
 from bench.integrity import run
-from bench.integrity.integrity import PAYMENTS, Tally, adjusted, chosen, classes, reliability_table, stated_errors
+from bench.integrity.integrity import Tally, chosen, classes, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, Run, plan
 from bench.integrity.run import altered, drive_of, judged
@@ -87,40 +87,19 @@ def search(*keyframes):
     return [(2.0 * k, *keyframe) for k, keyframe in enumerate(keyframes)]
 
 
-def cells(runs, payment):
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in reliability_table(runs).splitlines()[2:]]
-    return {line[1]: line[2:] for line in lines if line[0] == payment}
-
-
 def test_reliability_counts_each_run_once_where_it_first_states_an_error():
-    sure = search((0.2, 0.2, True), (0.04, 0.03, True), (0.02, 0.02, False))
+    sure = search((0.2, True), (0.04, True), (0.02, False))
     runs = [result(str(k), "right", searched=sure) for k in range(9)]
-    runs.append(result("x", "none", searched=search((0.08, 0.01, False), (5e-3, 5e-3, True))))
-    runs.append(result("y", "none", family="mirrored", searched=search((0.9, 0.9, False), (5e-5, 5e-5, False))))
-    runs.append(result("z", "failed", searched=search((0.01, 0.01, False))))
-    found = cells(runs, "1 + j // 8")
+    runs.append(result("x", "none", searched=search((0.08, False), (5e-3, True))))
+    runs.append(result("y", "none", family="mirrored", searched=search((0.9, False), (5e-5, False))))
+    runs.append(result("z", "failed", searched=search((0.01, False))))
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in reliability_table(runs).splitlines()[2:]]
+    found = {limit: cells for limit, *cells in lines}
     assert {name: (row[0], row[2], row[4], row[6]) for name, row in found.items()} == {
         "< 0.1": ("11", "2", "1 of 1", "2.0, 2.0"), "< 0.01": ("2", "1", "1 of 1", "2.0, 2.0"),
         "< 0.001": ("1", "1", "1 of 1", "-"), "< 0.0001": ("1", "1", "1 of 1", "-"),
     }  # fmt: skip
     assert (found["< 0.1"][1], found["< 0.01"][3]) == ("4.0e-02", "0.01 to 1")
-
-
-def test_payments_for_looking_again_change_the_odds_of_no_place_alone():
-    run = result("1", "none", searched=search(*[(0.11, 0.01, True)] * 16))
-    stated = {name: stated_errors(run, payment) for name, payment in PAYMENTS.items()}
-    np.testing.assert_allclose(stated["nothing (Ville)"], 0.11)  # as measured
-    paid = 99.0 / np.where(np.arange(16) < 7, 1.0, np.where(np.arange(16) < 15, 2.0, 3.0))
-    np.testing.assert_allclose(stated["1 + j // 8"], 1.0 - 0.89 / 0.99 * paid / (1.0 + paid))
-    assert stated["j (j + 1)"][[0, 1]] == pytest.approx([1.0 - 0.89 / 0.99 * o / (1.0 + o) for o in (49.5, 16.5)])
-
-
-def test_the_adjusted_largest_evidence_is_kept_and_worth_less():
-    kept = adjusted(np.array([10.0, 1e6, 1.0]))
-    assert kept[1] == kept[2] == pytest.approx(1e6 / np.log(1e6) ** 2, rel=1e-4)
-    # by Ville the largest exceeds e with a probability of 1 / e at most: then it is worth 1 on average
-    log = np.arange(0.005, 600.0, 0.01)
-    assert 0.01 * np.sum(adjusted(np.exp(log)) * np.exp(-log)) == pytest.approx(1.0, abs=2.0 / 600.0)
 
 
 def every(group, count=1080):

@@ -18,9 +18,6 @@ def _kernel_for_any_number_of_grids():
         yield
 
 
-VERTICALS = st.sampled_from(["max", "off"])
-
-
 @st.composite
 def grids(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -34,13 +31,11 @@ def grids(draw):
     return height, count
 
 
-@given(grids(), VERTICALS)
-def test_kernel_agrees_with_numpy(grid, vertical):
-    height, count = grid
-    context = coview(height, count, vertical)
+@given(grids())
+def test_kernel_agrees_with_numpy(grid):
+    context = coview(*grid)
     assert context.dtype == np.float32
-    expected = reference.coview(height, count, vertical)
-    np.testing.assert_array_equal(context, expected)
+    np.testing.assert_array_equal(context, reference.coview(*grid))
 
 
 @given(grids())
@@ -129,8 +124,8 @@ def test_wall_hides_lower_bins_behind_it_but_not_higher_ones():
 def test_dense_bins_behind_a_wall_are_visible_from_above():
     height = np.array([[5.0], [4.0], [3.0]], dtype=np.float32)
     count = np.array([[1], [7], [1]], dtype=np.int32)
-    assert coview(height, count, "max")[:, 0].tolist() == [5, 4, 0]
-    assert coview(height, count, "off")[:, 0].tolist() == [5, 0, 0]
+    assert coview(height, count)[:, 0].tolist() == [5, 4, 0]
+    assert visible(height, count)[:, 0].tolist() == [True, False, False]
 
 
 def test_mean_density_counts_empty_bins():
@@ -140,12 +135,12 @@ def test_mean_density_counts_empty_bins():
     assert coview(height, count)[1, 0] == 4.0
 
 
-@given(grids(), VERTICALS)
-def test_values_of_empty_bins_are_ignored(grid, vertical):
+@given(grids())
+def test_values_of_empty_bins_are_ignored(grid):
     height, count = (a.copy() for a in grid)
-    expected = coview(height, count, vertical)
+    expected = coview(height, count)
     height[count == 0] = np.nan
-    np.testing.assert_array_equal(coview(height, count, vertical), expected)
+    np.testing.assert_array_equal(coview(height, count), expected)
 
 
 def test_errors_name_the_argument():
@@ -154,7 +149,5 @@ def test_errors_name_the_argument():
         coview(grid, np.zeros((3, 2)))
     with pytest.raises(ValueError, match="max_height"):
         coview(np.zeros(3), np.zeros(3))
-    with pytest.raises(ValueError, match="vertical"):
-        coview(grid, grid, "highest")
     with pytest.raises(ValueError, match="mean_height"):
         paper_context(grid, grid, np.zeros((3, 2)))

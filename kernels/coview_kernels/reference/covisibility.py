@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_kernels.arrays import F32, I32, Mask, Vertical
+from coview_kernels.arrays import F32, I32, Mask
 
 _MIN_SLOPE = -np.finfo(np.float64).max  # of a height of minus infinity: above the slopes of empty bins
 
@@ -31,12 +31,9 @@ def dense(count: I32) -> Mask:
     return enough
 
 
-def coview(max_height: F32, count: I32, vertical: Vertical = "max") -> F32:
+def coview(max_height: F32, count: I32) -> F32:
     """See :func:`coview_kernels.coview`."""
-    seen = visible(max_height, count)
-    if vertical != "off":
-        seen |= dense(count)
-    return np.where(seen, max_height, np.float32(0))
+    return np.where(visible(max_height, count) | dense(count), max_height, np.float32(0))
 
 
 def paper_context(max_height: F32, count: I32, mean_height: F32) -> F32:
