@@ -40,7 +40,6 @@ COMMANDS = {
     "ablation, spacing": "ablation --only spacing --picture docs/images/spacing.png",
     "accuracy": "accuracy --only worlds",
     "dirt": "accuracy --only dirt",
-    "peers, tracking": "peers --tracking",
     "conditions beside the paper": "conditions --conditions base --paper",
     "reliability": "integrity --count 110",
     "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",

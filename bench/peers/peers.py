@@ -7,7 +7,6 @@ of those. Extra ``peers``; a peer that is missing gets a line with the remedy.
 from __future__ import annotations
 
 import math
-import os
 import pickle
 import signal
 import sys
@@ -32,15 +31,10 @@ from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CoViewError, require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse, norms, pose_from, rot_z
-from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
-from coview_stream.localization.registration.register import register
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
+from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.sim.casting import open3d
-
-OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking starts, metres and radians
 
 
 @dataclass(frozen=True)
@@ -56,14 +50,6 @@ class Method(Protocol):
 
     def answer(self, place: Place) -> Answer:
         """Say where the submap lies, or that it is not known."""
-
-
-def started(place: Place) -> Pose:
-    """Return ``T_map_submap`` (4, 4) that tracking starts from: the truth, off in a direction of the place's own."""
-    rng = np.random.default_rng(int(abs(place.T_map_submap[0, 3]) * 1e3))
-    heading, turn = rng.uniform(-np.pi, np.pi), TURNED * rng.choice([-1.0, 1.0])
-    off = pose_from(rot_z(turn), [OFF * np.cos(heading), OFF * np.sin(heading), 0.0])
-    return np.asarray(place.T_map_submap @ off)
 
 
 class Keyframes:
@@ -85,30 +71,6 @@ class Keyframes:
             if accepted is not None:
                 return Answer(accepted.T_map_odom @ place.T_odom_submap, True)
         return Answer(None, False)
-
-
-class Tracking:
-    """Registration from a pose nearby, believed if the scan speaks for it, as for every registration."""
-
-    def __init__(self, site: BaseMap) -> None:
-        coview_kernels.warm_up()
-        self._site, self._config = site, LocalizerConfig().registration
-        self._maps = LocalMaps(site, self._config.source_range)
-
-    def answer(self, place: Place) -> Answer:
-        """Register the submap."""
-        start, newest = started(place), place.queries[-1]
-        source = prepare_scan(place.submap, np.zeros(3), self._config)
-        target = self._maps.around(start[:3, 3])
-        if target is None:
-            return Answer(None, False)
-        found = register(source, start, target, self._config, self._config.track, centre=np.zeros(3))
-        if found is None:
-            return Answer(None, False)
-        T = found.T_map_source
-        # the submap's frame takes the place of odometry's
-        scan = ObservedScan.of(source, newest.cloud, inverse(place.T_odom_submap) @ newest.T_odom_body)
-        return Answer(T, PlaceEvidence(self._site).observe(scan, T).ratio > 0.0)
 
 
 class ByPaper:
@@ -242,69 +204,17 @@ class Features:
         return cloud, feature
 
 
-def small_gicp() -> Any:
-    """Import it, or raise ``DependencyError`` with the remedy."""
-    return require_library("small_gicp", "small-gicp>=1.0.1", "the comparison with small_gicp")
-
-
-class SmallGicp:
-    """small_gicp 1.0 (MIT): GICP or VGICP (voxels of 1 m, covariances of 10 points) to a prepared cloud."""
-
-    def __init__(self, points: Points, way: Literal["GICP", "VGICP"], voxel: float, near: float, threads: int) -> None:
-        """Prepare the target, thinned to ``voxel`` metres; correspondences count within ``near`` metres."""
-        self._library = small_gicp()
-        self._threads = threads
-        self._target, tree = self.prepared(points, voxel)
-        self._about: dict[str, Any] = {"max_correspondence_distance": near, "num_threads": threads}
-        if way == "VGICP":
-            voxels = self._library.GaussianVoxelMap(1.0)
-            voxels.insert(self._target)
-            self._target = voxels
-        else:
-            self._about["target_tree"] = tree
-
-    def prepared(self, points: Points, voxel: float) -> Any:
-        """Thin a cloud and estimate its covariances; with its search tree."""
-        return self._library.preprocess_points(
-            points.astype(np.float64), downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
-        )
-
-    def align(self, source: Any, start: Pose) -> Any:
-        """Align a prepared cloud to the target from a pose nearby."""
-        return self._library.align(self._target, source, init_T_target_source=start, **self._about)
-
-
-class NearbyGicp(SmallGicp):
-    """small_gicp: the submap to the map, from a pose nearby, on all cores.
-
-    In its favour the submap is cut to 50 m and thinned to 0.5 m, as in our registration: without that it is as exact
-    and two to four times as slow. Preparing the submap is part of a query. It vouches when it has converged.
-    """
-
-    MAP, SUBMAP, REACH, NEAR = 0.25, 0.5, 50.0, 1.0
-
-    def __init__(self, site: BaseMap, way: Literal["GICP", "VGICP"]) -> None:
-        super().__init__(np.array(site.points), way, self.MAP, self.NEAR, os.cpu_count() or 1)
-
-    def answer(self, place: Place) -> Answer:
-        """Prepare the submap and align it."""
-        source, _ = self.prepared(place.submap.compress(norms(place.submap) < self.REACH, axis=0), self.SUBMAP)
-        found = self.align(source, started(place))
-        return Answer(np.array(found.T_target_source), bool(found.converged))
-
-
 NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
 
 class Peer(NamedTuple):
-    """A method with its name, and how it is made for a map; ``tracking`` starts from a pose nearby, not nowhere."""
+    """A method with its name, and how it is made for a map."""
 
     name: str
     make: Callable[[BaseMap], Method]
-    tracking: bool = False
 
 
-OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
+OURS = "coview_stream"
 
 PEERS = (
     Peer(OURS, Keyframes),
@@ -314,9 +224,6 @@ PEERS = (
     Peer("MapClosures", MapClosures),
     Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),
     Peer("Open3D FPFH + FGR", partial(Features, way="fgr")),
-    Peer(OUR_TRACKING, Tracking, tracking=True),
-    Peer("small_gicp GICP", partial(NearbyGicp, way="GICP"), tracking=True),
-    Peer("small_gicp VGICP", partial(NearbyGicp, way="VGICP"), tracking=True),
 )
 
 
@@ -439,7 +346,6 @@ def options(parser: ArgumentParser) -> None:
     """Add how many places, and how long."""
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
-    parser.add_argument("--tracking", action="store_true", help="only those that start from a pose nearby")
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
 
 
@@ -449,11 +355,10 @@ def rows(asked: Namespace) -> Iterator[Row]:
         signal.alarm(math.ceil(asked.limit))  # ends this process
         yield from _asked(*asked.trial)
         return
-    peers = [peer for peer in PEERS if peer.tracking or not asked.tracking]
-    trials = list(contest(peers, 4 if asked.quick else asked.places, asked.limit))
-    for peer in peers:
+    trials = list(contest(PEERS, 4 if asked.quick else asked.places, asked.limit))
+    reference = [trial for trial in trials if trial.peer == OURS]
+    for peer in PEERS:
         theirs = [trial for trial in trials if trial.peer == peer.name]
-        reference = [trial for trial in trials if trial.peer == (OUR_TRACKING if peer.tracking else OURS)]
         details = {"trials": [asdict(trial) for trial in theirs]}
         for row in compared(theirs, reference, ours=peer.name.startswith(OURS)):
             yield replace(row, details=details)

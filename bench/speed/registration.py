@@ -20,20 +20,29 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from bench.harness.rows import Row, against, informs
+from bench.harness.rows import Row, against, informs, listed
 from bench.harness.worlds import opened
-from bench.peers.peers import SmallGicp, small_gicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.config import RegistrationConfig
+from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, rotation_angle, to_local, transform
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
+    inverse,
+    pose_from,
+    rot_z,
+    rotation_angle,
+    to_local,
+    transform,
+)
 from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
 from coview_stream.sim import SimulationConfig
@@ -46,6 +55,38 @@ SCALES = {"tracking": (0.8, 0.4), "search": (1.5, 0.8, 0.4), "far": CONFIG.searc
 FOUND = 0.3, 1.0  # metres and degrees
 WAYS: dict[Literal["GICP", "VGICP"], float] = {"GICP": 1.0, "VGICP": 2.0}  # correspondences within, metres
 _CLEAR = 0.5  # metres above the ground, as the engine's registration has it
+
+
+def small_gicp() -> Any:
+    """Import it, or raise ``DependencyError`` with the remedy."""
+    return require_library("small_gicp", "small-gicp>=1.0.1", "the comparison with small_gicp")
+
+
+class SmallGicp:
+    """small_gicp 1.0 (MIT): GICP or VGICP (voxels of 1 m, covariances of 10 points) to a prepared cloud."""
+
+    def __init__(self, points: Points, way: Literal["GICP", "VGICP"], voxel: float, near: float, threads: int) -> None:
+        """Prepare the target, thinned to ``voxel`` metres; correspondences count within ``near`` metres."""
+        self._library = small_gicp()
+        self._threads = threads
+        self._target, tree = self.prepared(points, voxel)
+        self._about: dict[str, Any] = {"max_correspondence_distance": near, "num_threads": threads}
+        if way == "VGICP":
+            voxels = self._library.GaussianVoxelMap(1.0)
+            voxels.insert(self._target)
+            self._target = voxels
+        else:
+            self._about["target_tree"] = tree
+
+    def prepared(self, points: Points, voxel: float) -> Any:
+        """Thin a cloud and estimate its covariances; with its search tree."""
+        return self._library.preprocess_points(
+            points.astype(np.float64), downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
+        )
+
+    def align(self, source: Any, start: Pose) -> Any:
+        """Align a prepared cloud to the target from a pose nearby."""
+        return self._library.align(self._target, source, init_T_target_source=start, **self._about)
 
 
 Peers = dict[tuple[str, int], SmallGicp]  # by way and tile
@@ -71,21 +112,27 @@ def rows(asked: Namespace) -> Iterator[Row]:
         peers |= {(w, id(target)): SmallGicp(target.points, w, 0.05, near, threads) for w, near in WAYS.items()}
         nearest(target.grid, target.points[:1], 1.0)  # sorts the tile
     for kind in STARTS:
-        results, shares = _trials(found, kind, peers)
-        if kind == "far":
-            for name, share in shares.items():
-                yield informs(f"registration/far: {name}, starts found", share, "%")
-            continue
-        took, *error = results["ours"]
-        for way in WAYS:
-            name, (took_them, *error_them) = f"registration/{kind}: {way}", results[way]
-            row = against(name, took, took_them, "ms", LEAST)
-            holds = bool(row.holds) and all(a <= EQUAL * b for a, b in zip(error, error_them, strict=True))
+        results = _trials(found, kind, peers)
+        ours = results["ours"]
+        for way in WAYS if kind != "far" else ():
+            theirs = results[way]
+            row = against(f"registration/{kind}: {way}", ours["ms"], theirs["ms"], "ms", LEAST)
+            holds = bool(row.holds) and all(ours[key] <= EQUAL * theirs[key] for key in ("cm", "deg"))
             yield replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
-        for name in ("ours", *WAYS):
-            _, metres, degrees = results[name]
-            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm")
-            yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
+        about = {"starts": kind, "threads": threads}
+        figures = [about | {"way": way} | of for way, of in results.items()]
+        yield informs(f"registration/{kind}: starts found", ours["found"], "%", {"figures": figures})
+
+
+COLUMNS = (
+    ("starts", "starts", None), ("threads", "threads", 0), ("", "way", None), ("ms, median", "ms", 0),
+    ("position, rms cm", "cm", 2), ("rotation, rms deg", "deg", 3), ("found %", "found", 1),
+)  # fmt: skip
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """One line for each kind of start and each way."""
+    return {"": listed(COLUMNS, [of for row in rows for of in row.details.get("figures", ())])}
 
 
 def places(count: int) -> Iterator[Place]:
@@ -112,12 +159,10 @@ def places(count: int) -> Iterator[Place]:
                 yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
 
 
-def _trials(
-    found: list[Place], kind: str, peers: Peers
-) -> tuple[dict[str, tuple[float, float, float]], dict[str, float]]:
-    """Median milliseconds and root mean squares of metres and degrees of every way, two starts at each place.
+def _trials(found: list[Place], kind: str, peers: Peers) -> dict[str, dict[str, float]]:
+    """Return figures of every way, of two starts at each place.
 
-    Beside them, the share of the starts that each way has found, %.
+    Median milliseconds, root mean squares of centimetres and degrees, and the share of the starts that are found, %.
     """
 
     def ours(place: Place, begin: Pose) -> Pose | None:
@@ -147,7 +192,10 @@ def _trials(
                 degrees = float(np.degrees(rotation_angle(inverse(place.truth) @ T)))
             values[name].append((took, error, degrees))
         order.reverse()
-    arrays = {name: np.array(value[1:]) for name, value in values.items()}
-    rms = {name: np.sqrt(np.mean(array[:, 1:] ** 2, axis=0)).tolist() for name, array in arrays.items()}
-    shares = {name: 100.0 * float(np.mean((array[:, 1:] < FOUND).all(axis=1))) for name, array in arrays.items()}
-    return {name: (float(np.median(array[:, 0])), *rms[name]) for name, array in arrays.items()}, shares
+    out: dict[str, dict[str, float]] = {}
+    for name, value in values.items():
+        array = np.array(value[1:])
+        metres, degrees = np.sqrt(np.mean(array[:, 1:] ** 2, axis=0)).tolist()
+        share = 100.0 * float(np.mean((array[:, 1:] < FOUND).all(axis=1)))
+        out[name] = {"ms": float(np.median(array[:, 0])), "cm": 100.0 * metres, "deg": degrees, "found": share}
+    return out
