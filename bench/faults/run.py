@@ -178,7 +178,7 @@ COLUMNS = (
     ("first fix m", "first_m", 1), ("false", "false", 0), ("in runs", "false_runs", 0), ("beyond level", "over", 0),
     ("worst m", "worst_m", 2), ("deg", "worst_deg", 1), ("goes on in", "goes_on", 0),
     ("else ends after s", "last_s", 1), ("m", "last_m", 1), ("named in", "named", None),
-    ("after s", "named_s", 1), ("name", "name", None),
+    ("after s", "named_s", 1),
 )  # fmt: skip
 
 
@@ -201,7 +201,6 @@ def _of_fault(name: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         **{key: worst(key, ended) for key in ("last_s", "last_m")},
         "named": str(len(named)) if runs[0]["to_name"] else NOTHING,
         "named_s": worst("named_s", named),
-        "name": re.sub(r"[|\n]| what the lidar sees.*", "", named[0]["name"])[:80] if named else "",
     }  # fmt: skip
 
 

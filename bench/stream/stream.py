@@ -123,15 +123,19 @@ def lidars(stage: Stage) -> Iterator[Row]:
     start = senders[0].begin()
     for helper in senders[1:]:
         helper.begin(start)
+    measured = []
     for kind, way, plan, drive, helper in zip(LIDARS, ways, plans, drives, senders, strict=True):
         numbers = stage.measure(plan, helper.result(), start, drive)
-        about = {"scene": home.scene, "way": way, "kind": kind, "sensor": LIDARS[kind][0]}
-        yield replace(punctual(f"{kind}: ", numbers["late_s"]), details=about | numbers)
-        yield judged(f"{kind}: found", f"{numbers['first_fix_m']:.1f} m", "found", numbers["poses"] > 0)
-        wrong = numbers["wrong"]
-        yield judged(f"{kind}: false or unreadable poses", f"{wrong} of {numbers['poses']}", "0", wrong == 0)
-        yield rated(f"{kind}: rate while TRACKING", [numbers["rate_hz"]])
-        yield bounded(f"{kind}: jitter p99", numbers["jitter_ms"], "ms", MAX_JITTER)
+        measured.append({"scene": home.scene, "way": way, "kind": kind, "sensor": LIDARS[kind][0]} | numbers)
+        yield informs(f"{kind}: median error", numbers["median_m"], "m", measured[-1])
+    found = [numbers for numbers in measured if numbers["poses"]]
+    wrong, poses = (sum(numbers[key] for numbers in measured) for key in ("wrong", "poses"))
+    yield punctual("", max(numbers["late_s"] for numbers in measured))
+    yield judged("robots found", f"{len(found)} of {len(measured)}", "all", len(found) == len(measured))
+    yield judged("false or unreadable poses", f"{wrong} of {poses}", "0", wrong == 0)
+    if found:
+        yield rated("rates while TRACKING", [numbers["rate_hz"] for numbers in found])
+        yield bounded("jitter p99, worst", max(numbers["jitter_ms"] for numbers in found), "ms", MAX_JITTER)
     yield informs("the machine's jitter p99", numbers["machine_jitter_ms"], "ms")
 
 
