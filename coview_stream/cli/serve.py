@@ -144,9 +144,9 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.node.engine_process import start_children
     from coview_stream.stream.node.heap import bound_heaps
 
+    tables = settings(args)
     require_installed("scipy", "coview-stream serve")  # before the messages' libraries, which are only a part of [node]
     bound_heaps(2, map_large=True)
-    tables = settings(args)
     # first of all: the engines take longest to start, and nothing that they need is known better later
     children = start_children(args.odometry == KISS_ICP)
     with contextlib.ExitStack() as closing, blaming_file(args):

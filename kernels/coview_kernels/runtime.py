@@ -24,6 +24,8 @@ import functools
 import hashlib
 import importlib
 import importlib.util
+import inspect
+import linecache
 import os
 import shutil
 import stat
@@ -95,7 +97,30 @@ def _import(name: str) -> ModuleType:
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
     os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # else Taichi asks over the network, once a day
-    return importlib.import_module(name)
+    with _quick_frames():
+        return importlib.import_module(name)
+
+
+@contextlib.contextmanager
+def _quick_frames() -> Iterator[None]:
+    """Answer this thread's ``inspect.getframeinfo`` from the frame alone, without a look at every module.
+
+    The library asks it for the line of every function that it decorates, its own and ours: a third of its import.
+    """
+    original, ours = inspect.getframeinfo, threading.get_ident()
+
+    def quick(frame: Any, context: int = 1) -> inspect.Traceback:
+        if threading.get_ident() != ours or context != 1:
+            return original(frame, context)
+        code, number = frame.f_code, frame.f_lineno
+        line = linecache.getline(code.co_filename, number, frame.f_globals)
+        return inspect.Traceback(code.co_filename, number, code.co_name, [line], 0)
+
+    inspect.getframeinfo = quick
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = original
 
 
 def _program(library: Any) -> Any:
@@ -163,17 +188,6 @@ def mark_of(names: Sequence[str]) -> Path | None:
     version = ".".join(map(str, library.__version__))
     digest = hashlib.sha256(" ".join(names).encode()).hexdigest()[:8]
     return folder / f"stored-{name}-{version}-{workers()}-{digest}"
-
-
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold a lock among processes, where the system has them: two that store at once would get in each other's way."""
-    with path.open("w") as file:
-        with contextlib.suppress(ImportError):
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 _temporary: set[Path] = set()
@@ -260,7 +274,11 @@ def program() -> Any:
 
 def kernels(name: str) -> Any:
     """Return the module ``_ti_<name>``, imported at first use; call on the owner thread."""
-    return importlib.import_module(f"coview_kernels._ti_{name}")
+    name = f"coview_kernels._ti_{name}"
+    if name in sys.modules:
+        return sys.modules[name]
+    with _quick_frames():
+        return importlib.import_module(name)
 
 
 def _usable(name: str) -> bool:

@@ -12,7 +12,10 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -21,7 +24,8 @@ from coview_kernels import runtime
 SAMPLE = np.ones((2, 3), dtype=np.float32)
 """A cloud for the calls of :func:`compiled_by`; not to be written to."""
 
-_PATIENCE = 300.0  # seconds; on an idle computer it takes five
+_PATIENCE = 600.0  # seconds to wait for it; on an idle computer it takes five, on the smallest boards some minutes
+_INTERVAL = 1.0  # seconds between two looks at another process that compiles
 
 _calls: dict[str, Callable[[], object]] = {}
 
@@ -41,20 +45,56 @@ def warm_up(*names: str) -> None:
         _calls[name]()
 
 
-def compile_once(*names: str) -> None:
+def compile_once(*names: str, say: Callable[[str], None] = lambda text: None) -> None:
     """Have the kernels of public functions compiled and stored by another process, the first time on a machine.
 
     The library stores them only when a process exits by itself: one that will be killed calls this before its first
-    kernel, and would compile them at every start. Does nothing where compiled kernels cannot be kept.
+    kernel, and would compile them at every start. The other process goes on if this one is killed meanwhile. ``say``
+    is called with each step. Does nothing where compiled kernels cannot be kept.
     """
     mark = runtime.mark_of(names)
     if mark is None or mark.is_file():
         return
-    code = "import sys; from coview_kernels import warm_up; warm_up(*sys.argv[1:])"
-    with contextlib.suppress(OSError, subprocess.SubprocessError), runtime.locked(mark.with_name("coview.lock")):
-        if mark.is_file():  # another process has, meanwhile
+    code = "import sys; from coview_kernels.warm_up import _store; _store(*sys.argv[1:])"
+    command = [sys.executable, "-P", "-c", code, str(mark), *names]
+    with contextlib.suppress(OSError):
+        quiet = subprocess.DEVNULL  # it may outlive us, and would keep our output open
+        with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet, text=True) as helper:
+            for line in helper.stdout or ():
+                say(line.strip())
+
+
+def _store(mark: str, *names: str) -> None:
+    """Compile and store kernels unless the file ``mark`` says that they are, and print each step."""
+    done = Path(mark)
+    with done.with_name("coview.lock").open("w") as lock:  # two that store at once would get in each other's way
+        _wait_for(lock)
+        if done.is_file():  # another process has, meanwhile
             return
-        subprocess.run(
-            [sys.executable, "-P", "-c", code, *names], check=True, stdin=subprocess.DEVNULL, timeout=_PATIENCE
-        )
-        mark.touch()
+        for number, name in enumerate(names, 1):
+            _tell(f"compiling kernels for this machine, once: {number} of {len(names)}")
+            warm_up(name)
+        runtime.shutdown()
+        done.touch()
+
+
+def _wait_for(lock: TextIO) -> None:
+    """Wait until no other process holds the lock, where the system has locks, and take it."""
+    end = time.monotonic() + _PATIENCE
+    with contextlib.suppress(ImportError, OSError):  # the latter: a file system without locks
+        import fcntl
+
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                _tell("waiting for another process that compiles kernels")
+                time.sleep(_INTERVAL)
+            else:
+                return
+
+
+def _tell(text: str) -> None:
+    with contextlib.suppress(OSError):  # the process that we tell may have been killed
+        sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()

@@ -275,11 +275,16 @@ def test_kernels_are_found_by_their_sources_and_the_constants_that_they_use(tmp_
 def test_process_that_will_be_killed_has_its_kernels_stored_by_another_one_once(name, tmp_path):
     variable = {"quadrants": "QD", "taichi": "TI"}[name] + "_OFFLINE_CACHE_FILE_PATH"
     code = (
-        "import os\nfrom coview_kernels.warm_up import compile_once\ncompile_once('nearest')\nos.kill(os.getpid(), 9)\n"
+        "import os\nfrom coview_kernels.warm_up import compile_once\n"
+        "def end(text=''):\n    os.kill(os.getpid(), 9)\n"
+        "compile_once('nearest', say=end)\nend()\n"
     )
     for stored in (True, False):  # the second process has none compiled again
         done = run_python(code, **{"COVIEW_KERNELS": name, variable: str(tmp_path)})
         assert (abs(done.returncode), done.stderr) == (9, "")
+        end = time.monotonic() + 120.0
+        while not list(tmp_path.rglob("stored-*")) and time.monotonic() < end:
+            time.sleep(0.1)
         kernels = [*tmp_path.rglob("*.qdc"), *tmp_path.rglob("*.tic")]
         assert bool(kernels) == stored
         for kernel in kernels:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import os
 import socket
 import subprocess
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from coview_stream.config import LocalizerConfig
     from coview_stream.stream.node.engine_queue import Job, Result
     from coview_stream.stream.node.engines import Engine
+
+log = logging.getLogger("coview_stream.node")
 
 NICE = {"odometry": 2, "track": 4, "search": 10}
 """Niceness of the engines, below the pose clock and the receiving threads in the parent. Every pose waits for
@@ -150,7 +153,7 @@ class EngineProcess:
         trust: demands that the map is signed; None takes any.
         child: the first child, started before; None starts one.
         job_timeout: seconds after which a job counts as hung.
-        open_timeout: seconds after which opening the map, or preparing for the first job, does.
+        open_timeout: seconds after which a start does, from its newest step: a kernel compiled, the map opened.
     """
 
     def __init__(
@@ -174,6 +177,7 @@ class EngineProcess:
         self._lock = threading.Lock()
         self._child: EngineChild | None = None
         self._awaited: list[str] = []  # messages that a fresh child has yet to send
+        self._step: str | None = None  # newest step of its start
         self._stopped: int | None = None  # process that was stopped at the previous check
         self._deadline = float("inf")  # local time at which the present job counts as hung
         self._hung = False
@@ -215,15 +219,25 @@ class EngineProcess:
             self._await(message, cancelled)
 
     def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
-        with self._exchange(self.open_timeout) as pipe:
-            while not pipe.poll(_POLL_INTERVAL):
-                if cancelled():
-                    raise CancelledError(f"the {self.kind} engine is no longer wanted")
-                self.end_hung_job()
-            kind, value = pipe.recv()
+        while message in self._awaited:
+            with self._exchange(self.open_timeout) as pipe:
+                while not pipe.poll(_POLL_INTERVAL):
+                    if cancelled():
+                        raise CancelledError(f"the {self.kind} engine is no longer wanted")
+                    self.end_hung_job()
+                news = pipe.recv()
+            self._take(*news)
+
+    def _take(self, kind: str, value: str | None) -> None:
+        """Take in a message of a fresh child: an error, a step of its start or an end of the wait."""
         if kind == "error":
             raise CoViewError(value)
-        self._awaited.remove(message)
+        if kind == "step":
+            if value != self._step:
+                log.info("%s engine: %s", self.kind, value)
+            self._step = value
+        else:
+            self._awaited.remove(kind)
 
     def run(self, job: Job) -> Result:
         """Do one job; a dead child is started again first."""
@@ -267,7 +281,9 @@ class EngineProcess:
             return
         try:
             while self._awaited and child.pipe.poll():
-                self._await(self._awaited[0])
+                with self._exchange(self.open_timeout) as pipe:
+                    news = pipe.recv()
+                self._take(*news)
         except (CoViewError, OSError) as error:  # the latter: closed by another thread meanwhile
             self._end()
             raise DiedError(str(error) if isinstance(error, CoViewError) else f"the {self.kind} engine died") from error
@@ -352,12 +368,13 @@ def work(
     from coview_kernels.warm_up import compile_once
     from coview_stream.stream.node import engines
 
-    compile_once(*engines.KINDS[kind].kernels, *engines.KINDS[kind].later_kernels)
-    for name in engines.KINDS[kind].kernels:
+    kernels, later_kernels = engines.KINDS[kind].kernels, engines.KINDS[kind].later_kernels
+    compile_once(*kernels, *later_kernels, say=lambda text: pipe.send(("step", text)))
+    for name in kernels:
         if pipe.poll():  # the node waits for its engines, or soon a robot for its search: no more standing back
             _set_group_nice(0)
         warm_up(name)
-    steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in engines.KINDS[kind].later_kernels)
+    steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in later_kernels)
 
     def use_pause() -> None:
         while steps and not pipe.poll():

@@ -61,9 +61,9 @@ class Engine(ABC):
 class TrackEngine(Engine):
     """Localizers of all robots: deskewing, keyframes, registration around a known place."""
 
-    kernels = ("transform_unique", "nearest", "align_planes")
-    # of robots that have a place to be tracked from, which takes a search longer than it does to load them
-    later_kernels = ("crop_points", "field_scores", "PointGrid")
+    kernels = ("transform_unique",)
+    # of robots that have driven a metre, and of those that have a place to be tracked from
+    later_kernels = ("nearest", "align_planes", "crop_points", "field_scores", "PointGrid")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map

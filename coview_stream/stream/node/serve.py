@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
-
-_SLOW = 3.0  # seconds, after which a start says why it takes long
 
 
 @dataclass(frozen=True)
@@ -128,18 +125,10 @@ def open_node(
             if (guess := options.guesses.get(session.keys.robot)) is not None:
                 session.guess_place(guess)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
-        slow = begin + _SLOW
-
-        def said_and_cancelled() -> bool:
-            nonlocal slow
-            if time.monotonic() > slow:
-                slow = math.inf
-                log.info("preparing: on the first start, kernels are compiled for this machine, some seconds of work")
-            return cancelled()
-
         for name, engine in engines.items():
             if name != "search":  # the search engine may become ready later
-                engine.wait_ready(said_and_cancelled)
+                engine.wait_ready(cancelled)
+        engines["search"].start()
         _give_up_if(cancelled)
         node.start(_services(options, node, notifier))
     except BaseException as error:
@@ -218,6 +207,7 @@ def start_engines(
 ) -> tuple[BaseMap, dict[str, EngineProcess]]:
     """Check the map and have the engines, which ``children`` become, begin to open it; return it and them.
 
+    That of searches is left to the caller to start: it would take cores from those that the node waits for.
     ``base_map`` is the map, if it has been loaded and verified already. After an error the caller closes the children.
 
     Raises:
@@ -239,8 +229,9 @@ def start_engines(
         kind: EngineProcess(kind, str(path), base_map.sha256, config, trust=trust, child=child)
         for kind, child in children.items()
     }
-    for engine in engines.values():
-        engine.start()
+    for kind, engine in engines.items():
+        if kind != "search":
+            engine.start()
     return base_map, engines
 
 
@@ -261,6 +252,7 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     engines: Mapping[str, EngineProcess] = {}
     try:
         _, engines = start_engines(options, children, base_map)
+        engines["search"].start()
         for engine in engines.values():
             engine.wait_prepared(cancelled)
         _give_up_if(cancelled)

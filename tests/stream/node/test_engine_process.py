@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 from multiprocessing.connection import Connection
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.localization.state import State
+from coview_stream.stream.node import engine_process
 from coview_stream.stream.node.engine_process import (
     CancelledError,
     DiedError,
@@ -265,6 +268,28 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled(engine):
         process.wait_ready(cancelled)
     with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
         process.wait_ready()
+
+
+@pytest.mark.slow
+def test_every_step_of_a_start_begins_the_wait_anew(engine, monkeypatch, caplog):
+    steps = "for k in (1, 2, 2, 3):\n    pipe.send(('step', f'{pipe.recv()} {k} of 3'))\n"
+    child = Program("pipe.recv()\n" + steps + READY)
+    process = engine("track", child=child, open_timeout=120.0)
+    now = 0.0
+    monkeypatch.setattr(engine_process, "time", SimpleNamespace(monotonic=lambda: now))
+    process.start()
+
+    def step():
+        nonlocal now
+        now += 100.0
+        child.pipe.send("compiling")
+        assert child.pipe.poll(60.0)
+        return False
+
+    with caplog.at_level(logging.INFO):
+        process.wait_prepared(step)
+    assert process.ready
+    assert caplog.messages == [f"track engine: compiling {k} of 3" for k in (1, 2, 3)]
 
 
 @pytest.mark.slow
