@@ -51,11 +51,11 @@ _NUMBERS = (0, -1, 1, 2, 3, 7, 4096, 1 << 20, 1 << 31, 1 << 40, 0.001, 0.5, 1e9,
 
 def _points() -> npt.NDArray[np.float32]:
     rng = np.random.default_rng(3)
-    ground = np.c_[rng.uniform(-20, 20, (24_000, 2)), rng.normal(0, 0.01, 24_000)]
+    ground = np.c_[rng.uniform(-9, 9, (5000, 2)), rng.normal(0, 0.01, 5000)]
     walls = [
-        np.c_[rng.uniform(-14, 14, 5000), np.full(5000, 9.0), rng.uniform(0, 5, 5000)],
-        np.c_[np.full(5000, -7.0), rng.uniform(-14, 4, 5000), rng.uniform(0, 7, 5000)],
-        np.c_[rng.uniform(2, 6, (3000, 2)), np.full(3000, 3.0)],
+        np.c_[rng.uniform(-8, 8, 1000), np.full(1000, 6.0), rng.uniform(0, 5, 1000)],
+        np.c_[np.full(1000, -6.0), rng.uniform(-8, 4, 1000), rng.uniform(0, 7, 1000)],
+        np.c_[rng.uniform(2, 5, (600, 2)), np.full(600, 3.0)],
     ]
     return np.concatenate([ground, *walls]).astype(np.float32)
 
@@ -71,7 +71,7 @@ def _use(base_map: BaseMap) -> object:
         base_map.learned.check()
     base_map.surveyed(np.zeros((1, 2)))
     _ = str(base_map.summary), base_map.station_grid, base_map.field, base_map.bounds
-    localizer, seen = Localizer(base_map, LocalizerConfig(reloc="coview")), _points()[::4]
+    localizer, seen = Localizer(base_map, LocalizerConfig(reloc="coview")), _points()[::2]
     for x in (0.0, 2.5):
         localizer.step(seen - np.array([x, 0.0, 1.7], np.float32), pose_from(np.eye(3), [x, 0.0, 0.0]), 100.0 + x)
     return base_map.crop(np.zeros(3), 5.0)
@@ -84,7 +84,8 @@ def _array(rng: random.Random, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return np.zeros((3, *out.shape[1:]), out.dtype)
     kind = rng.randrange(9)
     flat = out.reshape(-1)
-    some = np.array([rng.randrange(flat.size) for _ in range(rng.choice((1, 3, 50)))])
+    rows = np.random.default_rng(rng.getrandbits(32))
+    some = rows.integers(flat.size, size=rng.choice((1, 3, 50)))
     kinds, odd = out.dtype.kind, _ODD[out.dtype.kind]
     if kinds != "f":
         limits = np.iinfo(out.dtype)
@@ -95,9 +96,9 @@ def _array(rng: random.Random, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         elif kind == 1:
             flat[:] = rng.choice(odd)
         elif kind == 2:
-            flat[some] = flat[[rng.randrange(flat.size) for _ in some]]
+            flat[some] = flat[rows.integers(flat.size, size=len(some))]
         elif kind == 3:
-            out = out[[rng.randrange(len(out)) for _ in range(len(out))]]
+            out = out[rows.integers(len(out), size=len(out))]
         elif kind == 4:
             out = out[: rng.randrange(len(out) + 1)]
         elif kind == 5:

@@ -181,7 +181,7 @@ def describe_storeys(
         wanted: (K,) numbers of the stations to describe, in the order of the result; None takes all.
 
     Raises:
-        MapError: they stand on more than 1,024 storeys.
+        MapError: they stand on more than 1,024 storeys, or beside all points.
     """
     indoors = below_another(stations, block)
     if wanted is not None:
@@ -225,6 +225,9 @@ def describe_stations(
     shape = (len(stations), config.rings, config.sectors)
     described: Described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
     rows, columns = raster.cells_of(stations[:, :2])
+    inside = (rows >= 0) & (rows < raster.top.shape[0]) & (columns >= 0) & (columns < raster.top.shape[1])
+    if not inside.all():
+        raise MapError(f"{(~inside).sum()} stations lie beside the map's points; fetch or build it again")
     for start in range(0, len(stations), _PORTION):
         part = slice(start, start + _PORTION)
         grid = kernels.station_bins(

@@ -14,7 +14,7 @@ import numpy as np
 from coview_kernels import Raster
 from coview_stream.basemap.map_parts import MapParts
 from coview_stream.basemap.tiles import unit_normals
-from coview_stream.clouds.reference_system import short_name
+from coview_stream.clouds.reference_system import FOOT, UNKNOWN, short_name
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, MessageError, require_library
 from coview_stream.geometry.arrays import Bools, Floats, Ints
@@ -77,10 +77,11 @@ class MapSummary:
     form: str = "one file"
 
     def __str__(self) -> str:
-        """Return one line."""
+        """Return one line; the size in feet too where no reference system states the unit."""
         area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
+        feet = f" ({self.width * FOOT:.0f} x {self.depth * FOOT:.0f} m if in feet)" if self.crs == UNKNOWN else ""
         return (
-            f"{self.width:.0f} x {self.depth:.0f} m with points on {area}, {self.density:.3g} points/m2 kept, "
+            f"{self.width:.0f} x {self.depth:.0f} m{feet} with points on {area}, {self.density:.3g} points/m2 kept, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "
             f"{self.bytes / 1e6:.0f} MB as {self.form} ({self.bytes / self.area / 1e3:.2g} GB per km2)"
         )

@@ -21,6 +21,8 @@ _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of referen
 _LINEAR_UNIT, _VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
 _CODES = range(1024, 32767)  # of EPSG; 32767 is a system described by other keys
 _METRE = 9001
+FOOT = 0.3048  # metres
+UNKNOWN = "unknown"  # name of no system
 _NORTH_STEP = 10.0  # metres along the map's north axis, to measure true north
 _UNITS = {9002: "feet", 9003: "US survey feet", 9005: "Clarke's feet", 9014: "fathoms", 9093: "miles"}
 
@@ -99,7 +101,7 @@ def same_system(one: str | None, other: str | None) -> bool:
 def short_name(text: str | None) -> str:
     """Return a system's name in a few words."""
     if text is None:
-        return "unknown"
+        return UNKNOWN
     system = _parse(text)
     if system is not None:
         code = system.to_epsg()

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coview_stream.clouds.reference_system import FOOT
 from coview_stream.config.mount import Mount
 from coview_stream.doctor.finding import Finding, Verdict
 from coview_stream.errors import install_command
@@ -25,7 +26,6 @@ from coview_stream.localization.witness.conventions import (
     AXIS_NAMES,
     BOTH_CAMERA,
     FEET,
-    FOOT,
     HEADING,
     MILLIMETRES,
     MIRRORED,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coview_stream.clouds.reference_system import FOOT
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
@@ -167,31 +168,53 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
     except ImportError as error:
         remedy = install_command("all")
         return Finding("warn", "place", f"not searched for: {error.name} is missing", remedy)
-    localizer = Localizer(base_map, config)
-    reason, driven = "", 0.0
+
+    def searched(on: BaseMap) -> tuple[float, State, str]:
+        """Return the metres driven, the state, and both metres and reason in words."""
+        localizer = Localizer(on, config)
+        reason, driven = "", 0.0
+        before = run.poses[0, :3, 3]
+        for index in indices:
+            try:
+                frame = run.read(index)
+            except CloudError:
+                continue
+            driven += float(np.linalg.norm(frame.T_odom_body[:3, 3] - before))
+            before = frame.T_odom_body[:3, 3]
+            evidence = localizer.step(frame.points, frame.T_odom_body, frame.stamp).evidence
+            reason = reason if evidence is None else evidence.reason.removeprefix("found: ")
+            if localizer.state is State.TRACKING:
+                break
+        text = f"after {driven:.0f} m: {reason or 'too little has been seen'}"
+        return driven, localizer.state, text
+
     step = max(1, len(run) // _SEARCHED)
     indices = range(0, len(run), step) if len(run) <= 4 * _SEARCHED else range(0, 4 * _SEARCHED, 4)
-    before = run.poses[0, :3, 3]
-    for index in indices:
-        try:
-            frame = run.read(index)
-        except CloudError:
-            continue
-        driven += float(np.linalg.norm(frame.T_odom_body[:3, 3] - before))
-        before = frame.T_odom_body[:3, 3]
-        fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
-        if fix is None:
-            continue
-        reason = "" if fix.evidence is None else fix.evidence.reason
-        if fix.state is State.TRACKING:
-            return Finding("ok", "place", f"found after {driven:.0f} m: {reason}")
-    found = f"none on this map after {driven:.0f} m: {reason or 'too little has been seen'}"
+    driven, state, text = searched(base_map)
+    if state is State.TRACKING:
+        return Finding("ok", "place", f"found {text}")
+    sure = driven >= _ENOUGH and state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
+    if sure and base_map.crs is None:
+        in_metres = in_feet(base_map)
+        _, state, converted = (0.0, state, "") if in_metres is None else searched(in_metres)
+        if state is State.TRACKING:
+            found = f"the map is in feet: none on it {text}; found {converted} once it is converted"
+            return Finding("FAIL", "place", found, "multiply the survey's coordinates by 0.3048, and build it again")
     remedy = (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres, "
         "and has the site not changed? `coview-stream help reasons`"
     )
-    sure = driven >= _ENOUGH and localizer.state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
-    return Finding("FAIL" if sure else "warn", "place", found, remedy)
+    return Finding("FAIL" if sure else "warn", "place", f"none on this map {text}", remedy)
+
+
+def in_feet(base_map: BaseMap) -> BaseMap | None:
+    """Return the map that would have been built if its coordinates were feet; None where there would be none."""
+    from coview_stream.basemap.basemap import BaseMap
+
+    try:
+        return BaseMap.build(np.asarray(base_map.points) * np.float32(FOOT), config=base_map.config)
+    except CoViewError:
+        return None
 
 
 def sensor_findings(

@@ -16,6 +16,7 @@ from coview_stream.basemap.stations import (
     rasterise,
 )
 from coview_stream.config import DescriptorConfig
+from coview_stream.errors import MapError
 
 BLOCK = 2.0
 
@@ -190,3 +191,10 @@ def test_storeys_are_distinguished_by_height():
 def test_a_map_without_storeys_has_its_stations_at_any_height():
     stations = stations_of()
     np.testing.assert_array_equal(StationGrid(stations, BLOCK).at(stations + np.array([0.0, 0.0, 7.0])), np.arange(36))
+
+
+def test_stations_beside_all_points_are_refused():
+    points = np.random.default_rng(1).uniform(0.0, 10.0, (500, 3)).astype(np.float32)
+    stations = np.array([[5.0, 5.0, 0.0], [25.0, 5.0, 0.0], [5.0, -9.0, 0.0]], np.float32)
+    with pytest.raises(MapError, match="2 stations lie beside"):
+        describe_storeys(points, stations, 2.0, DescriptorConfig())

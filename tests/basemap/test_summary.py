@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,7 +39,9 @@ def test_summary_has_the_size_that_the_cloud_has(town, tmp_path):
     assert found.bytes == pytest.approx((tmp_path / "site.coview").stat().st_size, rel=0.05)
     assert found.warnings == ()
     assert "crs unknown" in str(found)
-    assert f"{found.width:.0f} x {found.depth:.0f} m" in str(found)
+    width, depth = found.width, found.depth
+    assert f"{width:.0f} x {depth:.0f} m ({width * 0.3048:.0f} x {depth * 0.3048:.0f} m if in feet) with" in str(found)
+    assert "feet" not in str(replace(found, crs="EPSG:25832"))
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_world
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.cloud import Cloud
-from coview_stream.doctor.map_checks import run_findings
+from coview_stream.clouds.reference_system import FOOT
+from coview_stream.config import LocalizerConfig
+from coview_stream.doctor.map_checks import place_finding, run_findings
 from coview_stream.recordings.run import Run
 
 BEGIN = 18  # frame of the fault
@@ -28,10 +32,13 @@ def way(scene):
     return small_world.record_along(scene, small_world.drive(12), 0.4)
 
 
-def findings(clouds, odometry):
+def run_of(clouds, odometry):
     stamps = DT * np.arange(len(clouds))
-    run = Run(Path("run"), (Path("run"),) * len(clouds), stamps, np.array(odometry), Clouds(clouds))
-    return {finding.what: finding for finding in run_findings(run)}
+    return Run(Path("run"), (Path("run"),) * len(clouds), stamps, np.array(odometry), Clouds(clouds))
+
+
+def findings(clouds, odometry):
+    return {finding.what: finding for finding in run_findings(run_of(clouds, odometry))}
 
 
 def test_undisturbed_run_is_told_to_agree(way):
@@ -55,3 +62,14 @@ def test_sensor_that_lies_is_named_once_with_its_cause(way, fault, says):
     assert found["sensors"].verdict == "FAIL"
     assert says in found["sensors"].found
     assert [what for what, finding in found.items() if finding.verdict == "FAIL"] == ["sensors"]
+
+
+def test_map_in_feet_is_named(map_points, scene):
+    """No reference system says so; the robot is found on the same map in metres."""
+    drive = small_world.record_along(scene, small_world.drive(12), 1.0)
+    near = map_points[np.abs(map_points[:, :2]).max(axis=1) < 32.0]
+    base_map = BaseMap.build((near / FOOT).astype(np.float32), radius=30.0)
+    finding = place_finding(run_of(drive.clouds, drive.T_odom_body), base_map, LocalizerConfig())
+    assert finding.verdict == "FAIL"
+    assert re.match(r"the map is in feet: none on it after \d+ m: .*; found after .*wrong .*1 in", finding.found)
+    assert "0.3048" in finding.remedy

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coview_stream.clouds.reference_system import FOOT
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.planar import planar_motion
 from coview_stream.geometry.transforms import (
@@ -45,7 +46,7 @@ _FAILS = 0.1  # probability that a registration fails, as in the calibration
 METRES_PER_RADIAN = 5.0
 _SWAY = math.radians(0.3)  # sigma of a turn about x or y: the registration's and that of odometry's level, 0.2 each
 _FARTHEST = 300.0  # metres; the median of a lidar's ranges is less, anywhere
-FOOT, MILLIMETRE = 0.3048, 0.001  # metres
+MILLIMETRE = 0.001  # metres
 
 UP = np.array([0.0, 0.0, 1.0])
 AXES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], dtype=np.float64)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coview_stream.clouds.reference_system import FOOT
 from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, wrap_angle, yaw_of
@@ -27,7 +28,6 @@ from coview_stream.localization.witness.conventions import (
     BASELINE,
     BOTH_CAMERA,
     FEET,
-    FOOT,
     HEADING,
     METRES_PER_RADIAN,
     MILLIMETRES,
