@@ -9,7 +9,6 @@ from __future__ import annotations
 from coview_stream.config.localizer import (
     AcceptanceConfig,
     ConsensusConfig,
-    GraphConfig,
     KeyframeConfig,
     LearnedConfig,
     LocalizerConfig,
@@ -25,7 +24,6 @@ __all__ = [
     "Channel",
     "ConsensusConfig",
     "DescriptorConfig",
-    "GraphConfig",
     "KeyframeConfig",
     "LearnedConfig",
     "LocalizerConfig",

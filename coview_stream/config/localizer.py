@@ -154,7 +154,6 @@ class LearnedConfig:
     Attributes:
         reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
         cell: metres from place to place at which their features are compared with the map's.
-        yaws: headings at each, an even number.
         dense_area: square metres up to which a map is searched all over.
         shortlist: tiles of a larger one, those that look most alike, around which it is searched.
         peaks: best places that are scored by the likelihood field.
@@ -162,7 +161,6 @@ class LearnedConfig:
 
     reach: float = 30.0
     cell: float = 2.0
-    yaws: int = 36
     dense_area: float = 2.0e6
     shortlist: int = 50
     peaks: int = 64
@@ -172,9 +170,6 @@ class LearnedConfig:
         positive(self, "dense_area")
         require(5.0 <= self.reach <= 32.0, self, "reach", "5 to 32 m, half a query's image")
         require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")
-        counts(self, "yaws", minimum=4)
-        require(self.yaws <= 360, self, "yaws", "360 at most: memory and time grow with it")
-        require(self.yaws % 2 == 0, self, "yaws", "an even number")
         counts(self, "shortlist", "peaks")
 
 
@@ -225,26 +220,6 @@ class TrackingConfig:
         counts(self, "min_points", "max_points")
 
 
-@dataclass(frozen=True)
-class GraphConfig:
-    """Smoothing of poses (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
-
-    Attributes:
-        window: newest keyframes that are smoothed; older ones live on in the belief that they left behind.
-        huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
-            once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
-            kernel that lets go altogether would, with an optimistic covariance, lock the map out for good.
-    """
-
-    window: int = 40
-    huber: float = 3.5
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        counts(self, "window", minimum=2)
-        positive(self, "huber")
-
-
 @names_parts
 @dataclass(frozen=True)
 class LocalizerConfig:
@@ -256,7 +231,6 @@ class LocalizerConfig:
         registration: registration of scans to the map, and its covariance.
         acceptance: limits of a fix.
         tracking: registrations while tracking.
-        graph: smoothing of poses.
         learned: look-up of learned features.
         reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where
             the map lacks them or has those of other weights.
@@ -273,7 +247,6 @@ class LocalizerConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    graph: GraphConfig = field(default_factory=GraphConfig)
     learned: LearnedConfig = field(default_factory=LearnedConfig)
     reloc: Reloc = "auto"
     sensor_leans: bool = True

@@ -24,9 +24,7 @@ class NodeConfig:
         odometry_history: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.
         max_outage: a longer pause of odometry (sensor time) is a new beginning: the robot may have been carried.
-        max_network_outage: the same while nothing is connected to the node, as that explains the pause.
         max_speed: metres per second; faster motion between two odometry samples is a jump.
-        max_turn_rate: radians per second; a faster turn of more than 20 degrees is a jump.
         max_payload: a larger message is counted as oversized and not decoded.
         max_points: a larger frame is thinned to every n-th point: no robot holds up the others.
         restart_after: a jump of the stamps is a restarted clock once they have run on steadily for this long.
@@ -42,9 +40,7 @@ class NodeConfig:
     odometry_history: float = 5.0
     max_gap: float = 0.5
     max_outage: float = 2.0
-    max_network_outage: float = 10.0
     max_speed: float = 50.0
-    max_turn_rate: float = 20.0
     max_payload: int = 16 << 20
     max_points: int = 200_000
     restart_after: float = 1.0

@@ -33,11 +33,8 @@ class LidarOdometryConfig:
         max_gap: seconds without a usable frame after which a new local map begins at the last frame's pose: the motion
             since is unknown.
         max_speed: metres per second; a faster registration is refused, and a new local map begins.
-        max_turn_rate: radians per second, likewise; registration may spin with its own prediction.
         keep_level: correct drift and registration's errors of roll and pitch by the walls and the ground around.
         threads: threads of kiss-icp.
-        convergence: step, metres and radians, below which registration ends.
-        iterations: iterations at most.
     """
 
     gravity: Gravity = "ground"
@@ -47,11 +44,8 @@ class LidarOdometryConfig:
     min_points: int = 100
     max_gap: float = 1.5
     max_speed: float = 50.0
-    max_turn_rate: float = 4.0
     keep_level: bool = True
     threads: int = 1
-    convergence: float = 1e-3
-    iterations: int = 60
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -41,6 +41,7 @@ from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.registration.register import swap_rotation_translation
 from coview_stream.localization.tracking.batch_graph import BatchGraph, Constraint
 from coview_stream.localization.tracking.motion import Drift
+from coview_stream.localization.tracking.pose_graph import HUBER
 from coview_stream.recordings.run import Run
 
 
@@ -100,7 +101,7 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
         return localizer.fit(run.read(frames[k].index, calibration.sweep).points, T_map_body, calibration)
 
     chain.settle_breaks(fit)
-    return chain.solved(localizer.config.graph.huber, localizer.base_map.origin)
+    return chain.solved(localizer.base_map.origin)
 
 
 @dataclass(eq=False)
@@ -226,7 +227,7 @@ class _Chain:
             self.broken[first] = self.broken.pop(at)
             self.unknown.difference_update(range(first, at))
 
-    def solved(self, huber: float, origin: Floats) -> list[SmoothedPose]:
+    def solved(self, origin: Floats) -> list[SmoothedPose]:
         """Solve the graph; return the poses in the frame of the map's sources, whose origin is ``origin`` (3,)."""
         nodes, start = self._nodes()
         number = {k: at for at, k in enumerate(nodes)}
@@ -241,7 +242,7 @@ class _Chain:
             for k, kept in self.registered.items()
             if k in number
         ]
-        graph.add(registrations, ("Huber", huber))
+        graph.add(registrations, ("Huber", HUBER))
         solved = zip(nodes, graph.solve(), graph.covariances(), strict=True)
         found = {k: self._pose(k, T, along_map(covariance, T), origin) for k, T, covariance in solved}
         for k, frame in enumerate(self.frames):

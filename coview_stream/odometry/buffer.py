@@ -25,6 +25,8 @@ _SPEED_FACTOR = 3.0  # times its speed of the last seconds
 _SPEED_WINDOW_NS = 2 * _NS
 _MIN_SPEED_SPAN = 0.2  # seconds of samples: fewer give no speed
 _JUMP_ANGLE = np.radians(20.0)
+_MAX_TURN_RATE = 20.0  # radians per second; a faster turn of more than _JUMP_ANGLE is a jump
+_UNREACHABLE = 10.0  # seconds of outage that a connection that was down explains
 
 
 class SampleKind(StrEnum):
@@ -100,7 +102,7 @@ class OdometryBuffer:
             now: local time (seconds) of its arrival.
             unreachable: the connection was down since the last sample.
         """
-        longest = self.config.max_network_outage if unreachable else self.config.max_outage
+        longest = _UNREACHABLE if unreachable else self.config.max_outage
         step = None if self.newest is None else inverse(self.newest.T_odom_body) @ sample.T_odom_body
         kind = self._classify(sample, step, now, longest)
         if kind in (SampleKind.DUPLICATE, SampleKind.OUT_OF_ORDER):
@@ -135,7 +137,7 @@ class OdometryBuffer:
         if seconds > longest:
             return SampleKind.OUTAGE
         max_distance = _SLACK + min(self.config.max_speed, self._max_plausible_speed()) * seconds
-        max_angle = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
+        max_angle = max(_JUMP_ANGLE, _MAX_TURN_RATE * seconds)
         if _distance(step) > max_distance or rotation_angle(step) > max_angle:
             return SampleKind.JUMP
         return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES

@@ -60,8 +60,8 @@ class KissRegistration:
         settings.data.deskew = False
         settings.mapping.voxel_size = config.voxel
         settings.registration.max_num_threads = config.threads
-        settings.registration.convergence_criterion = config.convergence
-        settings.registration.max_num_iterations = config.iterations
+        settings.registration.convergence_criterion = _CONVERGENCE
+        settings.registration.max_num_iterations = _ITERATIONS
         self._make: Callable[[], Any] = partial(pipeline.KissICP, settings)
         self.clear()
 
@@ -81,6 +81,8 @@ class KissRegistration:
 _MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise
 _MIN_SWEEP_SECONDS = 1e-4  # shorter sweeps are instants
 _MAX_SWEEP_SECONDS = 1.0  # from the stamp: points farther away in time have another clock
+_CONVERGENCE, _ITERATIONS = 1e-3, 60  # step, metres and radians, below which registration ends; at most so many
+_MAX_TURN_RATE = 4.0  # radians per second: registration may spin with its own prediction
 _SLACK, _SLACK_ANGLE = 0.5, np.radians(20.0)  # metres and radians that a registration may always move
 _FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there reduce it
 _GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction from the user
@@ -228,7 +230,7 @@ class LidarOdometry:
         """Refuse a motion that no robot makes; restart the local map, which holds the frame at a wrong place."""
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
         allowed = _SLACK + self.config.max_speed * seconds
-        if is_pose(step) and far <= allowed and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
+        if is_pose(step) and far <= allowed and wide <= max(_SLACK_ANGLE, _MAX_TURN_RATE * seconds):
             return
         self._restart()
         raise CloudError(

@@ -12,7 +12,6 @@ from coview_stream.config import (
     AcceptanceConfig,
     ConsensusConfig,
     DescriptorConfig,
-    GraphConfig,
     KeyframeConfig,
     LearnedConfig,
     LocalizerConfig,
@@ -26,7 +25,7 @@ from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import ConfigError
 
 CONFIGS = [
-    AcceptanceConfig, ConsensusConfig, DescriptorConfig, GraphConfig, KeyframeConfig, LearnedConfig,
+    AcceptanceConfig, ConsensusConfig, DescriptorConfig, KeyframeConfig, LearnedConfig,
     LidarOdometryConfig, LocalizerConfig, MapConfig, NodeConfig, RegistrationConfig,
     TrackingConfig,
 ]  # fmt: skip
@@ -52,7 +51,6 @@ BAD = [
     (KeyframeConfig, "range_min", -0.5),
     (LearnedConfig, "reach", float("nan")),
     (LearnedConfig, "reach", 33.0),
-    (LearnedConfig, "yaws", 361),
     (LearnedConfig, "dense_area", 0.0),
     (ConsensusConfig, "window", 0),
     (ConsensusConfig, "peaks", 0),

@@ -11,7 +11,7 @@ It is found by Gauss-Newton on X_k exp(xi_k). The linear problem of each step is
 block tridiagonal: a Kalman filter and the recursion backwards of Rauch, Tung and Striebel solve it exactly (Bell, "The
 iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optimization 1994; Barfoot, State Estimation for Robotics,
 chapter 3). With the measured step e, its derivative D (:func:`~coview_stream.geometry.transforms.log_se3`), and w the
-kernel's weight, min(1, huber / |R^-1/2 e|), of iteratively reweighted least squares:
+kernel's weight, min(1, 3.5 / |R^-1/2 e|), of iteratively reweighted least squares:
 
     odometry       m' = F m - D^-1 e,  P' = F P F^T + D^-1 Q D^-T          F = Ad(X_k^-1 X_{k-1})
     registration   m = m' - G (D^-1 e + m'),  P = G C                      C = D^-1 R D^-T / w,  G = P' (P' + C)^-1
@@ -33,7 +33,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coview_stream.config import GraphConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import (
     Pose,
@@ -48,6 +47,11 @@ from coview_stream.geometry.transforms import (
     relative,
 )
 from coview_stream.geometry.validation import check_covariance, check_rigid
+
+HUBER = 3.5
+"""Standard deviations from which a registration's pull grows no more: the norm of six residuals at once, 2.4 on average
+and above this in one case of twenty; the usual 1.345 is meant for one residual. A kernel that lets go altogether would,
+with an optimistic covariance, lock the map out for good."""
 
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are linearised again
 _MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
@@ -106,8 +110,9 @@ class PoseGraph:
     method that needs a keyframe raises RuntimeError before the first ``start``.
     """
 
-    def __init__(self, config: GraphConfig | None = None) -> None:
-        self.config = config or GraphConfig()
+    def __init__(self, window: int = 40) -> None:
+        """Smooth the newest ``window`` keyframes; older ones live on in the belief that they left behind."""
+        self._window = window
         self._keyframes: list[_Keyframe] = []
         self._newest_belief: _Gaussian | None = None
         self._stale = 0  # first keyframe that the filter has not seen as it is
@@ -138,7 +143,7 @@ class PoseGraph:
         # odometry alone does not change earlier poses, so there is nothing to solve
         F = adjoint(inverse(step))
         self._newest_belief = _Gaussian(T, F @ before.covariance @ F.T + between.covariance)
-        if len(self) > self.config.window:
+        if len(self) > self._window:
             self._filter()
             del self._keyframes[0]
             first = self._keyframes[0]
@@ -212,7 +217,7 @@ class PoseGraph:
         sigmas[: len(items)] = 0.0  # no kernel on odometry
         J = np.linalg.inv(D)
         means = -(J @ gaps[..., None])[..., 0]
-        covariances = J @ spread @ np.swapaxes(J, -1, -2) * np.maximum(1.0, sigmas / self.config.huber)[:, None, None]
+        covariances = J @ spread @ np.swapaxes(J, -1, -2) * np.maximum(1.0, sigmas / HUBER)[:, None, None]
         F, correction = adjoint(relative(steps, np.eye(4))), len(items)
         mean, P = (np.zeros(6), np.zeros((6, 6))) if before is None else before.filtered
         for k, item in enumerate(items):

@@ -65,7 +65,7 @@ class Tracker:
         self.ground = GroundOffset()
         self.change = GroundChange(base_map.field)
         self.risen = 0.0
-        self._graph = PoseGraph(config.graph)  # of clouds in the sensor's own axes: independent of the calibration
+        self._graph = PoseGraph()  # of clouds in the sensor's own axes: independent of the calibration
         self._calibration = calibration
         self.odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)

@@ -16,7 +16,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.learned.matcher import YAWS, FeatureMatcher
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.state import State
@@ -46,10 +46,10 @@ def knowing(drive):
     T_map_odom = drive.T_map_body[0] @ inverse(first)
 
     def distances(matcher, centre):
-        table = np.random.default_rng(0).normal(1.0, 0.1, (len(matcher.stations), matcher.config.yaws))
+        table = np.random.default_rng(0).normal(1.0, 0.1, (len(matcher.stations), YAWS))
         there = transform(T_map_odom, centre[None])[0, :2]
         station = np.hypot(*(matcher.stations[:, :2] - there).T).argmin()
-        table[station, round(-yaw_of(T_map_odom) / (2 * np.pi / matcher.config.yaws)) % matcher.config.yaws] = -1.0
+        table[station, round(-yaw_of(T_map_odom) / (2 * np.pi / YAWS)) % YAWS] = -1.0
         return table
 
     return distances
@@ -121,7 +121,7 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
 
     def distances(matcher, centre):
         xy = matcher.stations[:, :2]
-        table = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), matcher.config.yaws))
+        table = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), YAWS))
         away = np.hypot(*(xy - xy.mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
         table[wrong, np.arange(5) * 7] = -1.0

@@ -21,7 +21,7 @@ from trackers import (
     ride_of,
 )
 
-from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
+from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.clouds import LocalMaps
@@ -60,10 +60,9 @@ def test_good_registration_is_accepted(world_map, world_drive):
 
 
 def test_error_is_within_reported_covariance(world_map, slow_drive):
-    """Odometry lies by 5 %, in both ways, and is corrected once a metre; the graph forgets all but two keyframes."""
-    config = LocalizerConfig(graph=GraphConfig(window=2))
+    """Odometry lies by 5 %, in both ways, and is corrected once a metre."""
     for scale in (0.95, 1.05):
-        ride = ride_of(world_map, slow_drive, config, 0)
+        ride = ride_of(world_map, slow_drive, frame=0)
         T, off = ride.odometry(slow_drive.T_map_body[0]), []
         for k in range(1, len(slow_drive.clouds)):
             step = inverse(slow_drive.T_map_body[k - 1]) @ slow_drive.T_map_body[k]

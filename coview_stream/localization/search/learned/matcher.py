@@ -29,6 +29,9 @@ from coview_stream.localization.search.learned.rasters import (
 )
 from coview_stream.localization.search.request import SearchRequest
 
+YAWS = 36
+"""Headings that are compared, an even number."""
+
 _SIZE = 64.0  # metres along the edge of a query's image
 _ROUNDING = 1e-6  # cells
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other
@@ -148,7 +151,7 @@ class FeatureMatcher:
         most similar to the query and around ``near`` (N, 2), metres. All candidates lie within ``area``, if given.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
-        yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
+        yaws = yaw_of_shift(np.arange(YAWS), YAWS)
         turned = turn_query(query.features.local, query.weight, self.rasters, ratio, yaws)
         index = self.rasters.coarse
         blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near, area)
@@ -175,14 +178,14 @@ class FeatureMatcher:
         chosen = argsmallest(-best.ravel(), count)
         chosen = chosen[np.isfinite(best.ravel()[chosen])]
         half, cell = np.divmod(chosen, best.shape[1])
-        shift = turned.headings[heading.ravel()[chosen]] + half * (self.config.yaws // 2)
+        shift = turned.headings[heading.ravel()[chosen]] + half * (YAWS // 2)
         # all stations of a chosen cell, at its heading and those halfway to the next
         number = begin[cell + 1] - begin[cell]
         group = np.repeat(np.arange(len(chosen)), number)
         station = order[np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number) + begin[cell][group]]
         step = int(turned.headings[1] - turned.headings[0])
         off = np.arange(-(step // 2), step // 2 + 1)
-        shifts = (shift[group, None] + off) % self.config.yaws
+        shifts = (shift[group, None] + off) % YAWS
         return (np.repeat(station, len(off)), shifts.ravel()), np.repeat(group, len(off))
 
     def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike, area: Circle | None) -> Ints:

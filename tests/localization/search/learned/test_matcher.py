@@ -22,7 +22,7 @@ from coview_stream.descriptors.feature_map import (
 from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import Circle, inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus
-from coview_stream.localization.search.learned.matcher import FeatureMatcher, LearnedRecognizer, QueryFeatures
+from coview_stream.localization.search.learned.matcher import YAWS, FeatureMatcher, LearnedRecognizer, QueryFeatures
 from coview_stream.localization.search.learned.rasters import principal_axes
 from coview_stream.localization.search.request import SearchRequest
 
@@ -293,7 +293,7 @@ def named(heights, peaks=5):
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     stations = np.vstack([np.column_stack([xy, np.full(len(xy), z)]) for z in heights]).astype(np.float32)
     config = LocalizerConfig(learned=LearnedConfig(peaks=peaks))
-    flat = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), config.learned.yaws)).astype(np.float32)
+    flat = np.random.default_rng(0).normal(1.0, 0.1, (len(xy), YAWS)).astype(np.float32)
     flat[(xy == HERE).all(axis=1), SHIFT] = -1.0
     flat[(xy == THERE).all(axis=1), SHIFT] = 0.2
     learned = SimpleNamespace(
