@@ -100,6 +100,7 @@ EXTRA_OF = {
     "foxglove": "foxglove",
     "torch": "learn-train",
     "psutil": "bench",
+    "rclpy": "ros2",
 }
 """Extra of the package that brings a module of others, by its first name."""
 

@@ -68,14 +68,25 @@ def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mappin
 def fill_from_file(
     args: argparse.Namespace, path: Path, parser: argparse.ArgumentParser, tables: Collection[str]
 ) -> dict[str, dict[str, Any]]:
-    """Set the options that were not given to the values of a TOML file, by their names, and return its tables.
+    """As :func:`fill_from_settings`, from a TOML file."""
+    from coview_stream.config.settings_file import read_settings
+
+    return fill_from_settings(args, read_settings(path), path, parser, tables)
+
+
+def fill_from_settings(
+    args: argparse.Namespace, settings: Mapping[str, Any], path: Path | str, parser: argparse.ArgumentParser,
+    tables: Collection[str],
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """Set the options that were not given to those of some settings, by their names, and return their tables.
 
     ``args.in_file`` gets the options in the file, ``args.from_file`` those of them that it decides, by all their names.
+    ``path`` names the settings in errors.
 
     Raises:
         ConfigError: an unknown key, or a value that the option does not take.
     """
-    from coview_stream.config.settings_file import read_settings, unknown_key
+    from coview_stream.config.settings_file import unknown_key
 
     actions: dict[str, argparse.Action] = {}
     for action in parser._actions:
@@ -93,7 +104,7 @@ def fill_from_file(
             given.update(group._group_actions)
     file_tables: dict[str, dict[str, Any]] = {}
     args.in_file, args.from_file = set[str](), set[str]()
-    for key, value in read_settings(path).items():
+    for key, value in settings.items():
         name = key.replace("-", "_")
         if name in tables and (isinstance(value, dict) or name not in actions):
             if not isinstance(value, dict):

@@ -28,6 +28,7 @@ from coview_stream.cli.options import (
     blaming_file,
     check_codec,
     fill_from_file,
+    fill_from_settings,
     hide_rare,
     host_port,
     initial_guesses,
@@ -81,11 +82,19 @@ _TWICE = {
 """Options that are fields of a table as well: a file sets one of the two."""
 
 _RARE = (
-    *("domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
+    *("ros_args", "domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
     *("pose_encoding", "geo", "gravity", "no_deskew", "reloc", "log_json", "around", "foxglove"),
-    *("cloud_delay", "record", "rerun", *_LIMITS),
+    *("cloud_delay", "within", "record", "rerun", *_LIMITS),
 )
 """Options that are left to --help-all."""
+
+_PARAMETERS = "ROS parameters"
+
+_TOPICS = ("points", "odom", "pose")
+"""Topics of a robot's clouds, odometry and poses in ROS 2, in its namespace."""
+
+_OF_ZENOH = ("preset", "connect", "listen", "zenoh_config", "fleet", "domain", "humble", "pose_encoding", "geo")
+"""Options that say nothing to a ROS 2 node."""
 
 _MAX_SHUTDOWN = 1.5  # seconds after a signal: docs/operate.md promises two
 
@@ -96,14 +105,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="one or several robots")
     parser.add_argument("--config", type=Path, metavar="node.toml", help="settings; options given here replace them")
     add_network(parser, "--listen tcp/127.0.0.1:7447")
+    parser.add_argument("--ros2", action="store_true", help="topics of ROS 2 in place of zenoh's keys (extra ros2)")
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, metavar="...",
+        help="the rest is for ROS: remappings, parameters, which are options by their names (--params-file F.yaml)",
+    )  # fmt: skip
     keys = parser.add_argument_group("keys and encodings")
     add_shared(parser, "--preset")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument(
         "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
     )
-    keys.add_argument("--cloud-key", metavar="KEY", help="key of clouds, {base} and {robot} filled in (the preset's)")
-    keys.add_argument("--odometry-key", metavar="KEY", help="key of odometry, written as --cloud-key (the preset's)")
+    keys.add_argument(
+        "--cloud-key", "--cloud-topic", metavar="KEY",
+        help="key or topic of clouds, {base} and {robot} filled in (the preset's; {robot}/points)",
+    )  # fmt: skip
+    keys.add_argument(
+        "--odometry-key", "--odometry-topic", metavar="KEY",
+        help="key or topic of odometry, written as --cloud-key (the preset's; {robot}/odom)",
+    )  # fmt: skip
     keys.add_argument("--pose-key", metavar="KEY", help="key of poses, written as --cloud-key (the preset's)")
     keys.add_argument("--cloud-encoding", metavar="CODEC", help="of all clouds: xyz, xyzi, cdr, foxglove or keelson")
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="of all odometry: json, cdr, foxglove or keelson")
@@ -176,10 +196,12 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
         ConfigError: the file has a mistake, or map or robots are missing in both.
     """
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
-    args.from_file = set()
-    if args.config is not None:
-        declared = argparse.ArgumentParser()
+    args.from_file, args.ros_node = set(), None
+    declared = argparse.ArgumentParser()
+    if args.config is not None or args.ros2:
         add_arguments(declared)
+    parameters: dict[str, dict[str, Any]] = _ros_parameters(args, declared) if args.ros2 else {}
+    if args.config is not None:
         tables |= fill_from_file(args, args.config, declared, TABLES)
         for option, (table, *path) in _TWICE.items():
             field: Any = tables[table]
@@ -189,12 +211,31 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
                 raise ConfigError(
                     f"{args.config}: {option} and [{'.'.join([table, *path[:-1]])}] {path[-1]}: set one of them"
                 )
+    if args.ros2 and args.ros_node is None:  # the file says so
+        parameters = _ros_parameters(args, declared)
+    for name, of_ros in parameters.items():
+        tables[name] |= of_ros
+    if args.ros_args is not None and not args.ros2:
+        raise ConfigError("--ros-args goes with --ros2")
+    if args.ros2 and (other := [f"--{name.replace('_', '-')}" for name in _OF_ZENOH if getattr(args, name)]):
+        raise ConfigError(f"{other[0]} is for zenoh: leave it out with --ros2")
     for name, value in _DEFAULTS.items():
         if getattr(args, name) is None:
             setattr(args, name, value)
     for name, key, value in (("SITE", "site", args.map), ("--robot", "robot", args.robot)):
         if not value:
             raise ConfigError(f"{name} is missing: give it here, or as {key} = ... in the file of --config")
+    return tables
+
+
+def _ros_parameters(args: argparse.Namespace, declared: argparse.ArgumentParser) -> dict[str, dict[str, Any]]:
+    """Start the ROS 2 node that is asked for, set options to its parameters, and return its tables."""
+    from coview_stream.stream.transport.ros2_transport import settings_of, start_node
+
+    from_file = args.from_file
+    args.ros_node = start_node(args.ros_args or ())
+    tables = fill_from_settings(args, settings_of(args.ros_node), _PARAMETERS, declared, TABLES)
+    args.from_file = from_file  # of ``--config``, which errors name
     return tables
 
 
@@ -214,15 +255,16 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
     verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
+    source = args.config or _PARAMETERS
     for key, (name, remedy) in NOT_IN_TABLES.items():
         if key in tables[name]:
-            raise ConfigError(f"{args.config}: [{name}]: {key} cannot be set here: {remedy}")
-    localizer = with_table(LocalizerConfig(), tables["localizer"], f"{args.config}: [localizer]")
+            raise ConfigError(f"{source}: [{name}]: {key} cannot be set here: {remedy}")
+    localizer = with_table(LocalizerConfig(), tables["localizer"], f"{source}: [localizer]")
     delay = localizer.cloud_delay if args.cloud_delay is None else args.cloud_delay
     localizer = replace(localizer, reloc=args.reloc or localizer.reloc, cloud_delay=delay)
     if args.risk is not None:
         localizer = replace(localizer, acceptance=replace(localizer.acceptance, risk=acceptance_config(args.risk).risk))
-    node = with_table(NodeConfig(), tables["node"], f"{args.config}: [node]")
+    node = with_table(NodeConfig(), tables["node"], f"{source}: [node]")
     node = replace(
         node,
         **{name: value for name in _LIMITS if (value := getattr(args, name)) is not None},
@@ -233,14 +275,17 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     if "max_gap" not in tables["node"]:  # a pause that keeps the pose up keeps its frames as well
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
     table = {"max_speed": node.max_speed} | tables["lidar_odometry"]
-    odometry = with_table(LidarOdometryConfig(), table, f"{args.config}: [lidar_odometry]")
+    odometry = with_table(LidarOdometryConfig(), table, f"{source}: [lidar_odometry]")
     lidar = lidar_config(args.odometry, args.gravity, node.max_speed, args.cloud_delay)
     if lidar is not None:
         gravity = odometry.gravity if args.gravity is None else lidar.gravity
         lidar = replace(odometry, gravity=gravity, max_speed=args.max_speed or odometry.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
-    given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
+    topics = [args.cloud_key, args.odometry_key, args.pose_key]
+    if args.ros2:
+        topics = [(topic or "{robot}/" + name).lstrip("/") for topic, name in zip(topics, _TOPICS, strict=True)]
+    given: tuple[Any, ...] = (*topics, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
     fleet = None if args.fleet is None else f"{args.base}/fleet/{check_chunk(args.fleet, '--fleet')}"
     # nodes of a fleet have the same robots
@@ -251,7 +296,13 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     options = ServeOptions(
         map_path=opened.path,
         keys=keys,
-        network=NetworkOptions(args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.zenoh_config),
+        network=NetworkOptions(
+            args.connect,
+            [DEFAULT_ENDPOINT] if by_default else args.listen,
+            args.zenoh_config,
+            ros2=args.ros_node,
+            check_frames=args.mount is None,
+        ),
         codecs=CodecOptions(args.cloud_encoding, args.odometry_encoding, args.pose_encoding, args.geo),
         node=node,
         localizer=localizer,

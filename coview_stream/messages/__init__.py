@@ -28,7 +28,14 @@ from coview_stream.errors import ConfigError, MessageError
 from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
 from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.types import CloudMessage, Encoded, LocationMessage, OdometryMessage, PoseMessage, Sample
-from coview_stream.messages.validation import MAX_PAYLOAD, MAX_POINTS, OversizedError, check_size, read_attachment
+from coview_stream.messages.validation import (
+    MAX_PAYLOAD,
+    MAX_POINTS,
+    OversizedError,
+    RefusedError,
+    check_size,
+    read_attachment,
+)
 
 __all__ = [
     "CLOUD_CODECS",
@@ -155,6 +162,8 @@ def _decode(
         check_size(sample.payload, max_payload, sample.size)
     except OversizedError as error:
         raise OversizedError(f"{sample.key}: {error}") from error
+    if sample.refused:
+        raise RefusedError(f"{sample.key}: {sample.refused}")
     name = codec_for(kind, codecs, sample, option, hint)
     try:
         return codecs[name].decode(sample)

@@ -71,6 +71,30 @@ def _pose(message: Any) -> Pose:
     return checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 
+def header_stamp(payload: bytes) -> int:
+    """Read the stamp (ns) of the header at the start of a CDR message; MessageError if there is none."""
+    return stamp_join(*_unpack("iI", payload, 4))
+
+
+def frame_id(payload: bytes, skip: int = 0) -> str:
+    """Read the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
+    offset = 12
+    for _ in range(skip):
+        (length,) = _unpack("I", payload, offset)
+        offset += 4 + length + 3 & ~3
+    (length,) = _unpack("I", payload, offset)
+    return payload[offset + 4 : offset + 4 + length].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+
+def _unpack(kinds: str, payload: bytes, offset: int) -> tuple[int, ...]:
+    if payload[:2] not in (b"\0\0", b"\0\1"):
+        raise MessageError("not a message in CDR")
+    try:
+        return struct.unpack_from((">", "<")[payload[1]] + kinds, payload, offset)
+    except struct.error as error:
+        raise MessageError("the message is truncated") from error
+
+
 def _refuse_many_fields(payload: bytes) -> None:
     """Check the number of PointFields before parsing: rosbags would build an object for each of millions."""
     _check_encapsulation(payload, CLOUD)
@@ -138,14 +162,14 @@ def _pose_out(T: Pose, covariance: Any) -> Any:
     return new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=rows)
 
 
-def encode_cloud(message: CloudMessage) -> Encoded:
-    """Write a PointCloud2 in frame ``base_link``."""
+def encode_cloud(message: CloudMessage, frame_id: str = "base_link") -> Encoded:
+    """Write a PointCloud2 in a frame."""
     table = write_table(message)
     field = "sensor_msgs/msg/PointField"
     return write(
         new(
             CLOUD,
-            header=header(message.stamp_ns, "base_link"),
+            header=header(message.stamp_ns, frame_id),
             height=1,
             width=table.width,
             fields=[new(field, name=n, offset=o, datatype=_NUMBERS[k], count=1) for n, k, o in table.fields],

@@ -33,6 +33,7 @@ class Sample:
     encoding: str = ""  # MIME type with its schema (``type;schema``), empty if the sender set none
     attachment: bytes | None = None  # sent with the payload
     size: int | None = None  # bytes of a payload that was too large to receive; ``payload`` is empty then
+    refused: str = ""  # why the transport kept the payload back, for people; likewise
 
 
 @dataclass(frozen=True)

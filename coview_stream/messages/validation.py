@@ -23,6 +23,10 @@ MAX_POINTS = 4_000_000
 _NANO = 1_000_000_000
 
 
+class RefusedError(MessageError):
+    """The transport kept a message back, for one of few reasons; counted as malformed."""
+
+
 class OversizedError(MessageError):
     """A message exceeds the node's limits; counted separately from malformed messages."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import bz2
 import importlib
 import os
-import struct
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,9 +16,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from coview_stream.errors import CoViewError, InputError, MessageError, RunError
+from coview_stream.errors import CoViewError, InputError, RunError
 from coview_stream.messages import livox, ros2
-from coview_stream.messages.validation import stamp_join
 from coview_stream.recordings import frame_tree
 
 LIMIT = 1 << 29
@@ -100,30 +98,6 @@ def _cdr_from_ros1(data: bytes, kind: str) -> bytes:
     if kind in livox.TYPES:
         return livox.cdr_from_ros1(data)
     return bytes(ros2.store().ros1_to_cdr(data, frame_tree.TYPES[0] if kind in frame_tree.TYPES else kind))
-
-
-def header_stamp(payload: bytes) -> int:
-    """Read the stamp (ns) of the header at the start of a CDR message; MessageError if there is none."""
-    return stamp_join(*_unpack("iI", payload, 4))
-
-
-def frame_id(payload: bytes, skip: int = 0) -> str:
-    """Read the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
-    offset = 12
-    for _ in range(skip):
-        (length,) = _unpack("I", payload, offset)
-        offset += 4 + length + 3 & ~3
-    (length,) = _unpack("I", payload, offset)
-    return payload[offset + 4 : offset + 4 + length].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
-
-
-def _unpack(kinds: str, payload: bytes, offset: int) -> tuple[int, ...]:
-    if payload[:2] not in (b"\0\0", b"\0\1"):
-        raise MessageError("not a message in CDR")
-    try:
-        return struct.unpack_from((">", "<")[payload[1]] + kinds, payload, offset)
-    except struct.error as error:
-        raise MessageError("the message is truncated") from error
 
 
 def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:

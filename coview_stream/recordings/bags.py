@@ -24,11 +24,12 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.transforms import Points, Poses, interpolate, inverse, transform
 from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages import livox, ros2
+from coview_stream.messages.ros2 import frame_id, header_stamp
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import SweepCorrection, deskew
 from coview_stream.recordings import frame_tree
-from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stamp, readable
+from coview_stream.recordings.bag_reader import BagReader, readable
 from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.recordings.run import Run
 

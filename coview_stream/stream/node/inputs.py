@@ -15,11 +15,12 @@ import numpy as np
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import MessageError
+from coview_stream.errors import EncodingError, MessageError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
+from coview_stream.messages.validation import RefusedError
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind, Segment
 from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of, last_line
 from coview_stream.stream.transport.keys import RobotKeys
@@ -223,7 +224,7 @@ class Inputs:
         name = counter_of(error)
         self.counters.count(f"{prefix}received")
         self.counters.count(prefix + name)
-        if name == "unknown_encoding":
+        if isinstance(error, EncodingError | RefusedError):
             self.errors.add(str(error))
         else:
             self.errors.add_first(f"{key}: {name} messages", str(error).removeprefix(f"{key}: "))

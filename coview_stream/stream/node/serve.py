@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.joined import load_map
@@ -38,11 +38,13 @@ log = logging.getLogger("coview_stream.node")
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Endpoints to connect to and to listen on, and a zenoh JSON5 file."""
+    """Endpoints to connect to and to listen on, and a zenoh JSON5 file; or a ROS 2 node in place of zenoh."""
 
     connect: Sequence[str] = ()
     listen: Sequence[str] = ()
     zenoh_config: Path | None = None
+    ros2: Any = None  # of :func:`~coview_stream.stream.transport.ros2_transport.start_node`
+    check_frames: bool = True  # of ROS 2: refuse clouds in another frame than the one whose odometry comes
 
 
 @dataclass(frozen=True)
@@ -110,16 +112,10 @@ def open_node(
         base_map, engines = start_engines(options, children)
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
-        from coview_stream.stream.node.fleet import LEASE_MS
         from coview_stream.stream.node.health import Notifier
-        from coview_stream.stream.transport.zenoh_transport import open_transport
 
         notifier = notifier or Notifier()
-        network = options.network
-        transport = open_transport(
-            network.connect, network.listen, network.zenoh_config, options.node.max_payload,
-            lease_ms=None if options.fleet is None else LEASE_MS,
-        )  # fmt: skip
+        transport = _open_transport(options)
         node = _make_node(options, base_map, engines, transport, notifier)
         for session in node.sessions:
             if (guess := options.guesses.get(session.keys.robot)) is not None:
@@ -142,6 +138,20 @@ def open_node(
     log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, where, names)
     notifier.ready(f"serves {names}")
     return node
+
+
+def _open_transport(options: ServeOptions) -> Transport:
+    network = options.network
+    if network.ros2 is not None:
+        from coview_stream.stream.transport.ros2_transport import Ros2Transport
+
+        return Ros2Transport(network.ros2, options.keys, network.check_frames)
+    from coview_stream.stream.node.fleet import LEASE_MS
+    from coview_stream.stream.transport.zenoh_transport import open_transport
+
+    lease_ms = None if options.fleet is None else LEASE_MS
+    endpoints = network.connect, network.listen, network.zenoh_config
+    return open_transport(*endpoints, options.node.max_payload, lease_ms)
 
 
 def _make_node(

@@ -1,0 +1,446 @@
+"""A ROS 2 node as a transport: topics instead of zenoh's keys, through rclpy, which nothing else imports.
+
+Clouds, odometry and initial poses come as the bytes that the middleware has, and are read by our own codec. Poses,
+statuses and the view of the map go out as the messages that RViz and Nav2 read; all else stays in this process.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.summary import MapView
+from coview_stream.errors import (
+    ConfigError,
+    CoViewError,
+    DependencyError,
+    MessageError,
+    TransportError,
+    install_command,
+    printable,
+)
+from coview_stream.geometry.transforms import Pose
+from coview_stream.messages import json_messages, ros2, ros2_outputs
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
+from coview_stream.stream.transport.zenoh_io import THREADS, Inbox, Inboxes
+
+_log = logging.getLogger(__name__)
+
+_NODE = "coview_stream"
+_OWN_PARAMETERS = ("use_sim_time", "start_type_description_service")
+_QUEUE = 1024  # samples; 5 s of 200 Hz odometry
+_CACHE = 10.0  # seconds of transforms that a tf2 buffer keeps: with older stamps no user of ours finds any
+_JOIN = 0.3  # seconds for each thread at closing
+_MAP_TOPIC, _GUESS_TOPIC = "map_points", "initialpose"  # relative: a namespace moves them
+
+
+def start_node(args: Sequence[str]) -> Any:
+    """Return a ROS 2 node in a context of its own; ``args`` are those behind ``--ros-args``.
+
+    Raises:
+        DependencyError: there is no rclpy, or one of another Python. ConfigError: it refuses the arguments.
+    """
+    rclpy = _import_rclpy()
+    context = rclpy.context.Context()
+    try:
+        signals = import_module("rclpy.signals").SignalHandlerOptions.NO  # the command ends the node
+        rclpy.init(args=["--ros-args", *args], context=context, signal_handler_options=signals)
+        return rclpy.node.Node(_NODE, context=context, automatically_declare_parameters_from_overrides=True)
+    except Exception as error:  # its own kinds differ from release to release
+        raise ConfigError(f"--ros-args {' '.join(args)}: {printable(error)}") from error
+
+
+def _import_rclpy() -> Any:
+    try:
+        for name in ("context", "executors", "node", "qos"):
+            import_module(f"rclpy.{name}")
+        return import_module("rclpy")
+    except Exception as error:  # a library of another release may raise anything
+        spec = find_spec("rclpy")
+        if spec is None:
+            raise DependencyError(
+                f"--ros2: there is no rclpy here; source ROS 2, or {install_command('ros2')} (Python 3.11 to 3.13)"
+            ) from error
+        folder = Path(spec.origin or "").parent
+        built = sorted(path.name.split(".")[1] for path in folder.glob("_rclpy_pybind11.*.so"))
+        tag = f"cpython-{sys.version_info.major}{sys.version_info.minor}"
+        if built and not any(name.startswith(tag) for name in built):
+            why = f"is built for {', '.join(built)}, and this is {tag}: use that Python"
+        else:
+            why = f"cannot be loaded ({printable(error)}): is ROS 2 sourced?"
+        raise DependencyError(f"--ros2: the rclpy in {folder} {why}, or {install_command('ros2')}") from error
+
+
+def settings_of(node: Any) -> dict[str, Any]:
+    """Return the parameters of a node that are not its own, those with dots as tables."""
+    settings: dict[str, Any] = {}
+    for name, parameter in sorted(node.get_parameters_by_prefix("").items()):
+        if name in _OWN_PARAMETERS or name.startswith("qos_overrides."):
+            continue
+        *tables, last = name.split(".")
+        table = settings
+        for part in tables:
+            table = table.setdefault(part, {})
+        value = parameter.value
+        table[last] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    return settings
+
+
+@dataclass
+class _Robot:
+    """A robot's topics and frames. ``check_frames``: clouds have to be in the frame whose odometry comes."""
+
+    keys: RobotKeys
+    prefix: str  # of the topics that a single robot has in the node's namespace
+    check_frames: bool
+    map_frame: str = "map"
+    odometry_frame: str = ""  # of the newest odometry
+    body_frame: str = ""  # whose odometry it is
+    T_map_odom: Pose | None = None  # of the newest pose; kept while there is none
+    posed_at: float = 0.0  # local time of the newest pose
+    newest_ns: int | None = None  # stamp of the newest cloud or odometry
+    odometry_ns: int | None = None  # of the newest odometry
+    clock_said: bool = False  # that the stamps contradict this node's clock
+    outputs: dict[str, Any] = field(default_factory=dict)  # rclpy's publishers
+
+    def check_cloud(self, payload: bytes) -> str:
+        """Return why a cloud is not to be used, empty if nothing speaks against it."""
+        self.newest_ns, frame, body = ros2.header_stamp(payload), ros2.frame_id(payload), self.body_frame
+        if not (self.check_frames and frame and body) or frame == body:
+            return ""
+        return (
+            f"the cloud is in frame {frame!r}, odometry is of {body!r}: give the lidar's pose on it by --mount, "
+            "--mount=0,0,0 if the two are one"
+        )
+
+    def check_odometry(self, payload: bytes) -> str:
+        """Likewise of odometry, whose frames are noted."""
+        frame, stamp_ns = ros2.frame_id(payload), ros2.header_stamp(payload)
+        if frame == self.map_frame:
+            return f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?"
+        if self.odometry_ns is not None and stamp_ns < self.odometry_ns - _CACHE * 1e9:
+            self.T_map_odom = None  # the sender began anew, and so did its frame
+        self.newest_ns = self.odometry_ns = stamp_ns
+        self.odometry_frame, self.body_frame = frame, ros2.frame_id(payload, 1)
+        return ""
+
+    def check_guess(self, payload: bytes) -> str:
+        """Likewise of an initial pose."""
+        frame = ros2.frame_id(payload)
+        if frame and frame in (self.odometry_frame, self.body_frame):
+            return f"an initial pose in frame {frame!r}: set RViz' fixed frame to {self.map_frame!r}"
+        return ""
+
+
+@dataclass(frozen=True)
+class _Input:
+    topic: str
+    kind: str
+    check: Callable[[bytes], str]
+    then: Callable[[], None] = lambda: None  # after it has been handed on
+
+
+class _Output:
+    """Publisher to this process, and by ``write`` to ROS."""
+
+    def __init__(self, transport: Ros2Transport, key: str, write: Callable[[bytes], None] | None) -> None:
+        self._transport = transport
+        self._key = key
+        self._write = write
+
+    def put(self, message: Encoded) -> None:
+        self._transport.deliver(Sample(self._key, message.payload, message.encoding, message.attachment))
+        if self._write is not None:
+            with self._transport.guard.catch(self._key):
+                self._write(message.payload)
+
+    def close(self) -> None:
+        self._write = None
+
+
+class Ros2Transport:
+    """A ROS 2 node's topics under the keys of its robots; all methods may be called from any thread.
+
+    Args:
+        node: from :func:`start_node`; it is destroyed at closing.
+        keys: of the robots; clouds, odometry and poses are topics without their first slash.
+        check_frames: refuse clouds in another frame than the one whose odometry comes.
+    """
+
+    def __init__(self, node: Any, keys: Sequence[RobotKeys], check_frames: bool = True) -> None:
+        self.guard = RateLimitedErrors(_log)
+        self._node = node
+        self._inputs: dict[str, _Input] = {}
+        self._writers: dict[str, Callable[[bytes], None]] = {}
+        self._readers: dict[str, tuple[Inbox, ...]] = defaultdict(tuple)
+        self._subscribed: dict[str, Any] = {}
+        self._services: dict[str, str] = {}
+        self._show_map: Callable[[], dict[str, Any]] | None = None
+        self._map_publisher: Any = None
+        self._shown = ""  # hash of the map that has been published
+        self._lock = threading.RLock()
+        self._closed = threading.Event()
+        self._inboxes = Inboxes(self.guard)
+        self._map_wanted = self._inboxes.open("map", lambda _: self._publish_map(), 1)
+        self._robots = [_Robot(k, f"{k.robot}/" if len(keys) > 1 else "", check_frames) for k in keys]
+        try:
+            self._diagnostics = self._create_publisher(ros2_outputs.DIAGNOSTICS, "/diagnostics")
+            for robot in self._robots:
+                self._declare(robot)
+        except CoViewError:
+            raise
+        except Exception as error:  # a name that ROS does not allow
+            raise ConfigError(f"--ros2: {printable(error)}") from error
+        executors = import_module("rclpy.executors")
+        self._executor = executors.SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        works = [self._spin, *[self._inboxes.run] * THREADS]
+        self._threads = [threading.Thread(target=work, name="coview ros", daemon=True) for work in works]
+        for thread in self._threads:
+            thread.start()
+        atexit.register(self.close)  # a thread inside rclpy while the interpreter shuts down may abort the process
+
+    def _declare(self, robot: _Robot) -> None:
+        """Declare a robot's topics."""
+        keys, prefix, outputs = robot.keys, robot.prefix, robot.outputs
+        outputs["pose"] = self._create_publisher(ros2.POSE, f"/{keys.pose}")
+        if find_spec("tf2_msgs") is not None:
+            outputs["tf"] = self._create_publisher(ros2_outputs.TRANSFORMS, f"/{prefix}tf", 100)
+        self._inputs |= {
+            keys.cloud: _Input(f"/{keys.cloud}", ros2.CLOUD, robot.check_cloud),
+            keys.odometry: _Input(
+                f"/{keys.odometry}", ros2.ODOMETRY, robot.check_odometry, lambda: self._broadcast(robot)
+            ),
+            keys.initial_pose: _Input(prefix + _GUESS_TOPIC, ros2.POSE, robot.check_guess),
+        }
+        self._writers |= {
+            keys.pose: lambda payload: self._write_pose(robot, payload),
+            keys.status: lambda payload: self._write_status(robot, payload),
+        }
+        self._services |= {keys.relocalize: f"/{keys.robot}/relocalize", keys.reset: f"/{keys.robot}/reset"}
+
+    def _create_publisher(self, kind: str, topic: str, depth: Any = 10) -> Any:
+        return self._node.create_publisher(_type(kind), topic, depth)
+
+    # ---- as of Transport
+
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
+        """As :meth:`Transport.subscribe`, to a robot's topic or to messages of this process."""
+        inbox = self._inboxes.open(key, handler, 1 if policy == "newest" else _QUEUE)
+
+        def end() -> None:
+            inbox.close()
+            with self._lock:
+                self._readers[key] = tuple(other for other in self._readers[key] if other is not inbox)
+                subscription = None if self._readers[key] else self._subscribed.pop(key, None)
+                if subscription is not None and not self._closed.is_set():
+                    self._node.destroy_subscription(subscription)
+
+        with self._lock:
+            if self._closed.is_set():
+                raise TransportError(f"key {key!r}: the transport is closed")
+            self._readers[key] = (*self._readers[key], inbox)
+            source = self._inputs.get(key)
+            if source is not None and key not in self._subscribed:
+                self._subscribed[key] = self._subscription(key, source)
+        return end
+
+    def _subscription(self, key: str, source: _Input) -> Any:
+        """Subscribe with the QoS of sensor data, which hears every publisher; bytes, not Python's objects."""
+        qos = import_module("rclpy.qos")
+        encoding = f"application/cdr;{source.kind}"
+
+        def take(payload: bytes) -> None:
+            with self.guard.catch(key):
+                try:
+                    refused = source.check(payload)
+                except MessageError as error:
+                    refused = str(error)
+                self.deliver(Sample(key, b"" if refused else payload, encoding, refused=refused))
+                if not refused:
+                    source.then()
+
+        depth = 5 if source.kind == ros2.CLOUD else _QUEUE
+        profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+        subscription = self._node.create_subscription(_type(source.kind), source.topic, take, profile, raw=True)
+        _log.info("%s comes on topic %s", source.kind, subscription.topic_name)
+        return subscription
+
+    def deliver(self, sample: Sample) -> None:
+        """Hand a sample to the subscriptions of its key in this process."""
+        for inbox in self._readers.get(sample.key, ()):
+            inbox.put(sample)
+
+    def publisher(self, key: str, urgency: Urgency) -> Publisher:
+        """As :meth:`Transport.publisher`."""
+        return _Output(self, key, self._writers.get(key))
+
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
+        """Publish the view of the map; answer services where ``std_srvs`` is installed; ignore other questions."""
+        if any(key == robot.keys.map_view for robot in self._robots):
+            self._show_map = lambda: handler({})
+        if key not in self._services or find_spec("std_srvs") is None:
+            return lambda: None
+
+        def reply(_: Any, response: Any) -> Any:
+            try:
+                answer = handler({})
+                response.success, response.message = bool(answer["ok"]), f"{answer['state']}: {answer['reason']}"
+            except Exception as error:
+                self.guard.report(key, error)
+                response.success, response.message = False, str(error)
+            return response
+
+        trigger = import_module("std_srvs.srv").Trigger
+        service = self._node.create_service(trigger, self._services[key], reply)
+
+        def end() -> None:
+            if not self._closed.is_set():
+                self._node.destroy_service(service)
+
+        return end
+
+    def announce(self, key: str) -> None:
+        """Do nothing: ROS has a graph of its nodes."""
+
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
+    ) -> dict[str, Any]:
+        """Raise TransportError: nobody answers our keys in ROS."""
+        raise TransportError(f"{key}: no answer: ROS 2 has topics and services instead")
+
+    def tokens(self, expression: str) -> list[str]:
+        """Return none."""
+        return []
+
+    def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
+        """As :meth:`Transport.await_subscriber`, of a topic ``key``."""
+        deadline = time.monotonic() + seconds
+        while not self._node.count_subscribers(f"/{key}"):
+            if time.monotonic() >= deadline or wait(0.05):
+                return False
+        return True
+
+    def connection(self) -> Connection:
+        """Return the ROS nodes that publish clouds and odometry, and log those with another type."""
+        names = set()
+        with self._lock:
+            subscribed = [(self._inputs[key], held.topic_name) for key, held in self._subscribed.items()]
+        for source, topic in subscribed:
+            if source.topic.endswith(_GUESS_TOPIC):
+                continue
+            for end in self._node.get_publishers_info_by_topic(topic):
+                if "UNKNOWN" in end.node_name:  # for the moment in which only the publisher is known
+                    continue
+                names.add(f"{end.node_namespace.rstrip('/')}/{end.node_name}")
+                if end.topic_type != source.kind:
+                    text = f"{end.node_name} sends {end.topic_type}, which is not heard; {source.kind} is read"
+                    self.guard.report(topic, TransportError(text))
+        return Connection(peers=tuple(sorted(names)))
+
+    def close(self) -> None:
+        """As :meth:`Transport.close`."""
+        with self._lock:
+            if self._closed.is_set():
+                return
+            self._closed.set()
+        atexit.unregister(self.close)
+        self._inboxes.end()
+        with contextlib.suppress(Exception):  # rclpy's own kinds, while it takes down the rest
+            self._executor.shutdown(_JOIN)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(_JOIN)
+        with contextlib.suppress(Exception):
+            self._node.destroy_node()
+        with contextlib.suppress(Exception):
+            self._node.context.try_shutdown()
+
+    def _spin(self) -> None:
+        while not self._closed.is_set():
+            with self.guard.catch("rclpy"):
+                self._executor.spin()
+
+    # ---- messages out
+
+    def _write_pose(self, robot: _Robot, payload: bytes) -> None:
+        pose = json_messages.decode_pose(Sample("", payload))
+        robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
+        robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
+
+    def _broadcast(self, robot: _Robot) -> None:
+        """Broadcast map -> odom as it is known at the stamp of odometry that came; while the place is lost, as it was.
+
+        With odometry, not with poses: who looks up the body at odometry's stamp need not wait for the next pose.
+        """
+        publisher, T, frame = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame
+        if publisher is not None and T is not None and frame and robot.odometry_ns is not None:
+            publisher.publish(ros2_outputs.encode_transform(T, robot.odometry_ns, robot.map_frame, frame))
+
+    def _write_status(self, robot: _Robot, payload: bytes) -> None:
+        status = json.loads(payload)
+        now_ns = self._node.get_clock().now().nanoseconds
+        if status["map_sha256"] != self._shown:
+            self._shown = status["map_sha256"]
+            self._map_wanted.put(Sample("map", b""))
+        clock = self._clock(robot, now_ns)
+        if clock and not robot.clock_said:
+            _log.warning("%s: %s", robot.keys.robot, clock)
+        robot.clock_said = bool(clock)
+        if robot.T_map_odom is None:
+            transform = "none: the place has not been found yet"
+        elif status["state"] == "TRACKING":
+            transform = "follows the pose"
+        else:
+            transform = f"frozen for {time.monotonic() - robot.posed_at:.0f} s"
+        self._diagnostics.publish(ros2_outputs.encode_diagnostics(status, now_ns, transform, clock))
+
+    def _clock(self, robot: _Robot, now_ns: int) -> str:
+        """Return how the stamps contradict this node's clock; empty if they do not."""
+        if robot.newest_ns is None:
+            return ""
+        if not now_ns:
+            return "use_sim_time is set and nothing comes on /clock"
+        late = (now_ns - robot.newest_ns) / 1e9
+        if abs(late) <= _CACHE:
+            return ""
+        side = "before" if late > 0 else "after"
+        return f"stamps lie {abs(late):.0f} s {side} this node's clock: is use_sim_time as the sender's?"
+
+    def _publish_map(self) -> None:
+        """Publish the map's points for all who subscribe, also later."""
+        if self._show_map is None:
+            return
+        view = MapView.from_json(self._show_map())
+        if self._map_publisher is None:
+            qos = import_module("rclpy.qos")
+            latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+            self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, latched)
+        points = (view.points + view.origin).astype(np.float32)
+        self._map_publisher.publish(ros2_outputs.encode_map(points, self._node.get_clock().now().nanoseconds))
+
+
+def _type(name: str) -> Any:
+    """Import a message type; DependencyError if its package is missing."""
+    package, _, message = name.split("/")
+    try:
+        return getattr(import_module(f"{package}.msg"), message)
+    except ImportError as error:
+        raise DependencyError(f"--ros2: ROS package {package} is missing; {install_command('ros2')}") from error

@@ -1,0 +1,466 @@
+"""ROS 2 as transport, against a real rclpy over loopback: topics as Nav2 and RViz read them, bad input, restarts."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
+
+from coview_stream.cli import main
+from coview_stream.clouds.python_child import python_command, python_environment
+from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.geometry.transforms import inverse, pose_to_tum
+from coview_stream.messages import ros2, ros2_outputs
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.rmw import type_hash
+from coview_stream.stream.transport.ros2_transport import Ros2Transport, settings_of, start_node
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "node"))
+from fake_node import Site
+from fake_robot import POINTS, cloud, message, ns, odometry
+
+NO_ROS = "no rclpy here: pip install -e '.[test-ros2]', Python 3.11 to 3.13"
+KEYS = robot_keys("native", "coview", "r1", "r1/points", "r1/odom", "r1/pose")
+
+
+@pytest.fixture
+def ros(monkeypatch):
+    pytest.importorskip("rclpy", reason=NO_ROS)
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def robot(ros):
+    robot = RosRobot()
+    yield robot
+    robot.close()
+
+
+class RosSite(Site):
+    """A node without threads whose network is ROS; its engine knows every place at once."""
+
+    def __init__(self, *args):
+        super().__init__("r1", net=Ros2Transport(start_node(args), [KEYS]))
+        self.sessions["r1"].keys = self.keys["r1"] = KEYS
+        self.node.declare()
+
+    def meet(self, robot):
+        """Wait until both hear each other: what is sent before is lost."""
+        robot.found()
+        early = iter(range(-2000, -1000))
+
+        def heard():
+            at = 0.001 * next(early)
+            robot.move(ns(at), message(at).T_odom_body)
+            time.sleep(0.02)
+            return self.counters().odometry_received
+
+        robot.until(heard)
+        time.sleep(0.3)  # the other topics are found with it
+
+    def tick(self):
+        self.node.publish_poses(time.monotonic())
+        self.node.reporter.publish(time.monotonic())
+
+    def told(self, robot, condition):
+        """Publish statuses until the robot's diagnostics meet a condition."""
+
+        def met():
+            self.tick()
+            time.sleep(0.02)
+            return bool(robot.diagnostics) and condition()
+
+        robot.until(met)
+
+    def counters(self):
+        return self.sessions["r1"].counters
+
+
+@pytest.fixture
+def site(robot):
+    site = RosSite()
+    site.meet(robot)
+    yield site
+    site.net.close()
+
+
+def drive(robot, site, seconds, points=POINTS):
+    """Publish a frame, and let the node work on it until its pose is out."""
+    processed = site.counters().processed
+    stamp = ns(seconds)
+    robot.send(stamp, points, message(seconds).T_odom_body)
+    robot.move(stamp + 10_000_000, message(seconds + 0.01).T_odom_body)
+
+    def done():
+        site.work("r1")
+        return site.counters().processed > processed
+
+    robot.until(done)
+
+    def posed():
+        site.node.publish_poses(time.monotonic())
+        return any(stamp_of(pose) == stamp + 10_000_000 for pose in robot.poses)
+
+    robot.until(posed)
+
+
+@pytest.mark.slow
+def test_poses_are_those_of_another_transport_to_the_last_digit(robot, site):
+    other = Site("r1")
+    other.node.declare()
+    for k in range(5):
+        drive(robot, site, 0.1 * k)
+        other.net.publish(odometry(0.1 * k))
+        other.net.publish(cloud(0.1 * k))
+        other.net.publish(odometry(0.1 * k + 0.01))
+        other.work("r1")
+        wanted = other.poses("r1")[-1]
+        got = robot.poses[-1]
+        assert stamp_of(got) == wanted.stamp_ns
+        assert got.header.frame_id == "map"
+        np.testing.assert_allclose(place_of(got), pose_to_tum(wanted.T_map_body), atol=1e-9)
+        np.testing.assert_allclose(np.reshape(got.pose.covariance, (6, 6)), wanted.covariance, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, monkeypatch):
+    from geometry_msgs.msg import PolygonStamped  # any type will do: bytes go out and in as they are
+
+    package, messages = ModuleType("tf2_msgs"), ModuleType("tf2_msgs.msg")
+    package.__spec__ = ModuleSpec("tf2_msgs", None)
+    messages.TFMessage = PolygonStamped
+    monkeypatch.setitem(sys.modules, "tf2_msgs", package)
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", messages)
+    heard = []
+    robot.node.create_subscription(PolygonStamped, "/tf", heard.append, 10, raw=True)
+    site = RosSite()
+    try:
+        site.meet(robot)
+        for k in range(3):
+            drive(robot, site, 0.1 * k)
+        robot.move(ns(0.25), message(0.25).T_odom_body)
+        robot.until(lambda: heard and transform(heard[-1])[2] == ns(0.25))
+        parent, child, _, live = transform(heard[-1])
+        assert (parent, child) == ("map", "odom")
+        pose = site.sessions["r1"].pose()
+        np.testing.assert_allclose(live, pose_to_tum(pose.T_map_body @ inverse(message(0.25).T_odom_body)), atol=1e-9)
+        site.sessions["r1"].restart_search("asked", forget=True)
+        site.told(robot, lambda: "frozen" in robot.values()["map -> odom"])
+        robot.move(ns(0.3), message(0.3).T_odom_body)
+        robot.until(lambda: transform(heard[-1])[2] == ns(0.3))
+        np.testing.assert_array_equal(transform(heard[-1])[3], live)
+        count, received = len(heard), site.counters().odometry_received
+        for k in range(5):  # the sender began anew: its frame is another
+            robot.move(ns(-60.0 + 0.1 * k), message(0.1 * k).T_odom_body)
+        robot.until(lambda: site.counters().odometry_received > received + 3)
+        assert len(heard) == count
+    finally:
+        site.net.close()
+
+
+def transform(payload):
+    (row,) = ros2.store().deserialize_cdr(payload, ros2_outputs.TRANSFORMS).transforms
+    t, q, stamp = row.transform.translation, row.transform.rotation, row.header.stamp
+    values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+    return row.header.frame_id, row.child_frame_id, stamp.sec * 1_000_000_000 + stamp.nanosec, values
+
+
+@pytest.mark.slow
+def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog):
+    bad = {
+        "no numeric field 'z'": cloud_message(ns(0.1), POINTS[:, :2], names="xy"),
+        "frame 'velodyne', odometry is of 'base_link'": cloud_message(ns(0.2), POINTS, frame="velodyne"),
+    }
+    robot.move(ns(0.0), message(0.0).T_odom_body)
+    robot.until(lambda: site.sessions["r1"].inputs.odometry.newest.stamp_ns == ns(0.0))
+    for reason, payload in bad.items():
+        before = site.counters().malformed
+        for _ in range(2):
+            robot.clouds.publish(payload)
+            time.sleep(0.05)
+        robot.until(lambda before=before: site.counters().malformed == before + 2)
+        site.told(robot, lambda reason=reason: reason in robot.values().get("errors", ""))
+    assert sum("velodyne" in line for line in caplog.messages) <= 1
+    assert robot.values()["malformed"] == "4"
+    assert robot.level() == b"\1"
+    assert not robot.poses
+
+
+@pytest.mark.slow
+def test_points_of_the_other_byte_order_are_read(robot, site):
+    robot.move(ns(0.0), message(0.0).T_odom_body)
+    robot.clouds.publish(cloud_message(ns(0.0), POINTS, dtype=">f4"))
+    robot.move(ns(0.1), message(0.1).T_odom_body)
+    robot.until(lambda: site.sessions["r1"].has_job("track") or site.node.publish_poses(time.monotonic()))
+    np.testing.assert_array_equal(site.sessions["r1"].take_job("track").points, POINTS)
+
+
+@pytest.mark.slow
+def test_odometry_in_the_maps_frame_is_another_localizers_pose(robot, site):
+    odometry_of = ros2.store().types[ros2.ODOMETRY]
+    text = ros2.encode_odometry(message(0.0)).payload
+    own = ros2.store().deserialize_cdr(text, ros2.ODOMETRY)
+    own.header.frame_id = "map"
+    assert isinstance(own, odometry_of)
+    robot.odometry.publish(bytes(ros2.store().serialize_cdr(own, ros2.ODOMETRY)))
+    robot.until(lambda: site.counters().odometry_malformed == 1)
+    site.told(robot, lambda: "another localizer" in robot.values().get("errors", ""))
+
+
+@pytest.mark.slow
+def test_stamps_of_another_clock_are_told(robot, site):
+    drive(robot, site, 0.0)
+    site.told(robot, lambda: "before this node's clock" in robot.values().get("clock", ""))
+    assert robot.level() == b"\1"
+
+
+@pytest.mark.slow
+def test_sim_time_comes_from_the_clock_topic(robot):
+    from rosgraph_msgs.msg import Clock
+
+    site = RosSite("-p", "use_sim_time:=true")
+    try:
+        site.meet(robot)
+        clocks = robot.node.create_publisher(Clock, "/clock", 10)
+        drive(robot, site, 0.0)
+        site.told(robot, lambda: "nothing comes on /clock" in robot.values().get("clock", ""))
+        now = Clock()
+        now.clock.sec = ns(1.0) // 1_000_000_000
+
+        site.told(
+            robot, lambda: clocks.publish(now) or (robot.level(), stamp_of(robot.diagnostics[-1])) == (b"\0", ns(1.0))
+        )
+    finally:
+        site.net.close()
+
+
+@pytest.mark.slow
+def test_initial_pose_is_a_hypothesis_and_one_in_odometrys_frame_is_refused(robot, site):
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+
+    robot.move(ns(0.0), message(0.0).T_odom_body)
+    robot.until(robot.guesses.get_subscription_count)
+    guess = PoseWithCovarianceStamped()
+    guess.pose.pose.orientation.w = 1.0
+    guess.pose.pose.position.x = 5.0
+    guess.header.frame_id = "odom"
+    robot.guesses.publish(guess)
+    session = site.sessions["r1"]
+    robot.until(lambda: any("fixed frame" in text for text in session.errors.texts))
+    assert session.hints.guess is None
+    guess.header.frame_id = "map"
+    robot.guesses.publish(guess)
+    robot.until(lambda: session.hints.guess is not None)
+    assert session.hints.guess.x == 5.0
+
+
+@pytest.mark.slow
+def test_services_search_again_and_reset(robot, site):
+    from std_srvs.srv import Trigger
+
+    drive(robot, site, 0.0)
+    client = robot.node.create_client(Trigger, "/r1/relocalize")
+    assert client.wait_for_service(10.0)
+    answer = client.call_async(Trigger.Request())
+    robot.until(answer.done)
+    assert answer.result().success
+    assert site.sessions["r1"].pose() is None
+
+
+@pytest.mark.slow
+def test_publisher_of_another_type_is_named(robot, site, caplog):
+    from sensor_msgs.msg import Imu
+
+    other = RosRobot(name="r2", node="imu")
+    other.node.create_publisher(Imu, "/r1/points", 10)
+    robot.until(lambda: site.net.connection() and any("sensor_msgs/msg/Imu" in line for line in caplog.messages))
+    robot.until(lambda: site.net.connection().peers == ("/driver", "/imu"))
+    other.close()
+
+
+def test_type_hashes_are_those_of_rclpy(robot):
+    """An independent oracle of the keys of rmw_zenoh: the hashes in rclpy's type descriptions."""
+    for topic, kind in (("/r1/points", ros2.CLOUD), ("/r1/odom", ros2.ODOMETRY), ("/initialpose", ros2.POSE)):
+        robot.until(lambda topic=topic: robot.node.get_publishers_info_by_topic(topic))
+        (end,) = robot.node.get_publishers_info_by_topic(topic)
+        assert end.topic_type == kind
+        assert str(end.topic_type_hash).endswith(type_hash(kind).removeprefix("RIHS01_"))
+
+
+def test_bag_of_rclpys_bytes_is_a_run(ros, tmp_path):
+    from nav_msgs.msg import Odometry
+    from rclpy.serialization import serialize_message
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from coview_stream.recordings import open_run
+
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        clouds = writer.add_connection("/points", ros2.CLOUD, typestore=types)
+        moves = writer.add_connection("/odom", ros2.ODOMETRY, typestore=types)
+        for k in range(3):
+            moved = Odometry()
+            moved.header.frame_id, moved.child_frame_id = "odom", "base_link"
+            moved.header.stamp.sec, moved.pose.pose.orientation.w, moved.pose.pose.position.x = k, 1.0, 2.0 * k
+            writer.write(moves, k * 1_000_000_000, serialize_message(moved))
+            writer.write(clouds, k * 1_000_000_000, cloud_message(k * 1_000_000_000, POINTS + k))
+    frames = list(open_run(tmp_path / "bag"))
+    assert len(frames) == 3
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.points, POINTS + k)
+        assert frame.T_odom_body[0, 3] == 2.0 * k
+
+
+def test_parameters_are_options_by_their_names(ros, tmp_path):
+    file = tmp_path / "p.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters:\n    use_sim_time: true\n    site: site.coview\n    robot: [r1, r2]\n"
+        "    risk: 1.0e-5\n    node:\n      pairing_wait: 0.5\n"
+    )
+    node = start_node(["--params-file", str(file), "-r", "__ns:=/fleet"])
+    try:
+        assert settings_of(node) == {
+            "site": "site.coview", "robot": ["r1", "r2"], "risk": 1e-5, "node": {"pairing_wait": 0.5}
+        }  # fmt: skip
+        assert node.get_namespace() == "/fleet"
+    finally:
+        node.destroy_node()
+        node.context.try_shutdown()
+
+
+def test_names_that_ros_does_not_allow_are_refused(ros):
+    node = start_node(())
+    with pytest.raises(ConfigError, match="--ros2"):
+        Ros2Transport(node, [robot_keys("native", "coview", "r-1", "r-1/points", "r-1/odom", "r-1/pose")])
+    with pytest.raises(ConfigError, match="--ros-args"):
+        start_node(["--params-file", "/nowhere.yaml"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--ros2", "--connect", "tcp/127.0.0.1:1"], "--connect is for zenoh"),
+        (["--ros2", "--ros-args", "-p", "risks:=1.0"], "ROS parameters: unknown key 'risks'"),
+    ],
+)
+def test_options_that_do_not_go_with_ros_are_refused(ros, capfd, arguments, text):
+    assert main(["serve", "site.coview", "--robot", "r1", *arguments]) == 2
+    assert text in capfd.readouterr().err
+
+
+def test_arguments_of_ros_need_ros(capfd):
+    assert main(["serve", "site.coview", "--robot", "r1", "--ros-args", "-r", "a:=b"]) == 2
+    assert "--ros-args goes with --ros2" in capfd.readouterr().err
+
+
+@pytest.mark.skipif(find_spec("rclpy") is not None, reason="rclpy is here")
+def test_without_rclpy_the_message_names_the_extra():
+    with pytest.raises(DependencyError, match=r"no rclpy here.*ros2\]"):
+        start_node(())
+
+
+def test_rclpy_of_another_python_is_named(tmp_path):
+    (tmp_path / "rclpy").mkdir()
+    (tmp_path / "rclpy/__init__.py").write_text("")
+    (tmp_path / "rclpy/_rclpy_pybind11.cpython-399-x86_64-linux-gnu.so").write_text("")
+    code = "from coview_stream.stream.transport.ros2_transport import start_node; start_node(())"
+    paths = f"import sys; sys.path[:0] = {[str(tmp_path)]!r}; "
+    done = subprocess.run(
+        [sys.executable, "-c", paths + code], env=python_environment(), capture_output=True, text=True
+    )
+    assert "is built for cpython-399" in done.stderr.splitlines()[-1]
+
+
+# ---- a process of its own
+
+
+class Served:
+    """``coview-stream serve`` in a process."""
+
+    def __init__(self, world_file, folder, *arguments):
+        self.log = (folder / "serve.log").open("a+")
+        command = ("coview_stream", "serve", str(world_file), "--robot", "r1", "--ros2", "--no-state", *arguments)
+        self.process = subprocess.Popen(python_command(*command), env=python_environment(), stderr=self.log)
+
+    def end(self):
+        begin = time.monotonic()
+        self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(10.0), time.monotonic() - begin
+        finally:
+            self.process.kill()
+            self.log.close()
+
+
+def at_of(k, run):
+    """Number of the k-th frame of a run that is driven to and fro."""
+    count = len(run.clouds)
+    return (count - 1) - abs((k % (2 * count - 2)) - (count - 1))
+
+
+def play(robot, run, seconds, begin, until=lambda: False):
+    """Drive to and fro, ten frames a second by the wall clock; return the truth by stamps."""
+    truth, started = {}, time.monotonic()
+    for k in range(round(10 * seconds)):
+        at = at_of(begin + k, run)
+        stamp = time.time_ns()
+        truth[stamp] = run.T_map_body[at]
+        robot.send(stamp, run.clouds[at], run.T_odom_body[at])
+        if until():
+            break
+        time.sleep(max(0.0, started + 0.1 * (k + 1) - time.monotonic()))
+    return truth, begin + k + 1
+
+
+def errors(robot, truth):
+    found = [np.linalg.norm(place_of(p)[:3] - truth[stamp_of(p)][:3, 3]) for p in robot.poses if stamp_of(p) in truth]
+    assert len(found) == len(robot.poses) > 0
+    return found
+
+
+@pytest.mark.slow
+def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side(
+    robot, world_file, world_drive, tmp_path
+):
+    served = Served(world_file, tmp_path)
+    try:
+        robot.found()
+        robot.clouds.publish(cloud_message(time.time_ns(), np.zeros((0, 3))))  # zero width
+        truth, at = play(robot, world_drive, 60.0, 0, lambda: len(robot.poses) > 10)
+        assert max(errors(robot, truth)) < 0.3
+        robot.until(lambda: robot.level() == b"\0")
+        assert robot.heard["/map_points"][0].header.frame_id == "map"
+        assert 0 < robot.heard["/map_points"][0].width <= 100_000
+        still = world_drive.T_odom_body[at_of(at - 1, world_drive)]
+        for _ in range(70):  # the clouds stop, odometry goes on
+            robot.move(time.time_ns(), still)
+            time.sleep(0.1)
+        assert (robot.level(), "no usable frame" in robot.texts()[-1][1]) == (b"\2", True)
+        # the driver starts anew
+        robot.close()
+        robot.__init__(node="driver_again")
+        robot.found()
+        truth, at = play(robot, world_drive, 60.0, at, lambda: len(robot.poses) > 10)
+        assert max(errors(robot, truth)) < 0.3
+        # and so does the node
+        code, seconds = served.end()
+        assert (code, seconds < 2.0) == (0, True)
+        served = Served(world_file, tmp_path)
+        robot.until(lambda: not robot.clouds.get_subscription_count(), 40.0)
+        robot.found()
+        robot.poses.clear()
+        truth, at = play(robot, world_drive, 60.0, at, lambda: len(robot.poses) > 10)
+        assert max(errors(robot, truth)) < 0.3
+    finally:
+        served.end()
