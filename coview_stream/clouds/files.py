@@ -56,7 +56,7 @@ _FORMAT_BYTE = 104  # of a LAS header
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file in a folder is a cloud by its suffix; not hidden files, .txt and .csv."""
+    """Tell whether a file that is found in a folder has a cloud's suffix; .txt, .csv and hidden files do not count."""
     name = Path(path).name
     return suffix_of(Path(name)) in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
 

@@ -181,12 +181,16 @@ class LocalMaps:
         self._max_bytes = max_bytes
         self._crops: WeakValueDictionary[tuple[int, int], LocalMap] = WeakValueDictionary()
         self._recent: OrderedDict[LocalMap, None] = OrderedDict()  # the last one is the newest
+        self._empty: set[tuple[int, int]] = set()  # places without a crop
 
     def around(self, position: Floats) -> LocalMap | None:
         """Return the map within at least ``radius`` metres of ``position`` (3,); None if it is (nearly) empty there."""
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
+        if key in self._empty:
+            return None
         crop = self._crops.get(key) or self._cut(key)
         if crop is None:
+            self._empty.add(key)
             return None
         if crop in self._recent:
             self._recent.move_to_end(crop)
@@ -199,6 +203,7 @@ class LocalMaps:
     def clear(self) -> None:
         """Drop the crops that are not in use."""
         self._recent.clear()
+        self._empty.clear()
 
     def _cut(self, key: tuple[int, int]) -> LocalMap | None:
         centre = np.array(key) * _CROP_STEP

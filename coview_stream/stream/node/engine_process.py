@@ -356,12 +356,19 @@ def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
 def work(
     pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None = None, parent: int | None = None
 ) -> int:
-    """Load the kernels, open the engine, then answer jobs until the parent is gone; return the exit code.
+    """Run an engine in this process: load its kernels, open it, do the jobs that come through the pipe.
 
-    Kernels of later jobs are loaded one by one while no job waits: a job that comes meanwhile waits a quarter of a
-    second at most with the cache, some seconds on the first run ever. ``open_engine`` replaces
-    :func:`~coview_stream.stream.node.engines.open_engine`. Once ``parent``, a process id, is not our parent's, we end
-    even if its pipe is open.
+    On the first start on a machine the kernels are compiled before, for some seconds. Those of later jobs are loaded
+    one by one while no job waits; a job that comes meanwhile waits for one of them, a quarter of a second at most.
+
+    Args:
+        pipe: to the parent. First comes what :func:`~coview_stream.stream.node.engines.open_engine` needs, then jobs.
+        kind: of the engine.
+        open_engine: opens the engine, in place of that function.
+        parent: process id of the parent. The process ends when it has another parent, even if the pipe is open.
+
+    Returns:
+        The exit code: 0 when the parent has gone, 1 if the engine cannot be opened, which the parent has been told.
     """
     _set_group_nice(NICE[kind])
     from coview_kernels import warm_up

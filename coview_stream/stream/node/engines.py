@@ -206,10 +206,10 @@ KINDS: dict[str, type[Engine]] = {"odometry": OdometryEngine, "track": TrackEngi
 def open_engine(
     kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None, trust: Trust | None = None
 ) -> Engine:
-    """Make one of :data:`KINDS`; ``track`` and ``search`` load the map, which the node has checked.
+    """Return a new engine of the kind that :data:`KINDS` names; those that track and search load the map's file.
 
-    The file may have been changed meanwhile: its hash has to be ``sha256`` and, with ``trust``, it is verified again,
-    unless it is the very file, untouched.
+    The node has checked the file. It may have been replaced since, so its hash must still be ``sha256``. With
+    ``trust`` its signature is verified again, unless the file is the one that the node has verified, unchanged.
 
     Raises:
         MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or

@@ -16,6 +16,7 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import boxminus, boxplus, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
+from coview_stream.localization.registration import clouds
 from coview_stream.localization.registration.clouds import LocalMap, LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import (
     SIGMA_FLOOR,
@@ -165,10 +166,11 @@ def test_local_map_counts_all_bytes_it_keeps(world_map):
     assert crop.nbytes == pytest.approx(sum({id(base): base.nbytes for base in bases}.values()), rel=0.1)
 
 
-def test_local_map_without_points_is_none(world_map):
-    maps = LocalMaps(world_map, radius=6.0)
-    for x in (900.0, 901.0):
-        assert maps.around(np.array([x, 0.0, 0.0])) is None
+def test_local_map_without_points_is_none_and_is_cut_once(world_map, monkeypatch):
+    maps, cuts, cut_points = LocalMaps(world_map, radius=6.0), [], clouds.cut_points
+    monkeypatch.setattr(clouds, "cut_points", lambda *given: cuts.append(given) or cut_points(*given))
+    assert [maps.around(np.array([x, 0.0, 0.0])) for x in (900.0, 901.0, 960.0, 900.0)] == [None] * 4
+    assert len(cuts) == 2
 
 
 FLOOR = SIGMA_FLOOR
