@@ -30,6 +30,7 @@ from coview_stream.localization.result import Fix, KeyframeEvidence, calibration
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.smoothing import PoseKind, SmoothedPose, smooth_run
 from coview_stream.localization.state import State
+from coview_stream.localization.tracking.monitor import FAULTS, RejectionReason
 from coview_stream.recordings.run import Run
 
 _KINDS = {
@@ -48,19 +49,19 @@ TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 
 @dataclass(frozen=True)
 class Interruption:
-    """Successive frames after the first fix that have no pose.
+    """Frames with a reason: those after the first fix that have no pose, or those that were told of a fault.
 
     Attributes:
         first: stamp of the first frame, seconds.
         last: stamp of the last frame.
         frames: number of frames.
-        reason: why the first frame has none.
+        reason: of most of them.
     """
 
     first: float
     last: float
     frames: int
-    reason: str  # of most of them
+    reason: str
 
     def to_json(self) -> dict[str, Any]:
         """Plain data of ``result.json``."""
@@ -178,6 +179,18 @@ class RunResult:
             fixed, going_on = fixed or has, fixed and not has
         return [Interruption(gap[0].stamp, gap[-1].stamp, len(gap), _usual_reason(gap)) for gap in gaps]
 
+    @property
+    def faults(self) -> dict[RejectionReason, Interruption]:
+        """Faults of clouds and odometry that frames were told of, posed or not: first, last and number of frames."""
+        told: dict[RejectionReason, list[Fix]] = {}
+        for fix in self.fixes:
+            if fix.evidence is not None and fix.evidence.cause in FAULTS:
+                told.setdefault(fix.evidence.cause, []).append(fix)
+        return {
+            cause: Interruption(fixes[0].stamp, fixes[-1].stamp, len(fixes), _usual_reason(fixes))
+            for cause, fixes in told.items()
+        }
+
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
 
@@ -200,6 +213,7 @@ class RunResult:
             "posed": len(self.posed),
             "smoothed": None if self.smoothed is None else [stretch.to_json() for stretch in self.stretches],
             "interruptions": [gap.to_json() for gap in self.interruptions],
+            "faults": [{"cause": cause.value} | told.to_json() for cause, told in self.faults.items()],
             "skipped": self.skipped,
             "sources": list(self.sources),
             "map_sha256": base_map.sha256,
@@ -348,6 +362,10 @@ def summary(located: RunResult) -> str:
             lines.extend(f"{'calibration':<18} {clause}" for clause in says)
     elif located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    begin = located.fixes[0].stamp if located.fixes else 0.0
+    for cause, told in located.faults.items():
+        span = f"{told.frames} frames from {told.first - begin:.1f} s to {told.last - begin:.1f} s"
+        lines.append(f"{'FAULT ' + cause.value:<18} {span}: {told.reason}")
     if located.smoothed is not None and not posed:
         lines.append(f"{'smoothed':<18} nothing: there was no fix to smooth from")
     if located.skipped:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -178,3 +179,22 @@ def test_interruptions_are_reported_with_their_reason(world_map):
     assert "3 frames in 2 more places: see result.json" in text
     assert "without a pose" not in summary(RunResult(1, fixes[4:5]))
     assert not RunResult(4, fixes[:4]).interruptions  # before the first fix it is being sought
+
+
+def test_faults_of_sensors_are_reported_whether_there_are_poses_or_not(world_map):
+    def fix(stamp, cause, posed=False):
+        pose = (np.eye(4), np.eye(4), np.eye(6)) if posed else (None, None, None)
+        state = State.TRACKING if posed else State.SEARCHING
+        return Fix(stamp, state, *pose, evidence=KeyframeEvidence(stamp, state, f"{cause} at {stamp:g}", cause=cause))
+
+    repeated, clock = RejectionReason.REPEATED, RejectionReason.CLOCK
+    found = RunResult(5, [fix(10.0, None, True), fix(10.5, repeated), fix(11.0, None), fix(11.5, repeated),
+                          fix(12.0, clock, True)])  # fmt: skip
+    assert found.to_json(world_map)["faults"] == [
+        {"cause": "repeated", "first_stamp": 10.5, "last_stamp": 11.5, "frames": 2, "reason": f"{repeated} at 11.5"},
+        {"cause": "clock", "first_stamp": 12.0, "last_stamp": 12.0, "frames": 1, "reason": f"{clock} at 12"},
+    ]
+    assert re.search(r"^FAULT repeated +2 frames from 0\.5 s to 1\.5 s: .* at 11\.5$", summary(found), re.MULTILINE)
+    unposed = RunResult(2, found.fixes[1:3])
+    assert "FAULT repeated" in summary(unposed)
+    assert "FAULT" not in summary(RunResult(1, found.fixes[:1]))
