@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from dataclasses import replace
 
 from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_of
@@ -39,20 +40,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
     add_shared(parser, "--mount", "--cloud-topic", "--odometry-topic")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait for a node to subscribe (10)")
+    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait for a node that is ready (10)")
     add_shared(parser, "--progress")
     parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 
 
 def run(args: argparse.Namespace) -> int:
-    """Wait for a subscriber, send the run, print what was done; exit code 1 if there never was a subscriber."""
+    """Wait for a node, send the run, print what was done; exit code 1 if there never was a subscriber."""
     from tqdm import tqdm
 
     from coview_stream.cli.process import stop_on_signals
     from coview_stream.errors import ConfigError
     from coview_stream.recordings.lidar_runs import open_bare_run
     from coview_stream.recordings.open_run import open_run
-    from coview_stream.stream.client.replay import ReplayConfig, enough_odometry, odometry_spacing, replay
+    from coview_stream.stream.client.replay import (
+        ReplayConfig,
+        await_engines,
+        enough_odometry,
+        odometry_spacing,
+        replay,
+    )
     from coview_stream.stream.client.sender import Sender
     from coview_stream.stream.transport.keys import robot_keys
     from coview_stream.stream.transport.zenoh_transport import open_client
@@ -88,9 +95,13 @@ def run(args: argparse.Namespace) -> int:
             else:
                 print(f"{said}; use --odometry-rate {rate:g}", file=sys.stderr)
         with stop_on_signals() as stop:
+            begin = time.monotonic()
             heard = transport.await_subscriber(sender.cloud_key, args.wait, stop.wait)
             if not heard and not stop.requested:
                 print(f"nothing subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
+            left = args.wait - (time.monotonic() - begin)
+            if heard and left > 0 and not await_engines(transport, args.base, args.robot, left, stop.wait):
+                print("the node's engines are not ready yet; sending all the same", file=sys.stderr)
             total = None if args.loop else len(recorded)
             quiet = not (args.progress or sys.stderr.isatty())
             with tqdm(total=total, desc=f"replaying {args.robot}", unit="frame", disable=quiet) as bar:

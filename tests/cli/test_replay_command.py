@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.messages import decode_cloud, decode_odometry
+from coview_stream.messages.types import Encoded
 from coview_stream.stream.transport.zenoh_transport import open_transport
 
 
@@ -161,3 +165,33 @@ def test_signal_ends_replay_loop_cleanly(node, run_folder, start, number):
 )
 def test_bad_replay_usage_is_one_line(run_folder, refused, options, text):
     assert text in refused("replay", run_folder, "--robot", "r1", "--listen", free_endpoint(), *options)
+
+
+@pytest.mark.slow
+def test_replay_waits_until_the_node_is_ready(node, run_folder, capsys):
+    """A node subscribes before its engines have opened the map; clouds that come earlier are lost."""
+    began, sent_before = threading.Event(), []
+
+    def health(ok):
+        return {"robots": {"r1": {}}, "ready": {"ok": ok, "reasons": []}}
+
+    def start():
+        publisher = node.transport.publisher("coview/@node/x/out/health", "report")
+        for ok in (False, False, False, False, True):
+            if ok:
+                sent_before.extend(node.sent)
+            publisher.put(Encoded(json.dumps(health(ok)).encode(), "application/json"))
+            time.sleep(0.3)
+
+    def asked(parameters):
+        if not began.is_set():
+            began.set()
+            threading.Thread(target=start, daemon=True).start()
+        return health(False)
+
+    node.transport.answer("coview/@node/x/rpc/health", asked)
+    node.subscribe()
+    assert node.replay(run_folder, "--rate", "50") == 0
+    until(lambda: len(node.clouds()) == 6)
+    assert not sent_before
+    assert "not ready" not in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -12,12 +13,15 @@ from typing import Protocol
 
 import numpy as np
 
-from coview_stream.errors import CloudError, ConfigError
+from coview_stream.errors import CloudError, ConfigError, TransportError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, interpolate
-from coview_stream.messages.types import Encoded
+from coview_stream.messages.json_messages import read_object
+from coview_stream.messages.types import Encoded, Sample
 from coview_stream.recordings.run import Run
 from coview_stream.stream.client.sender import Sender, nanoseconds
+from coview_stream.stream.transport.keys import ANY, node_keys
+from coview_stream.stream.transport.transport import Transport
 
 _USUAL_RATE = 20.0  # Hz, of odometry
 _SINGLE_FRAME_PERIOD = 0.1  # seconds between repetitions of a run of one frame
@@ -114,6 +118,40 @@ def enough_odometry(run: Run, config: ReplayConfig) -> float:
 
 def _period(times: Floats, single: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else single
+
+
+_SILENT = 2.5  # seconds: a node tells of its health once a second
+
+
+def await_engines(
+    transport: Transport, base: str, robot: str, seconds: float, wait: Callable[[float], object] = time.sleep
+) -> bool:
+    """Wait up to ``seconds`` until a node that serves a robot tells that its engines are ready; False if none has.
+
+    Nothing is waited for where no node answers: another program has subscribed. ``wait`` as of
+    :meth:`Transport.await_subscriber`.
+    """
+    told = dict[str, bool]()  # by key, of the nodes that serve the robot
+
+    def hear(sample: Sample) -> None:
+        document = read_object(sample.payload)
+        if robot in document.get("robots", ()):
+            told[sample.key] = document["ready"]["ok"] is True
+
+    nodes = node_keys(base, ANY)
+    end = transport.subscribe(nodes.health, hear, "all")
+    try:
+        transport.query(nodes.ask_health, timeout=min(_SILENT, seconds))
+        begin = time.monotonic()
+        while not any(told.values()):
+            waited = time.monotonic() - begin
+            if waited >= (seconds if told else min(_SILENT, seconds)) or wait(0.1):
+                return not told
+    except TransportError:
+        pass  # no node, or one that does not answer
+    finally:
+        end()
+    return True
 
 
 _MAX_MEASUREMENTS = 100_000  # of each kind: a replay in a loop may run for days

@@ -163,9 +163,12 @@ class NodeKeys:
     reload: str  # query: open the map's file again
 
 
+ANY = "*"  # of the names of nodes
+
+
 def node_keys(base: str, name: str) -> NodeKeys:
-    """Return the keys of the node called ``name``; ConfigError if that is not one chunk of a key."""
-    own = f"{check_prefix(base, '--base')}/@node/{check_chunk(name, '--node')}"
+    """Return the keys of the node called ``name``, or of ANY; ConfigError if that is not one chunk of a key."""
+    own = f"{check_prefix(base, '--base')}/@node/{ANY if name == ANY else check_chunk(name, '--node')}"
     return NodeKeys(f"{own}/out/health", f"{own}/rpc/health", f"{own}/rpc/reload")
 
 
