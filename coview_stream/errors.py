@@ -92,6 +92,7 @@ EXTRA_OF = {
     "obstore": "s3",
     "open3d": "open3d",
     "CSF": "build",
+    "PIL": "plot",
     "matplotlib": "plot",
     "pye57": "e57",
     "kiss_icp": "kiss-icp",

@@ -94,6 +94,7 @@ def test_extras_that_messages_name_bring_the_library():
         return {*rest, *(name for part in more for name in brought(part))}
 
     spelt = {"google": "protobuf", "CSF": "cloth-simulation-filter", "rerun": "rerun-sdk", "lazrs": "laspy"}
+    spelt["PIL"] = "matplotlib"
     spelt |= {"open3d": "open3d-cpu", "foxglove": "foxglove-sdk", "rclpy": "ros-kilted-rclpy"}
     for module, extra in errors.EXTRA_OF.items():
         assert spelt.get(module, module.replace("_", "-")) in brought(extra), module

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -174,36 +172,21 @@ def write_geotiff(seen: Relief, path: str | os.PathLike[str], crs: str | None) -
     Raises:
         InputError: it cannot be written.
     """
-    picture = np.ascontiguousarray(seen.rgba[::-1])  # the north first
-    height, width = picture.shape[:2]
-    data = zlib.compress(picture.tobytes(), 6)
-    west, north = float(seen.corner[0]), float(seen.corner[1]) + height * seen.cell
+    from PIL import Image, TiffImagePlugin, TiffTags
+
     keys = [(1024, 0, 1, 1), (1025, 0, 1, 1)]  # a projected system; a raster of areas
     code = epsg_of(crs)
     if code is not None:
         keys.append((3072, 0, 1, code))
-    geo = [1, 1, 0, len(keys), *(number for key in keys for number in key)]
-    short, long, double = ("H", 3), ("I", 4), ("d", 12)
-    tags: list[tuple[int, tuple[str, int], list[Any]]] = [
-        (256, long, [width]), (257, long, [height]), (258, short, [8] * 4), (259, short, [8]), (262, short, [2]),
-        (273, long, [0]), (277, short, [4]), (278, long, [height]), (279, long, [len(data)]), (284, short, [1]),
-        (338, short, [2]),
-        (33550, double, [seen.cell, seen.cell, 0.0]), (33922, double, [0.0, 0.0, 0.0, west, north, 0.0]),
-        (34735, short, geo),
-    ]  # fmt: skip
-    at = 8 + 2 + 12 * len(tags) + 4  # behind the directory come values of more than four bytes, then the picture
-    sizes = [struct.calcsize(f"<{len(values)}{kind[0]}") for _, kind, values in tags]
-    start = at + sum(size + size % 2 for size in sizes if size > 4)
-    directory, rest = struct.pack("<2sHIH", b"II", 42, 8, len(tags)), b""
-    for (tag, (letter, number), values), size in zip(tags, sizes, strict=True):
-        packed = struct.pack(f"<{len(values)}{letter}", *([start] if tag == 273 else values))
-        if size > 4:
-            field, rest = struct.pack("<I", at + len(rest)), rest + packed + b"\0" * (size % 2)
-        else:
-            field = packed.ljust(4, b"\0")
-        directory += struct.pack("<HHI", tag, number, len(values)) + field
+    north = float(seen.corner[1]) + seen.rgba.shape[0] * seen.cell
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[33550] = (seen.cell, seen.cell, 0.0)
+    tags[33922] = (0.0, 0.0, 0.0, float(seen.corner[0]), north, 0.0)
+    tags[34735] = (1, 1, 0, len(keys), *(number for key in keys for number in key))
+    tags.tagtype |= {33550: TiffTags.DOUBLE, 33922: TiffTags.DOUBLE, 34735: TiffTags.SHORT}
+    picture = Image.fromarray(np.ascontiguousarray(seen.rgba[::-1]))  # the north first
     try:
         with atomic_file(Path(path)) as file:
-            file.write(directory + struct.pack("<I", 0) + rest + data)
+            picture.save(file, "TIFF", compression="tiff_adobe_deflate", tiffinfo=tags)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error

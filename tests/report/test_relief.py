@@ -62,7 +62,7 @@ def test_geotiff_is_read_by_others_where_it_lies(tmp_path):
     rgba = np.zeros((30, 50, 4), dtype=np.uint8)
     rgba[0] = (10, 20, 30, 255)  # the south
     write_geotiff(Relief(rgba, ORIGIN[:2], 0.5), tmp_path / "map.tif", None)
-    pillow = pytest.importorskip("PIL.Image")  # matplotlib brings it
+    pillow = pytest.importorskip("PIL.Image")
     with pillow.open(tmp_path / "map.tif") as picture:
         assert picture.size == (50, 30)
         assert picture.getpixel((0, 29)) == (10, 20, 30, 255)
