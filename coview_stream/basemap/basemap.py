@@ -99,7 +99,7 @@ class BaseMap:
                 float64 where they are large (UTM).
             preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
             config: replaces preset and options.
-            progress: show a bar on stderr.
+            progress: show a bar on stderr, or a line for each stage where that is no terminal.
             crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; of metres.
             options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.
 

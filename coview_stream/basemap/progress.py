@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+
+_SHORT = 10.0  # seconds of work that needs no lines
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -36,18 +39,24 @@ def progress_bar(title: str, show: bool | None = None, unit: str = "", scale: bo
 def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[str], Progress]]:
     """Show one bar of successive stages, with the time that is left, and yield the function that begins a stage.
 
+    Where stderr is no terminal, each stage is one line instead, as soon as the work has taken ten seconds.
+
     Args:
         shares: of the whole time, by stage, in order.
-        show: whether there is a bar.
+        show: whether anything is shown.
     """
     from tqdm import tqdm
 
+    terminal, start = sys.stderr.isatty(), time.monotonic()
     form = "{desc}{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left"
-    with tqdm(total=sum(shares.values()), disable=not show, leave=False, bar_format=form) as bar:
+    with tqdm(total=sum(shares.values()), disable=not (show and terminal), leave=False, bar_format=form) as bar:
 
         def begin(stage: str) -> Progress:
             before = sum(share for name, share in list(shares.items())[: list(shares).index(stage)])
             bar.set_description(stage)
+            if show and not terminal and (seconds := time.monotonic() - start) > _SHORT:
+                sys.stderr.write(f"{stage}, {seconds:.0f} s after the start\n")
+                sys.stderr.flush()
             bar.update(max(0.0, before - bar.n))
 
             def step(done: int, total: int) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from coview_stream.cli.map_argument import check_map_name
-from coview_stream.cli.options import add_shared
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import SigningKey
@@ -74,7 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
-    add_shared(parser, "--progress")
     tiles = parser.add_argument_group("directories of tiles")
     tiles.add_argument(
         "--workers", type=int, metavar="N", help="processes that build tiles (as many as cores, 8 at most)"
@@ -150,9 +148,7 @@ def _build_file(
 
     file_format.check_target(output)
     begin = time.perf_counter()
-    base_map = BaseMap.build(
-        clouds, args.preset, progress=args.progress or sys.stderr.isatty(), crs=args.crs, **options
-    )
+    base_map = BaseMap.build(clouds, args.preset, progress=True, crs=args.crs, **options)
     base_map.save(output, key)
     print(
         f"{output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "
@@ -179,14 +175,7 @@ def _build_site(
     executor: Executor = DaskExecutor(args.dask, args.workers) if dask else ProcessExecutor(workers)
     try:
         built = build_site(
-            clouds,
-            output,
-            config,
-            executor=executor,
-            crs=args.crs,
-            key=key,
-            keep_going=args.keep_going,
-            progress=args.progress or sys.stderr.isatty(),
+            clouds, output, config, executor=executor, crs=args.crs, key=key, keep_going=args.keep_going, progress=True
         )
     finally:
         executor.close()

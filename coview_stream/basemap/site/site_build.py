@@ -96,7 +96,7 @@ def build_site(
         key: signs the manifest.
         executor: runs the steps; None runs them in this process.
         keep_going: skip sources and tiles that fail, instead of ending.
-        progress: show a bar on stderr.
+        progress: show a bar on stderr, or a line for each stage where that is no terminal.
 
     Raises:
         CloudError: a source cannot be read. MapError: nothing to stand on, or the directory cannot be used.
