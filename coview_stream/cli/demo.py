@@ -81,9 +81,10 @@ def run(args: argparse.Namespace) -> int:
     with atomic_file(out / "report.json") as stream:
         stream.write((json.dumps(facts, indent=1) + "\n").encode())
     print(table(evaluation))
-    if not located.posed and located.keyframes:
-        print(f"{'reason':<18} {located.keyframes[-1].reason}")
-    print(f"{'written':<18} {out}: {', '.join(name for name in _WRITTEN if (out / name).is_file())}")
+    if located.reason:
+        print(f"{'reason':<18} {located.reason}")
+    names = ("site.coview", "world", *([] if args.offline else ["logs"]), *_WRITTEN)
+    print(f"{'written':<18} {out}: {', '.join(name for name in names if (out / name).exists())}")
     print(f"{'step by step':<18} coview-stream build {world / 'base.laz'} -o site.coview")
     print(f"{'':<18} coview-stream locate site.coview {world / 'run'} -o out")
     print(f"{'':<18} coview-stream eval out/trajectory.tum {world / 'truth.tum'}")
@@ -177,7 +178,7 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
 ROBOT = "demo"
 
 # seconds
-_MAX_START = 60.0  # until the node publishes something and can search; a first run compiles its kernels
+_MAX_START = 300.0  # until the node publishes something and can search; a first run compiles its kernels
 _MAX_SHUTDOWN = 5.0  # for a process after a signal
 _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
@@ -225,7 +226,7 @@ def record_live(
             _check_running(logs, serve=node, watch=watcher)
             if time.monotonic() > deadline:
                 raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
-        _await_engines(endpoint)
+        _await_engines(endpoint, logs)
         robot = start("replay", str(run_path), "--robot", ROBOT, "--connect", endpoint)
         while robot.poll() is None or not lines.empty():
             with contextlib.suppress(queue.Empty):
@@ -273,7 +274,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
-def _await_engines(endpoint: str) -> None:
+def _await_engines(endpoint: str, logs: Path) -> None:
     """Wait until the node's engines can search: on a busy machine the drive would be over before."""
     from coview_stream.stream.transport.keys import node_keys
     from coview_stream.stream.transport.zenoh_transport import open_client
@@ -286,6 +287,7 @@ def _await_engines(endpoint: str) -> None:
                 if transport.query(node_keys("coview", ROBOT).ask_health, timeout=2.0)["ready"]["ok"]:
                     return
             time.sleep(0.2)
+        raise TransportError(f"the node is not ready after {_MAX_START:g} s; see {logs / 'serve.log'}")
     finally:
         transport.close()
 

@@ -108,6 +108,7 @@ class RunResult:
         driven: metres that odometry had driven at the first fix; None if not known.
         mount: of the run's lidar; None for the body itself.
         smoothed: poses by the whole run, in order; None unless they were asked for.
+        node_reason: why there was no pose, as a node said; empty if none was asked.
     """
 
     frames: int
@@ -121,6 +122,14 @@ class RunResult:
     driven: float | None = None
     mount: Mount | None = None
     smoothed: list[SmoothedPose] | None = None
+    node_reason: str = ""
+
+    @property
+    def reason(self) -> str:
+        """Why no frame has a pose; empty if one has, or if nothing is known."""
+        if self.posed:
+            return ""
+        return self.node_reason or (self.keyframes[-1].reason if self.keyframes else "")
 
     @property
     def posed(self) -> list[Fix]:
@@ -202,6 +211,7 @@ class RunResult:
         return {
             "format": 1,
             "state": self.state.reported,
+            "reason": self.reason or None,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
             "calibration": calibration_json(self.calibration, evidence, self.mount),
@@ -317,7 +327,20 @@ def from_stream(
             evidence = KeyframeEvidence.from_json(status["evidence"])
             if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
                 located.keyframes.append(evidence)
+    if live := [status for status in statuses if "counters" in status and not status["node"]["ending"]]:
+        located.node_reason = live[-1]["reason"] + _dropped(live[-1]["counters"], len(stamps))
     return located
+
+
+def _dropped(counters: dict[str, int], frames: int) -> str:
+    """Return a clause on the work for which a node's machine was too slow; empty if there was none."""
+    searches = counters["searches"] + counters["searches_skipped"]
+    parts = [
+        (counters["dropped"], frames, "frames"),
+        (counters["searches_skipped"], searches, "keyframes to search for"),
+    ]
+    said = [f"{number} of {total} {name}" for number, total, name in parts if number]
+    return f"; the machine had no time for {' and '.join(said)}" if said else ""
 
 
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
@@ -360,8 +383,8 @@ def summary(located: RunResult) -> str:
         if located.calibration is not None:
             says = calibration_says(located.calibration, located.fixes[-1].evidence, located.mount)
             lines.extend(f"{'calibration':<18} {clause}" for clause in says)
-    elif located.keyframes:
-        lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    elif located.reason:
+        lines.append(f"{'reason':<18} {located.reason}")
     begin = located.fixes[0].stamp if located.fixes else 0.0
     for cause, told in located.faults.items():
         span = f"{told.frames} frames from {told.first - begin:.1f} s to {told.last - begin:.1f} s"

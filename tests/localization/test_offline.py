@@ -17,7 +17,7 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.offline import RunResult, locate, summary, write
+from coview_stream.localization.offline import RunResult, from_stream, locate, summary, write
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
@@ -198,3 +198,18 @@ def test_faults_of_sensors_are_reported_whether_there_are_poses_or_not(world_map
     unposed = RunResult(2, found.fixes[1:3])
     assert "FAULT repeated" in summary(unposed)
     assert "FAULT" not in summary(RunResult(1, found.fixes[:1]))
+
+
+def test_run_without_a_pose_has_the_nodes_last_reason_and_the_work_that_it_had_no_time_for():
+    def status(reason, ending=False, **counters):
+        counted = {"searches": 1, "searches_skipped": 0, "dropped": 0} | counters
+        told = {"state": "SEARCHING", "reason": reason, "last_frame_ns": None, "counters": counted}
+        return told | {"node": {"ending": ending}}
+
+    end = status("the node is shutting down", ending=True)
+    idle = [status("waiting for clouds"), status("too little has been seen"), end]
+    assert from_stream([0.0, 0.1], [], idle).reason == "too little has been seen"
+    busy = [status("too little has been seen", dropped=1, searches_skipped=3), end]
+    late = "; the machine had no time for 1 of 2 frames and 3 of 4 keyframes to search for"
+    assert from_stream([0.0, 0.1], [], busy).reason == f"too little has been seen{late}"
+    assert from_stream([0.0, 0.1], [], []).reason == ""
