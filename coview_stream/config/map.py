@@ -27,13 +27,11 @@ class DescriptorConfig:
         radius: metres that a descriptor reaches; the paper's; at most 200.
         rings: bins along it, 80 at most; at most 4,800 in all sectors.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
-        channels: descriptors that vote together. ``scan_context`` is the greatest height of every bin. ``paper`` is the
-            co-view context as printed (eqs 1-4): the greatest height of bins that are horizontally co-visible only, the
-            mean height of bins that are vertically co-visible as well. ``coview`` keeps bins that are either, with
-            their greatest heights. ``python -m bench ablation`` compares them and their sums.
+        channels: descriptors that vote together: ``scan_context``, the greatest heights of all bins; ``coview``, those
+            of co-visible bins; ``paper``, eqs 1-4 as printed. ``python -m bench ablation`` compares them.
         voxel: metres; one point is kept in each cube of it.
-        ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
-            the sensor. ``python -m bench ablation`` compares the two.
+        ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are, not from the
+            sensor; ``python -m bench ablation`` has both.
     """
 
     radius: float = 50.0
