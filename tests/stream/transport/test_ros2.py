@@ -13,6 +13,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import small_world
 from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
 
 from coview_stream.cli import main
@@ -390,7 +391,17 @@ class Served:
 
     def __init__(self, world_file, folder, *arguments):
         self.log = (folder / "serve.log").open("a+")
-        command = ("coview_stream", "serve", str(world_file), "--robot", "r1", "--ros2", "--no-state", *arguments)
+        command = (
+            "coview_stream",
+            "serve",
+            str(world_file),
+            "--robot",
+            "r1",
+            "--ros2",
+            "--state",
+            str(folder),
+            *arguments,
+        )
         self.process = subprocess.Popen(python_command(*command), env=python_environment(), stderr=self.log)
 
     def end(self):
@@ -410,16 +421,16 @@ def at_of(k, run):
 
 
 def play(robot, run, seconds, begin, until=lambda: False):
-    """Drive to and fro, ten frames a second by the wall clock; return the truth by stamps."""
-    truth, started = {}, time.monotonic()
-    for k in range(round(10 * seconds)):
+    """Drive to and fro, five frames a second by the wall clock; return the truth by stamps."""
+    truth, started, first = {}, time.monotonic(), time.time_ns()
+    for k in range(round(5 * seconds)):
         at = at_of(begin + k, run)
-        stamp = time.time_ns()
+        stamp = first + 200_000_000 * k  # of an even drive, however this machine stutters
         truth[stamp] = run.T_map_body[at]
         robot.send(stamp, run.clouds[at], run.T_odom_body[at])
         if until():
             break
-        time.sleep(max(0.0, started + 0.1 * (k + 1) - time.monotonic()))
+        time.sleep(max(0.0, started + 0.2 * (k + 1) - time.monotonic()))
     return truth, begin + k + 1
 
 
@@ -430,19 +441,18 @@ def errors(robot, truth):
 
 
 @pytest.mark.slow
-def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side(
-    robot, world_file, world_drive, tmp_path
-):
+def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side(robot, scene, world_file, tmp_path):
+    run = small_world.record_along(scene, small_world.drive(), 0.4)
     served = Served(world_file, tmp_path)
     try:
         robot.found()
         robot.clouds.publish(cloud_message(time.time_ns(), np.zeros((0, 3))))  # zero width
-        truth, at = play(robot, world_drive, 60.0, 0, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 60.0, 0, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
         robot.until(lambda: robot.level() == b"\0")
         assert robot.heard["/map_points"][0].header.frame_id == "map"
         assert 0 < robot.heard["/map_points"][0].width <= 100_000
-        still = world_drive.T_odom_body[at_of(at - 1, world_drive)]
+        still = run.T_odom_body[at_of(at - 1, run)]
         for _ in range(70):  # the clouds stop, odometry goes on
             robot.move(time.time_ns(), still)
             time.sleep(0.1)
@@ -451,7 +461,7 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
         robot.close()
         robot.__init__(node="driver_again")
         robot.found()
-        truth, at = play(robot, world_drive, 60.0, at, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 60.0, at, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
         # and so does the node
         code, seconds = served.end()
@@ -460,7 +470,7 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
         robot.until(lambda: not robot.clouds.get_subscription_count(), 40.0)
         robot.found()
         robot.poses.clear()
-        truth, at = play(robot, world_drive, 60.0, at, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 60.0, at, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
     finally:
         served.end()
