@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import (
@@ -34,6 +35,7 @@ class Sample:
     attachment: bytes | None = None  # sent with the payload
     size: int | None = None  # bytes of a payload that was too large to receive; ``payload`` is empty then
     refused: str = ""  # why the transport kept the payload back, for people; likewise
+    mount: Mount | None = None  # of the lidar, where the transport knows it
 
 
 @dataclass(frozen=True)

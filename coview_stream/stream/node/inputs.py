@@ -213,7 +213,7 @@ class Inputs:
         """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
         message = decode_cloud(sample, self.codecs[0], self.keys.hint, self.config.max_payload)
         message = message.limited(self.config.max_points)
-        return replace(message, points=self.config.mount.to_body(message.points))
+        return replace(message, points=(sample.mount or self.config.mount).to_body(message.points))
 
     def decode_odometry(self, sample: Sample) -> OdometryMessage:
         """Return an odometry sample; MessageError: it cannot be read."""

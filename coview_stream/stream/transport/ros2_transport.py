@@ -15,7 +15,8 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.summary import MapView
+from coview_stream.config.mount import Mount
 from coview_stream.errors import (
     ConfigError,
     CoViewError,
@@ -36,6 +38,7 @@ from coview_stream.errors import (
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import json_messages, ros2, ros2_outputs
 from coview_stream.messages.types import Encoded, Sample
+from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
@@ -113,6 +116,7 @@ class _Robot:
     map_frame: str = "map"
     odometry_frame: str = ""  # of the newest odometry
     body_frame: str = ""  # whose odometry it is
+    frames: FrameTree = field(default_factory=FrameTree)  # of /tf_static
     T_map_odom: Pose | None = None  # of the newest pose; kept while there is none
     posed_at: float = 0.0  # local time of the newest pose
     newest_ns: int | None = None  # stamp of the newest cloud or odometry
@@ -120,40 +124,49 @@ class _Robot:
     clock_said: bool = False  # that the stamps contradict this node's clock
     outputs: dict[str, Any] = field(default_factory=dict)  # rclpy's publishers
 
-    def check_cloud(self, payload: bytes) -> str:
-        """Return why a cloud is not to be used, empty if nothing speaks against it."""
-        self.newest_ns, frame, body = ros2.header_stamp(payload), ros2.frame_id(payload), self.body_frame
+    def check_cloud(self, sample: Sample) -> Sample:
+        """Return a cloud with its mount, of /tf_static, or refused for its frame."""
+        self.newest_ns, frame, body = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload), self.body_frame
         if not (self.check_frames and frame and body) or frame == body:
-            return ""
-        return (
-            f"the cloud is in frame {frame!r}, odometry is of {body!r}: give the lidar's pose on it by --mount, "
-            "--mount=0,0,0 if the two are one"
+            return sample
+        self.frames.lidar = frame
+        if (T_body_lidar := self.frames.mount(body)) is not None:
+            return replace(sample, mount=Mount().moved(T_body_lidar))
+        return _refused(
+            sample,
+            f"the cloud is in frame {frame!r}, odometry is of {body!r}, and /tf_static does not join them: give the "
+            "lidar's pose on it by --mount, --mount=0,0,0 if the two are one",
         )
 
-    def check_odometry(self, payload: bytes) -> str:
-        """Likewise of odometry, whose frames are noted."""
-        frame, stamp_ns = ros2.frame_id(payload), ros2.header_stamp(payload)
+    def check_odometry(self, sample: Sample) -> Sample:
+        """Note the frames of odometry; refuse that of another localizer."""
+        frame, stamp_ns = ros2.frame_id(sample.payload), ros2.header_stamp(sample.payload)
         if frame == self.map_frame:
-            return f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?"
+            return _refused(sample, f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?")
         if self.odometry_ns is not None and stamp_ns < self.odometry_ns - _CACHE * 1e9:
             self.T_map_odom = None  # the sender began anew, and so did its frame
         self.newest_ns = self.odometry_ns = stamp_ns
-        self.odometry_frame, self.body_frame = frame, ros2.frame_id(payload, 1)
-        return ""
+        self.odometry_frame, self.body_frame = frame, ros2.frame_id(sample.payload, 1)
+        return sample
 
-    def check_guess(self, payload: bytes) -> str:
-        """Likewise of an initial pose."""
-        frame = ros2.frame_id(payload)
+    def check_guess(self, sample: Sample) -> Sample:
+        """Refuse an initial pose in odometry's frame or the body's."""
+        frame = ros2.frame_id(sample.payload)
         if frame and frame in (self.odometry_frame, self.body_frame):
-            return f"an initial pose in frame {frame!r}: set RViz' fixed frame to {self.map_frame!r}"
-        return ""
+            text = f"an initial pose in frame {frame!r}: set RViz' fixed frame to {self.map_frame!r}"
+            return _refused(sample, text)
+        return sample
+
+
+def _refused(sample: Sample, reason: str) -> Sample:
+    return replace(sample, payload=b"", refused=reason)
 
 
 @dataclass(frozen=True)
 class _Input:
     topic: str
     kind: str
-    check: Callable[[bytes], str]
+    check: Callable[[Sample], Sample]
     then: Callable[[], None] = lambda: None  # after it has been handed on
 
 
@@ -223,6 +236,10 @@ class Ros2Transport:
         outputs["pose"] = self._create_publisher(ros2.POSE, f"/{keys.pose}")
         if find_spec("tf2_msgs") is not None:
             outputs["tf"] = self._create_publisher(ros2_outputs.TRANSFORMS, f"/{prefix}tf", 100)
+            self._node.create_subscription(
+                _type(ros2_outputs.TRANSFORMS), f"/{prefix}tf_static", partial(self._on_static, robot),
+                _latched(100), raw=True,
+            )  # fmt: skip
         self._inputs |= {
             keys.cloud: _Input(f"/{keys.cloud}", ros2.CLOUD, robot.check_cloud),
             keys.odometry: _Input(
@@ -269,12 +286,11 @@ class Ros2Transport:
 
         def take(payload: bytes) -> None:
             with self.guard.catch(key):
-                try:
-                    refused = source.check(payload)
-                except MessageError as error:
-                    refused = str(error)
-                self.deliver(Sample(key, b"" if refused else payload, encoding, refused=refused))
-                if not refused:
+                sample = Sample(key, payload, encoding)
+                with contextlib.suppress(MessageError):  # of one without a header, which its codec will refuse
+                    sample = source.check(sample)
+                self.deliver(sample)
+                if not sample.refused:
                     source.then()
 
         depth = 5 if source.kind == ros2.CLOUD else _QUEUE
@@ -378,6 +394,10 @@ class Ros2Transport:
             with self.guard.catch("rclpy"):
                 self._executor.spin()
 
+    def _on_static(self, robot: _Robot, payload: bytes) -> None:
+        with self.guard.catch("/tf_static"):
+            robot.frames.add(payload, static=True)
+
     # ---- messages out
 
     def _write_pose(self, robot: _Robot, payload: bytes) -> None:
@@ -430,11 +450,15 @@ class Ros2Transport:
             return
         view = MapView.from_json(self._show_map())
         if self._map_publisher is None:
-            qos = import_module("rclpy.qos")
-            latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-            self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, latched)
+            self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, _latched(1))
         points = (view.points + view.origin).astype(np.float32)
         self._map_publisher.publish(ros2_outputs.encode_map(points, self._node.get_clock().now().nanoseconds))
+
+
+def _latched(depth: int) -> Any:
+    """Return a QoS by which who comes later gets the newest messages too."""
+    qos = import_module("rclpy.qos")
+    return qos.QoSProfile(depth=depth, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def _type(name: str) -> Any:

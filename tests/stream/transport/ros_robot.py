@@ -36,9 +36,9 @@ class RosRobot:
         self.clouds = self.node.create_publisher(PointCloud2, f"/{name}/points", qos_profile_sensor_data)
         self.odometry = self.node.create_publisher(Odometry, f"/{name}/odom", 10)
         self.guesses = self.node.create_publisher(PoseWithCovarianceStamped, "/initialpose", 10)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.latched = lambda depth: QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.subscribed = (f"/{name}/pose", "/diagnostics", "/map_points")
-        kinds = (PoseWithCovarianceStamped, 10), (DiagnosticArray, 10), (PointCloud2, latched)
+        kinds = (PoseWithCovarianceStamped, 10), (DiagnosticArray, 10), (PointCloud2, self.latched(1))
         for topic, (kind, qos) in zip(self.subscribed, kinds, strict=True):
             self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
         self.poses, self.diagnostics = self.heard[f"/{name}/pose"], self.heard["/diagnostics"]

@@ -19,7 +19,8 @@ from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
 from coview_stream.cli import main
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, DependencyError
-from coview_stream.geometry.transforms import inverse, pose_to_tum
+from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
+from coview_stream.geometry.transforms import transform as transform_points
 from coview_stream.messages import ros2, ros2_outputs
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.rmw import type_hash
@@ -133,17 +134,48 @@ def test_poses_are_those_of_another_transport_to_the_last_digit(robot, site):
         np.testing.assert_allclose(np.reshape(got.pose.covariance, (6, 6)), wanted.covariance, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, monkeypatch):
-    from geometry_msgs.msg import PolygonStamped  # any type will do: bytes go out and in as they are
+@pytest.fixture
+def transforms(ros, monkeypatch):
+    """Type of transforms, which no wheel has: any other will do, for bytes go out and in as they are."""
+    from geometry_msgs.msg import PolygonStamped
 
     package, messages = ModuleType("tf2_msgs"), ModuleType("tf2_msgs.msg")
     package.__spec__ = ModuleSpec("tf2_msgs", None)
     messages.TFMessage = PolygonStamped
     monkeypatch.setitem(sys.modules, "tf2_msgs", package)
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", messages)
+    return PolygonStamped
+
+
+@pytest.mark.slow
+def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, transforms):
+    latched = robot.latched(1)
+    publisher = robot.node.create_publisher(transforms, "/tf_static", latched)
+    T_body_lidar = pose_from(rot_z(0.3), [0.2, 0.0, 0.5])
+    publisher.publish(ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne"))
+    site = RosSite()
+    try:
+        site.meet(robot)
+        robot.move(ns(0.0), message(0.0).T_odom_body)
+
+        def seen():
+            robot.clouds.publish(cloud_message(ns(0.0), POINTS, frame="velodyne"))
+            robot.move(ns(0.1), message(0.1).T_odom_body)
+            time.sleep(0.05)
+            return site.sessions["r1"].has_job("track")
+
+        robot.until(seen)
+        np.testing.assert_allclose(
+            site.sessions["r1"].take_job("track").points, transform_points(T_body_lidar, POINTS), atol=1e-4
+        )
+    finally:
+        site.net.close()
+
+
+@pytest.mark.slow
+def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, transforms):
     heard = []
-    robot.node.create_subscription(PolygonStamped, "/tf", heard.append, 10, raw=True)
+    robot.node.create_subscription(transforms, "/tf", heard.append, 10, raw=True)
     site = RosSite()
     try:
         site.meet(robot)
