@@ -10,7 +10,6 @@ alone and no graph are rows of ``python -m bench forest_drives``. Results stay i
 
 from __future__ import annotations
 
-import os
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ import numpy as np
 
 from bench.accuracy import paper
 from bench.accuracy.choices import OFF, Choice, LocalizerChoice, RegistrationChoice, Site, uncalibrated, unverified
-from bench.harness.files import ROOT, fingerprint, folder, isolated, remembered
+from bench.harness.files import add_data, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs, listed
 from bench.harness.worlds import prepare
 from coview_stream import BaseMap
@@ -281,12 +280,11 @@ def elsewhere_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
 
 def options(parser: ArgumentParser) -> None:
     """Add the groups and the sites."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
     groups = ", ".join(GROUPS)
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS), metavar="GROUP", help=groups)
     every = (*WORLDS, *REAL)
     parser.add_argument("--sites", nargs="+", choices=every, metavar="SITE", help=f"(by group) {', '.join(every)}")
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
+    add_data(parser)
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the group spacing")
 
 
@@ -354,7 +352,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
             if group in ("localizer", "elsewhere", "spacing")
             else tuple((site, site, 2) for site in found[0]["sites"])
         )
-        columns = (*COLUMNS.get(group, (*_SHARES, ("ms", "ms", 0))), *per_site)
+        columns = (*COLUMNS[group], *per_site)
         about = f"Sites: {', '.join(found[0]['sites'])}; {found[0]['cpu'] / 60.0:.1f} minutes of one core."
         out[group] = f"{about}\n\n{listed(columns, found)}"
         if group == "spacing" and asked.picture:

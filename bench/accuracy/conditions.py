@@ -26,7 +26,6 @@ rev180          the body turned around its z axis by 180 degrees, in clouds, odo
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import time
@@ -44,7 +43,7 @@ from scipy.spatial.transform import Rotation
 from bench.accuracy import paper
 from bench.accuracy.scores import Track, errors, score
 from bench.harness import worlds
-from bench.harness.files import PYTHON, ROOT, built, environment, fingerprint, folder, remembered
+from bench.harness.files import PYTHON, add_data, built, environment, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed, number
 from coview_stream import BaseMap
 from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
@@ -306,8 +305,7 @@ def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[
 
 def options(parser: ArgumentParser) -> None:
     """Add the sets, the conditions and the maps."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the sets (COVIEW_DATA)")
+    add_data(parser)
     parser.add_argument("--sets", nargs="+", default=list(SETS), metavar="NAME", help=f"folders ({', '.join(SETS)})")
     parser.add_argument("--conditions", nargs="+", default=list(CONDITIONS), metavar="NAME")
     parser.add_argument(

@@ -9,7 +9,6 @@ stay in ``--work``, so a run can be made in portions.
 
 from __future__ import annotations
 
-import os
 import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ import numpy as np
 from bench.accuracy.conditions import SETS, set_of
 from bench.accuracy.scores import Track, errors
 from bench.faults.faults import FAULTS, UNDISTURBED, Fault, Feed
-from bench.harness.files import ROOT, built, fingerprint, folder, remembered
+from bench.harness.files import add_data, built, fingerprint, folder, remembered
 from bench.harness.rows import NOTHING, Row, judged, listed
 from bench.harness.worlds import prepared_run, world_name
 from coview_stream import BaseMap, Localizer
@@ -49,14 +48,13 @@ WORLDS = (*_SIMULATED, *SETS)
 
 def options(parser: ArgumentParser) -> None:
     """Add faults, worlds and the folder of the real runs."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="FAULT", help="faults whose names contain one of these"
     )
     parser.add_argument(
         "--worlds", nargs="+", default=[], metavar="NAME", help=f"of {', '.join(WORLDS)}; or their parts"
     )
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
+    add_data(parser)
 
 
 def rows(asked: Namespace) -> Iterator[Row]:

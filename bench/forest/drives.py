@@ -4,7 +4,7 @@
 since the survey. NAME picks one, or ``times``; ``--plots`` draws all errors as boxes, and the tracks in their colour.
 ``times`` takes the product's parts on the first drive, in processor time, which other work hardly changes; give it one
 thread. Errors of a variant are of all its poses, of ours from the first fix on. GNSS is simulated
-(:mod:`bench.forest.gnss`).
+(:mod:`bench.forest.variants`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ WORLDS = (
     World("long-forest", "os64", 6002, 520.0, 2000.0, 4.0, 0.01),
     World("closed-forest", "vlp16", 6001, 300.0, 400.0, 2.0, 0.01),
 )
-_MADE_BY = (*(f"bench/forest/{part}.py" for part in ("variants", "gnss")), "bench/tracking/drives.py")
+_MADE_BY = ("bench/forest/variants.py", "bench/tracking/drives.py")
 _EVERY = 2  # of the frames: five a second
 _QUICK = 60.0  # metres of the first
 _TIMES = "times"

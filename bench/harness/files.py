@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from argparse import ArgumentParser
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -39,6 +40,12 @@ Result = TypeVar("Result")
 def folder() -> Path:
     """Folder of worlds and answers: ``--work``, the environment's ``COVIEW_BENCH``, or a temporary one."""
     return Path(os.environ.get("COVIEW_BENCH") or Path(tempfile.gettempdir()) / "coview-bench")
+
+
+def add_data(parser: ArgumentParser) -> None:
+    """Add the option that names the folder of the real runs."""
+    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
 
 
 def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dict[str, Any]:

@@ -8,10 +8,8 @@ of a simulated drive, of those that ``bench protection`` follows.
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from scipy.stats import chi2
 
 from bench.accuracy.conditions import SETS, RealSet
 from bench.accuracy.scores import Track, errors
-from bench.harness.files import ROOT, built, fingerprint, folder, remembered
+from bench.harness.files import add_data, built, fingerprint, folder, remembered
 from bench.harness.rows import Row, judged, table
 from bench.tracking.protection import FAMILIES, measure
 from bench.tracking.tracking import AXES, NOMINAL, squares
@@ -43,8 +41,7 @@ _PARTS = {"position": (0, 1, 2), "rotation": (3, 4, 5)}
 
 def options(parser: ArgumentParser) -> None:
     """Add the runs and the drives."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
+    add_data(parser)
     parser.add_argument("--sets", nargs="*", default=list(SETS), metavar="NAME", help=f"folders ({', '.join(SETS)})")
     parser.add_argument("--worlds", type=int, default=8, metavar="N", help="simulated drives of each family (8)")
 

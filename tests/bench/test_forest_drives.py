@@ -10,8 +10,7 @@ from drives_with_truth import way
 
 from bench.accuracy.scores import errors
 from bench.forest.drives import statistics
-from bench.forest.gnss import Receiver, fused
-from bench.forest.variants import ForgetfulGraph, of_poses
+from bench.forest.variants import ForgetfulGraph, Receiver, fused, of_poses
 from bench.tracking.drives import drifting
 from bench.tracking.worlds import World, winding_path
 from coview_stream.geometry.transforms import exp_so3, pose_from
