@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import pytest
 import small_world
 from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
 
-from coview_stream.cli import main
+from coview_stream.cli import main, options, serve
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
@@ -413,6 +414,22 @@ def test_rclpy_of_another_python_is_named(tmp_path):
         [sys.executable, "-c", paths + code], env=python_environment(), capture_output=True, text=True
     )
     assert "is built for cpython-399" in done.stderr.splitlines()[-1]
+
+
+def test_launch_file_and_parameters_of_the_example_are_right(tmp_path):
+    """Nav2 is not here: names and syntax only, and that each parameter of ours is an option."""
+    from ruamel.yaml import YAML
+
+    folder = Path(__file__).parents[3] / "examples/ros2"
+    compiled = compile((folder / "nav2.launch.py").read_text(), "nav2.launch.py", "exec")
+    assert "generate_launch_description" in compiled.co_names
+    ours = YAML(typ="safe").load(folder / "nav2.yaml")["coview_stream"]["ros__parameters"]
+    assert ours.pop("use_sim_time") is False
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    args = parser.parse_args(["site.coview", "--robot", "r1"])
+    assert options.fill_from_settings(args, ours, "nav2.yaml", parser, serve.TABLES)["node"] == {"pairing_wait": 0.3}
+    assert (float(args.risk), args.state) == (1e-4, "/var/lib/coview")
 
 
 # ---- a process of its own
