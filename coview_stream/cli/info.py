@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
     """Print the map's contents, parameters and hash."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.file_format import signer
-    from coview_stream.basemap.site.manifest import Manifest, site_directory
+    from coview_stream.basemap.site.manifest import Manifest
+    from coview_stream.basemap.site.site_grid import site_directory
     from coview_stream.clouds.reference_system import short_name
     from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError

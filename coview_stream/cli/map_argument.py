@@ -77,7 +77,8 @@ def local_map(
         return LocalMap(Path(name))  # without the modules below: most maps are files
 
     from coview_stream.basemap.site.fetch import is_site_address
-    from coview_stream.basemap.site.manifest import Around, Manifest, is_site, part_file, tiles_around
+    from coview_stream.basemap.site.manifest import Manifest, is_site
+    from coview_stream.basemap.site.site_grid import Around, part_file
 
     circle = None if around is None else Around.parse(around)
     if is_site_address(name):
@@ -93,7 +94,7 @@ def local_map(
             f"--around: {name} is no directory of tiles; `coview-stream build CLOUDS -o DIRECTORY/` makes one, "
             "`convert` one of a .coview file"
         )
-    return LocalMap(part_file(path, tiles_around(Manifest.load(path), circle), str(circle)))
+    return LocalMap(part_file(path, Manifest.load(path).tiles_around(circle), str(circle)))
 
 
 def open_map_argument(args: argparse.Namespace) -> LocalMap:

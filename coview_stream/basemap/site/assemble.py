@@ -20,7 +20,8 @@ from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, ma
 from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.layers import decode, most_bytes, read_cloud_layer, read_stations_layer
-from coview_stream.basemap.site.manifest import HALO, Manifest, SiteGrid, TileEntry
+from coview_stream.basemap.site.manifest import Manifest, TileEntry
+from coview_stream.basemap.site.site_grid import HALO, SiteGrid
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.stations import Described, describe_storeys
 from coview_stream.basemap.tiles import Key, sort_by_tile, unit_normals

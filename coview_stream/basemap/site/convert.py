@@ -19,8 +19,9 @@ from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, assemble, layer_of
 from coview_stream.basemap.site.layers import STEPS, cloud_layer, read_cloud_layer
-from coview_stream.basemap.site.manifest import TILE, VERSION, Manifest, SiteGrid, in_order, is_site
+from coview_stream.basemap.site.manifest import VERSION, Manifest, in_order, is_site
 from coview_stream.basemap.site.site_build import check_directory
+from coview_stream.basemap.site.site_grid import TILE, SiteGrid
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import put_layer, write_tile
 from coview_stream.basemap.tiles import Key, unit_normals

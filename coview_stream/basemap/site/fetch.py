@@ -21,16 +21,14 @@ from coview_stream.basemap.site.manifest import (
     FILE,
     MAX_MANIFEST,
     OPENED,
-    Around,
     LayerEntry,
     Manifest,
     TileEntry,
     is_site,
-    part_file,
     read_manifest,
-    tiles_around,
     write_manifest,
 )
+from coview_stream.basemap.site.site_grid import Around, part_file
 from coview_stream.basemap.site.store import TileStore, cache_bound, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
 from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
@@ -180,7 +178,7 @@ class Mirror:
         """Path of the map: the mirror, or the part of it in the circle."""
         if self.around is None:
             return self.directory
-        keys = tiles_around(Manifest.load(self.directory), self.around)
+        keys = Manifest.load(self.directory).tiles_around(self.around)
         return part_file(self.directory, keys, str(self.around))
 
     def open(self, progress: Progress | None = None) -> Path:
@@ -211,7 +209,7 @@ class Mirror:
 
     def _wanted(self, manifest: Manifest) -> dict[str, tuple[LayerEntry, TileEntry]]:
         """Return the layers of the tiles in the circle, and the tile of each, by hash."""
-        keys = None if self.around is None else tiles_around(manifest, self.around)
+        keys = None if self.around is None else manifest.tiles_around(self.around)
         return {
             layer.sha256: (layer, tile)
             for tile in manifest.tiles

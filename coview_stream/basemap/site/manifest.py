@@ -1,4 +1,4 @@
-"""Manifest of a site (settings, and tiles by the hashes of their layers), grid of its tiles, and parts of sites.
+"""Manifest of a site: settings, and tiles by the hashes of their layers.
 
 The manifest is a JSON file, ``manifest.json``. Its hash identifies the state of the whole site; a signature (ed25519)
 covers every byte of the layers. Readers verify it before they read anything, then check all numbers and names, tile by
@@ -7,28 +7,24 @@ tile: another thread never waits longer than for one tile, and a refused manifes
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-import numpy.typing as npt
-
 from coview_stream.basemap.signature import SigningKey, VerifyKey, sha256_of
 from coview_stream.basemap.site.layers import most_bytes, most_points
-from coview_stream.basemap.site.store import SHA256, read_record, write_record
+from coview_stream.basemap.site.site_grid import Around, SiteGrid
+from coview_stream.basemap.site.store import SHA256
 from coview_stream.basemap.tiles import Key
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.config import MapConfig, config_of_map
+from coview_stream.config import config_of_map
 from coview_stream.errors import ConfigError, MapError
-from coview_stream.geometry.arrays import Floats, Ints, Reals
 
 FORMAT = "coview-site"
 VERSION = 2  # is written; sites of version 1, with layers compressed otherwise, can be read
@@ -47,12 +43,6 @@ _MAX_METRES = 1e8
 _MAX_DEPTH = 32  # of the parameters
 _PURPOSE = b"site manifest\n"
 _BEGIN = re.compile(rb'(?:, "signature": "([0-9a-f]*)", "signer": "([0-9a-f]*)")?(, "tile": [-+.0-9eE]+, "tiles": \[)')
-
-TILE = 320.0  # metres, a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)
-HALO = 64.0  # metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin
-FEATURE_HALO = 112.0  # likewise its learned features: 64 for the network, 48 for the ground below these
-PART_SUFFIX = ".tiles"
-_FORMAT = "coview-part"
 
 
 @dataclass(frozen=True)
@@ -142,6 +132,22 @@ class Manifest:
     def hashes(self) -> set[str]:
         """Return the hashes of all layers."""
         return {layer.sha256 for tile in self.tiles for layer in tile.layers.values()}
+
+    def tiles_around(self, around: Around) -> set[Key]:
+        """Return the tiles that touch a circle; MapError, with the distance of the nearest one, if there are none."""
+        x, y = around.x - self.origin[0], around.y - self.origin[1]
+        distances = {}
+        for entry in self.tiles:
+            outside = (
+                max(k * self.tile - value, 0.0, value - (k + 1) * self.tile)
+                for k, value in ((entry.column, x), (entry.row, y))
+            )
+            distances[entry.column, entry.row] = math.hypot(*outside)
+        near = {key for key, distance in distances.items() if distance <= around.radius}
+        if not near:
+            nearest = f"the nearest is {min(distances.values()):.0f} m away" if distances else "it has none"
+            raise MapError(f"around {around}: no tile of the site is there, {nearest}; check the coordinates")
+        return near
 
     def _pieces(self, joint: str = ", ", line: str = "") -> Iterator[bytes]:
         """Yield all but the signature as JSON: ``joint`` joins tiles, ``line`` is before each and after the last."""
@@ -344,121 +350,3 @@ def _number(value: Any) -> float:
     if type(value) not in (int, float) or not math.isfinite(value) or abs(value) > _MAX_METRES:
         raise ValueError(f"{str(value)[:40]} is no length")
     return float(value)
-
-
-@dataclass(frozen=True)
-class SiteGrid:
-    """Grid of a site's tiles, and settings of their build.
-
-    Attributes:
-        origin: (3,) metres, in the frame of the sources; corner of a tile.
-        tile: metres, a multiple of 320.
-        config: of the map.
-    """
-
-    origin: tuple[float, float, float]
-    tile: float
-    config: MapConfig
-
-    def __post_init__(self) -> None:
-        if not 0 < self.tile <= 4 * TILE or self.tile % TILE:
-            raise ConfigError(f"tile={self.tile}: tiles are of 320, 640, 960 or 1280 m")
-        if TILE % self.config.tile:
-            raise ConfigError(f"tile={self.config.tile} of the cloud: a site needs one that divides {TILE:g} m")
-
-    def cells(self, xy: Reals) -> Ints:
-        """Return column and row (N, 2) of the tiles at positions (N, 2 or 3) in the sources' frame."""
-        return np.asarray(np.floor((xy[:, :2] - np.asarray(self.origin[:2])) / self.tile), dtype=np.int64)
-
-    def corner(self, key: Key) -> Floats:
-        """Return the lower corner (3,) of a tile, metres from the origin."""
-        return np.array([key[0] * self.tile, key[1] * self.tile, 0.0])
-
-    @staticmethod
-    def around(key: Key) -> list[Key]:
-        """Return a tile and its neighbours, by row and column."""
-        column, row = key
-        return [(column + i, row + j) for j in (-1, 0, 1) for i in (-1, 0, 1)]
-
-
-def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return the origin of a site with corners (3,): in the middle, rounded to 320 m; the lowest z, rounded to 10 m."""
-    middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
-    x, y = (math.floor(float(value) / TILE) * TILE for value in middle[:2])
-    return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0
-
-
-@dataclass(frozen=True)
-class Around:
-    """Circle on a site.
-
-    Attributes:
-        x, y: centre, in the frame of the site's sources, metres.
-        radius: metres.
-    """
-
-    x: float
-    y: float
-    radius: float
-
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
-            raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
-
-    @classmethod
-    def parse(cls, text: str) -> Around:
-        """Parse ``X,Y,RADIUS``; ConfigError if it is something else."""
-        try:
-            x, y, radius = map(float, text.split(","))
-        except ValueError:
-            raise ConfigError(f"around {text!r}: give X,Y,RADIUS in the map's coordinates, metres") from None
-        return cls(x, y, radius)
-
-    def __str__(self) -> str:
-        """Return ``X,Y,RADIUS``."""
-        return ",".join(f"{value:.15g}" for value in (self.x, self.y, self.radius))
-
-
-def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
-    """Return the tiles that touch a circle; MapError, with the distance of the nearest one, if there are none."""
-    x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
-    distances = {}
-    for entry in manifest.tiles:
-        outside = (
-            max(k * manifest.tile - value, 0.0, value - (k + 1) * manifest.tile)
-            for k, value in ((entry.column, x), (entry.row, y))
-        )
-        distances[entry.column, entry.row] = math.hypot(*outside)
-    near = {key for key, distance in distances.items() if distance <= around.radius}
-    if not near:
-        nearest = f"the nearest is {min(distances.values()):.0f} m away" if distances else "it has none"
-        raise MapError(f"around {around}: no tile of the site is there, {nearest}; check the coordinates")
-    return near
-
-
-def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
-    """Write a small file that is opened like a map: directory and tiles of a part of a site; return its path.
-
-    There is one file for each site and ``name``. MapError if the cache cannot be written.
-    """
-    place = str(directory.resolve())
-    record = hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + PART_SUFFIX
-    return write_record(record, {"format": _FORMAT, "directory": place, "tiles": sorted(keys)})
-
-
-def read_part(path: Path) -> tuple[Path, set[Key]]:
-    """Return the site's directory and the tiles in a file of :func:`part_file`; MapError if it is another file."""
-    try:
-        data = read_record(path)
-        if data["format"] != _FORMAT:
-            raise ValueError("another format")
-        return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise MapError(f"{path}: names no part of a site ({error}); use --around again") from error
-
-
-def site_directory(path: Path) -> Path | None:
-    """Return the directory of the site at a map's path, or of the site of a part; None for a map file."""
-    if path.suffix == PART_SUFFIX and path.is_file():
-        return read_part(path)[0]
-    return path if path.is_dir() else None

@@ -17,7 +17,8 @@ from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.progress import Progress, staged_bar
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.executors import Executor
-from coview_stream.basemap.site.manifest import TILE, Manifest, SiteGrid, TileEntry, in_order, is_site, origin_of
+from coview_stream.basemap.site.manifest import Manifest, TileEntry, in_order, is_site
+from coview_stream.basemap.site.site_grid import TILE, SiteGrid, origin_of
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build_tile, extent_of, partition, thin
 from coview_stream.basemap.sources import Given, Source, short_names, sources_of, warn_of_other_systems

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.site.layers import PACKING, cloud_layer, encode, square_metres, stations_layer
-from coview_stream.basemap.site.manifest import FEATURE_HALO, HALO, LayerEntry, SiteGrid, TileEntry
+from coview_stream.basemap.site.manifest import LayerEntry, TileEntry
+from coview_stream.basemap.site.site_grid import FEATURE_HALO, HALO, SiteGrid
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.sources import Source
 from coview_stream.basemap.stations import find_stations

@@ -15,7 +15,8 @@ from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, VERSION, assemble, field_layers
-from coview_stream.basemap.site.manifest import OPENED, Manifest, read_part
+from coview_stream.basemap.site.manifest import OPENED, Manifest
+from coview_stream.basemap.site.site_grid import read_part
 from coview_stream.basemap.site.store import (
     TileStore,
     cache_folder,

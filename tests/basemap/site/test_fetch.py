@@ -16,7 +16,8 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.signature import SigningKey, read_verify_key
 from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, SiteSource, WebSource, is_site_address
-from coview_stream.basemap.site.manifest import FILE, Around, LayerEntry, Manifest, part_file, read_part, tiles_around
+from coview_stream.basemap.site.manifest import FILE, LayerEntry, Manifest
+from coview_stream.basemap.site.site_grid import Around, part_file, read_part
 from coview_stream.basemap.site.store import TileStore, layer_path
 from coview_stream.cli import main
 from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
@@ -186,7 +187,7 @@ def test_only_tiles_around_a_place_are_fetched(site):
     assert read_part(path) == (mirror.directory.resolve(), {(tile.column, tile.row)})
     part = BaseMap.load(path)
     assert len(part) == tile.stations
-    local = BaseMap.load(part_file(site, tiles_around(manifest, around), str(around)))
+    local = BaseMap.load(part_file(site, manifest.tiles_around(around), str(around)))
     assert local.sha256 == part.sha256
     with pytest.raises(MapError, match=r"no tile of the site is there, the nearest is \d+ m away"):
         Mirror(source, around=Around(1e6, 1e6, 10.0)).open()

@@ -107,9 +107,22 @@ def test_nothing_is_parsed_before_the_signature_is_verified(tmp_path):
         Manifest.from_bytes(changed, "a", read_verify_key(public))
 
 
-def test_manifest_of_many_tiles_is_read():
+def test_manifest_of_many_tiles_is_read_tile_by_tile():
     many = replace(SITE, tiles=tuple(replace(TILE, column=k) for k in range(300)))
-    assert Manifest.from_bytes(many.to_bytes(), "site.json") == many
+    raw = many.to_bytes()
+    assert Manifest.from_bytes(raw, "site.json") == many
+    third, fifth = (f'"area": 7, "column": {k},'.encode() for k in (3, 5))
+    assert third in raw
+    wrong = raw.replace(third, b'"area": -7, "column": 3,').replace(fifth, b"]")
+    with pytest.raises(MapError, match=r"-7 is no whole number"):  # checked before the text behind it is parsed
+        Manifest.from_bytes(wrong, "site.json")
+    for blanks, holds in ((1024, True), (2048, False)):  # the parser is given no more of a tile than 2 kB at once
+        padded = raw.replace(third, third + b" " * blanks)
+        if holds:
+            assert Manifest.from_bytes(padded, "site.json") == many
+        else:
+            with pytest.raises(MapError, match=r"site\.json"):
+                Manifest.from_bytes(padded, "site.json")
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,9 @@ from sockets import free_endpoint, until
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site.fetch import Mirror
-from coview_stream.basemap.site.manifest import Around, Manifest, part_file, read_part
+from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.site_build import build_site
+from coview_stream.basemap.site.site_grid import Around, part_file, read_part
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.working_file import working_path
 from coview_stream.clouds.files import write_cloud
