@@ -146,7 +146,7 @@ def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator
 def install_command(extra: str) -> str:
     """Return the command that installs an extra from where this package came: a checkout, a wheel, an address.
 
-    Its bare name is not enough: an index may not have it, or have it from somebody else. A package from an index is
+    Its bare name is not enough: an index may lack it, or have another of that name. A package from an index is
     named with its version, which pip finds installed and does not look for.
     """
     from importlib.metadata import PackageNotFoundError, distribution

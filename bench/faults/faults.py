@@ -20,7 +20,7 @@ from coview_stream.geometry.transforms import Points, Poses, interpolate, pose_f
 from coview_stream.report.evaluation import driven
 
 BEGINS = 0.4  # share of the drive's time
-_MOUNT = 0.6  # metres, of a lever arm that nobody has measured
+_MOUNT = 0.6  # metres, of a lever arm that was not measured
 _SHIFTED = 4.0  # metres, of clouds
 _KIDNAPPED = 0.3  # share of the drive that the robot is carried over
 

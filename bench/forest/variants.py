@@ -1,7 +1,7 @@
 """Parts of the method by themselves: odometry, GNSS and odometry, the map, and tracking with and without its graph.
 
 The GNSS receiver is simulated, and has one frequency: under forest canopies such ones were 4.2 to 9.3 m off in two
-dimensions, root mean square, whatever the density of the stand (Kaartinen et al., Accuracy of Kinematic Positioning
+dimensions, root mean square, at any density of the stand (Kaartinen et al., Accuracy of Kinematic Positioning
 Using Global Satellite Navigation Systems under Forest Canopies, Forests 6(9), 2015). Ours has the best of them. Most of
 its error is multipath that changes within a minute; its split, the height's error and the outages are set by hand.
 """

@@ -81,7 +81,7 @@ def classes(results: Sequence[Result]) -> dict[str, Tally]:
     parts = {"all": results} | {
         name: [run for run in results if run["class"] == name] for name in ("near copies", "outside", "ordinary")
     }
-    # with nothing but buildings in view nothing shows that all of them have moved
+    # with buildings alone in view nothing shows that all of them have moved
     but = [run for run in results if run["family"] != "shifted"]
     parts |= {"all but shifted buildings": but} if len(but) < len(results) else {}
     return {name: tally for name, runs in parts.items() if (tally := Tally.of(runs)).runs}

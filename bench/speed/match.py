@@ -39,7 +39,7 @@ class Spectral:
     def __call__(self, columns: Floats32) -> Floats32:
         """Return the best correlation (M,) of each station."""
         wave = fft.rfft(columns, axis=-1).T.conj()
-        product = np.matmul(wave[:, None], self._spectra)[:, 0]  # conjugate, for the want of a copy
+        product = np.matmul(wave[:, None], self._spectra)[:, 0]  # the conjugate, which saves a copy
         return np.asarray((self._turn @ np.concatenate([product.real, -product.imag])).max(axis=0))
 
 

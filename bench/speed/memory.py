@@ -171,7 +171,7 @@ def measured(site: Path, home: Path, stranger: Path, log: Path) -> dict[str, Mem
         sender = observed.drive(stranger)
         out["searching"] = max(observed.watch(_SEARCHES), key=total)
         sender.kill()
-        time.sleep(6.0)  # the sender's clock begins anew: the node takes that from nobody whom it still hears
+        time.sleep(6.0)  # the sender's clock begins anew: the node takes that only from a sender that was silent
         sender = observed.drive(home)
         found = observed.watch(_PATIENCE, lambda: observed.state() == "TRACKING")
         out["searching"] = max(out["searching"], *found, key=total)

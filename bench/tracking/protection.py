@@ -3,7 +3,7 @@
 Plain drives with odometry that drifts by 0.5 to 5 %, every other block on a map in which 30 % of the buildings and all
 cars, poles and trees are others. One pose per ten metres counts, a block. Its score is error over level at a factor of
 one, and the factor that the ``calibrated`` family needs is the k-th smallest of n scores, k = ceil((n + 1)(1 - risk)):
-a further block that is exchangeable with those exceeds its level with at most that risk, whatever the distribution.
+a further block that is exchangeable with those exceeds its level with at most that risk, for any distribution.
 Below 999 blocks a risk of 1e-3 is out of reach: then the largest score holds for 1 / (n + 1), and the tail's shape
 carries it on. The product's factors are judged on the ``reported`` family.
 

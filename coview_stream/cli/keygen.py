@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write both keys and print what they are for."""
+    """Write both keys and print their use."""
     from coview_stream.basemap.signature import make_keys
 
     private, public, fingerprint = make_keys(args.name)

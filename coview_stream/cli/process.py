@@ -36,7 +36,7 @@ class Stop:
         """Ask to end; safe in a signal handler."""
         with contextlib.suppress(OSError):  # full or closed: it has been asked before
             os.write(self._write, _ASKED)
-        # last: whoever sees it may close the pipe, whose numbers may be those of another file then
+        # last: a reader of it may close the pipe, whose numbers may be those of another file then
         self.requested = True
 
     def now(self) -> float:

@@ -64,7 +64,7 @@ def is_cloud_name(path: str | os.PathLike[str]) -> bool:
 def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Return the files that names, folders and patterns (``tiles/*.laz``) mean, in natural order within each.
 
-    A folder means the clouds directly in it, by their suffix. A named file is returned whatever its suffix, for its
+    A folder means the clouds directly in it, by their suffix. A named file is returned with any suffix, for its
     reader to judge. CloudError if a folder or a pattern holds no cloud.
     """
     out: list[Path] = []

@@ -222,7 +222,7 @@ def likely_columns(values: Floats32, expected: int) -> int:
     """Guess the number of columns in a file of float32 rows.
 
     The right number maximises the mutual information of column and value: heights, intensities and rings are
-    distributed unlike x and y; with a wrong row length every column mixes all of them, whatever the order of the rows.
+    distributed unlike x and y; with a wrong row length every column mixes all of them, in any order of the rows.
     ``expected`` unless another number is clearly better.
     """
     values = values[:_JUDGED]

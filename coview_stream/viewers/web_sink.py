@@ -1,6 +1,6 @@
 """Sink and hub of the web page: events for every open page at its own pace, and the robots' trails.
 
-Of each kind of event about a robot a page holds the newest only, so that a slow page delays nobody.
+Of each kind of event about a robot a page holds the newest only, so that a slow page delays no other.
 """
 
 from __future__ import annotations

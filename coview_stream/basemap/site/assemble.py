@@ -89,7 +89,7 @@ def assemble(
         try:
             arrays |= {f"learned.{name}": np.concatenate([layer[name] for layer in layers]) for name in _LEARNED}
         except (KeyError, ValueError) as error:
-            flaw = f"a tile's features are not what they should be ({error})"
+            flaw = f"a tile's features are damaged ({error})"
             raise MapError(f"{flaw}; fetch or build it again") from error
     parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256, "learned": learned}
     if keys is not None and isinstance(read := parameters.get("source_points"), int):

@@ -217,7 +217,7 @@ def read_stations_layer(layer: Layer, block: float) -> Floats32:
     """Return the stations (M, 3), by rows and columns and from low to high; MapError if the arrays are invalid."""
     steps = layer.get("steps")
     if steps is None or steps.dtype.str != "<i4" or steps.ndim != 2 or len(steps) != 3:
-        raise MapError("a tile's stations are not what they should be; fetch or build it again")
+        raise MapError("a tile's stations are damaged; fetch or build it again")
     rows = np.cumsum(steps.astype(np.int64), axis=1)
     if rows.size and np.abs(rows).max() > _MAX_BLOCK:
         raise MapError("a tile's stations lie beyond any site; fetch or build it again")

@@ -1,7 +1,7 @@
 """Store of a site's layers, files named by their sha256; and the cache of working files and mirrors.
 
 The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. Least recently used files are deleted
-to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, for ``--verify-key`` as well: nobody else can reach
+to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, for ``--verify-key`` as well: no other user reaches
 them. A folder that others may write or exchange is refused. One that they may read is closed to them, and files that
 they could write meanwhile are deleted.
 """

@@ -145,7 +145,7 @@ class CalibrationBelief:
         present = self.applied()
         for group in _GROUPS:
             if group is _CLOCK and earlier.stated_delay != self._stated_delay:
-                continue  # somebody has said something else since
+                continue  # it has been stated since
             sigma, axes = getattr(earlier, group.sigma), np.arange(SIZE)[group.axes]
             values = [getattr(earlier, name) for name in group.names]
             if group in _RARE and sigma**2 < self.P[axes, axes].mean():  # as it was, rather than as it should be

@@ -1,1 +1,1 @@
-"""Evidence: what a scan says of a place, against chance (docs/integrity.md has the equations)."""
+"""Evidence of a scan for a place, against chance (docs/integrity.md has the equations)."""

@@ -173,7 +173,7 @@ class LocalMap:
 
 
 class LocalMaps:
-    """Crops of a base map by place; those that somebody holds and the recently used ones are cached."""
+    """Crops of a base map by place; those in use and the recently used ones are cached."""
 
     def __init__(self, base_map: BaseMap, radius: float, max_bytes: int = MAX_CROP_BYTES) -> None:
         self._map = base_map

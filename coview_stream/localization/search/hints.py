@@ -44,7 +44,7 @@ FROM_THERE = " (from the last known place)"
 
 @dataclass(frozen=True)
 class PlaceGuess:
-    """Somebody's guess of a robot's place.
+    """A guess of a robot's place.
 
     Attributes:
         x, y: in the frame of the map's sources, metres.

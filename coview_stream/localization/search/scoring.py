@@ -27,7 +27,7 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
-_KEPT = 16  # places that stay by their evidence, whatever their rank at the newest keyframe
+_KEPT = 16  # places that stay by their evidence, at any rank at the newest keyframe
 _KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones farthest apart
 _NEWEST = 8  # keyframes that are searched for a moved part
 _CHANCE = 128  # places that measure the correlation of chance over keyframes

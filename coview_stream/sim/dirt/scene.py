@@ -247,7 +247,7 @@ class Movers:
         yaw = yaw_of(T_scene_body)
         c, s = np.cos(yaw), np.sin(yaw)
         for (ahead, left), phase in zip(self._companions.tolist(), self._pace.tolist(), strict=True):
-            ahead += 0.3 * np.sin(0.7 * seconds + phase)  # nobody keeps an even distance
+            ahead += 0.3 * np.sin(0.7 * seconds + phase)  # people keep no even distance
             x, y = here[0] + c * ahead - s * left, here[1] + s * ahead + c * left
             parts.append(placed(person(), x, y, self._site.height(x, y), yaw))
         return join(parts)

@@ -66,11 +66,11 @@ class ZenohSource:
         self._session: Any = None
 
     def manifest(self) -> bytes:
-        """Return the manifest's bytes. TransportError: nobody answers."""
+        """Return the manifest's bytes. TransportError: no server answers."""
         return self._get(self._keys.manifest, MAX_MANIFEST)
 
     def layer(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes. TransportError: nobody answers, or the server cannot read it."""
+        """Return a layer's bytes. TransportError: no server answers, or the server cannot read it."""
         return self._get(self._keys.layer(sha256), size)
 
     def close(self) -> None:

@@ -40,7 +40,7 @@ class FrameJob:
     defer: bool = False  # frames wait for the engine: put off all work that can wait
     # (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis
     hint: Pose | None = None
-    guess: PlaceGuess | None = None  # of the place by somebody; tried, never trusted
+    guess: PlaceGuess | None = None  # of the place; tried, never trusted
     calibration: Calibration | None = None  # of its sensor and odometry at ``hint``, a prior
     # the first one since a client reset the robot; another one makes the engine forget the calibration as well
     first_epoch: int = 0
@@ -115,7 +115,7 @@ class RoundRobin:
 
 
 class PlaceHints:
-    """Hints for the engine: the last place and somebody's guess, each once in every odometry epoch.
+    """Hints for the engine: the last place and a guess, each once in every odometry epoch.
 
     Attributes:
         forgotten: number of times that a client has asked to forget the place.

@@ -1,6 +1,6 @@
 """Engines of many robots: the quick one tracks, the slow one searches, a third one computes lidar odometry.
 
-They share nothing but the map's file, so each can have a process of its own: a search must delay neither the frames of
+They share only the map's file, so each can have a process of its own: a search must delay neither the frames of
 other robots nor the pose clock. The odometry engine needs no map.
 """
 

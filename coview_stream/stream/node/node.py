@@ -51,7 +51,7 @@ class OpenedMap(NamedTuple):
     # by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``
     engines: Mapping[str, EngineRunner]
     sessions: Sequence[Session]  # one per robot, in the node's order, without any message
-    file: Path | None = None  # that it was opened from; None where nobody reads it
+    file: Path | None = None  # that it was opened from; None where it is not needed
 
 
 OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]

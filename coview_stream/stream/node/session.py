@@ -164,7 +164,7 @@ class Session:
             return True
 
     def guess_place(self, guess: PlaceGuess) -> bool:
-        """Have the search try somebody's guess; return False, and do nothing, while a place is known.
+        """Have the search try a guess; return False, and do nothing, while a place is known.
 
         InputError: one of several maps has to be named, and none of that name is there, or it has no ground there.
         """

@@ -26,7 +26,7 @@ from coview_stream.version import __version__
 log = logging.getLogger("coview_stream.node")
 
 MAX_STATUS = 3500
-"""Bytes of a status, whatever happens; a usual one has 2,000. A default zenoh-pico loses one of 5 kB silently."""
+"""Bytes of a status at most; a usual one has 2,000. A default zenoh-pico loses one of 5 kB silently."""
 
 _JSON = "application/json"
 _MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood

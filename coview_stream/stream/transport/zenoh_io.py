@@ -78,7 +78,7 @@ class ZenohPublisher:
 class Writer:
     """Queue of messages that wait for the link rather than being dropped, and the work of the thread that empties it.
 
-    A link that is half-open holds up whoever writes to it, by seconds: the thread, not its callers. Of more than 1024
+    A link that is half-open holds up its writer by seconds: the thread, not its callers. Of more than 1024
     messages the oldest are dropped, five seconds of odometry at 200 Hz, and that is logged.
     """
 
