@@ -27,10 +27,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.fixture(scope="session", autouse=True)
 def state_home(tmp_path_factory):
-    """Nodes of tests leave nothing in the user's state directory."""
+    """Nodes of tests leave nothing in the user's state directory, nor in the cache of maps."""
     folder = tmp_path_factory.mktemp("state")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder))
+        patch.setenv("COVIEW_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield folder
 
 

@@ -56,10 +56,12 @@ class BaseMap:
         sha256: hash of parameters and content; empty until saved or loaded.
         path: file that the map was loaded from, else None.
         identity: of that file.
+        shared: whether other processes use the map, too: the layers of its field are in the cache then, for all.
     """
 
     path: Path | None = None
     identity: FileIdentity | None = None
+    shared = False
 
     def __init__(self, arrays: Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
         missing = [name for name in _REQUIRED if name not in arrays]
@@ -263,6 +265,10 @@ class BaseMap:
     @cached_property
     def field(self) -> kernels.FieldMap:
         """Likelihood field, relative to :attr:`origin`; made here if the file has none. MapError if it is invalid."""
+        if self.shared:
+            from coview_stream.basemap.site.working_file import with_shared_layers
+
+            self.arrays = with_shared_layers(self.arrays, self.sha256)
         arrays = self.arrays
         if "field.tiles" not in arrays:
             normals = tiles.unit_normals(arrays["normals"])

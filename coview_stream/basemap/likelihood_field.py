@@ -8,8 +8,8 @@ Square cells of half a metre, in tiles of 16 m that are stored only where the ma
 * edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
 
 A map file holds it: 48 MB per km2. It is looked up in rasters that are made of it when a map is opened
-(:class:`~coview_kernels.reference.field.FieldLayers`), 88 MB per km2 of memory; the working files of sites hold these
-as well, memory-mapped.
+(:class:`~coview_kernels.reference.field.FieldLayers`), 88 MB per km2 of memory. Those of a node are memory-mapped: the
+working files of sites hold them as well, and those of other maps are kept in the cache.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Working file of a site: a ``.coview`` file in the cache that nodes map into memory, written when a site is opened."""
+"""Files in the cache that nodes map into memory: the working file of a site, and the layers of a map's field."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from coview_stream.basemap.file_format import Loaded, check_arrays, open_file, save
+from coview_stream.basemap.file_format import Arrays, Loaded, check_arrays, open_file, save
+from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, LAYERS
 from coview_stream.basemap.map_arrays import EarlierMap
 from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
@@ -31,7 +32,7 @@ from coview_stream.basemap.site.store import (
 )
 from coview_stream.basemap.tiles import Key
 from coview_stream.config import Channel, config_of_map
-from coview_stream.errors import MapError, warn
+from coview_stream.errors import CoViewError, MapError, warn
 
 log = logging.getLogger("coview_stream.maps")
 
@@ -113,6 +114,29 @@ def _written(directory: Path, manifest: Manifest, progress: bool | None, keys: C
         remember_written(path)
         write_record(_record_name(directory), path.name)
         evict(folder, path, directory)
+    return path
+
+
+def with_shared_layers(arrays: Arrays, sha256: str) -> Arrays:
+    """Return a map's arrays with the rasters of its field mapped from a file in the cache, one for all processes.
+
+    A site's working file holds them itself. Where the cache cannot be used they are left out, to be made in memory.
+    """
+    if f"{LAYERS}table" not in arrays and FIELD_ARRAYS[0] in arrays:
+        with contextlib.suppress(CoViewError, OSError):
+            return arrays | open_made(lambda: _layers_file(arrays, sha256))[1].arrays
+    return arrays
+
+
+def _layers_file(arrays: Arrays, sha256: str) -> Path:
+    folder = cache_folder()
+    path = folder / f"{sha256[:40]}.field.{VERSION}.coview"
+    with lock(path):
+        if not path.is_file():
+            with ArrayFiles(folder) as into:
+                save(path, field_layers(arrays, into), {})
+            remember_written(path)
+            evict(folder, path)
     return path
 
 

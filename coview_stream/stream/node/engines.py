@@ -220,4 +220,5 @@ def open_engine(
     base_map = BaseMap.load(map_path, check=False, verify_key=trust)
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node (serve) again")
+    base_map.shared = True
     return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

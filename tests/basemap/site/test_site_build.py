@@ -218,6 +218,29 @@ def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not
 
 
 @pytest.mark.slow
+def test_rasters_of_a_shared_map_are_made_once_in_the_cache_if_there_is_one(world_map, world_file, cache, monkeypatch):
+    def shared():
+        base_map = BaseMap.load(world_file)
+        base_map.shared = True
+        return base_map
+
+    first = shared()
+    assert isinstance(first.field.layers.bits, np.memmap)
+    assert first.nbytes == world_map.nbytes
+    (made,) = cache.glob("*.coview")
+    made.write_bytes(made.read_bytes()[:-1])  # a damaged one is made again
+    monkeypatch.setenv("COVIEW_CACHE", str(world_file))
+    alone = shared()
+    assert not isinstance(alone.field.layers.bits, np.memmap)
+    monkeypatch.setenv("COVIEW_CACHE", str(cache))
+    again = shared()
+    for base_map in (alone, again):
+        for stored, wanted in zip(base_map.field.layers, world_map.field.layers, strict=True):
+            np.testing.assert_array_equal(stored, wanted)
+    assert isinstance(again.field.layers.bits, np.memmap)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("station_codes.StationCodes.MAX_STATIONS", 100), ("field._MAX_TABLE", 2)])
 def test_site_that_is_too_large_for_one_map_is_to_be_opened_in_parts(site, cache, monkeypatch, name, most):
     monkeypatch.setattr(f"coview_kernels.{name}", most)
