@@ -68,12 +68,15 @@ def _host() -> str:
 
 
 @contextmanager
-def atomic_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
+def atomic_file(path: Path, *, sync: bool = False, private: bool = False) -> Iterator[BinaryIO]:
     """Open a binary stream that becomes ``path`` at the end of the block (:func:`atomic_path`); OSError if it cannot.
 
-    With ``sync`` it is flushed to disk before renaming; otherwise a power cut may leave an empty file.
+    With ``sync`` it is flushed to disk before renaming; otherwise a power cut may leave an empty file. A
+    ``private`` file is readable by its owner alone, and no link in the place of the temporary file is followed.
     """
-    with atomic_path(path) as part, part.open("wb") as stream:
+    flags, mode = (os.O_EXCL, 0o600) if private else (os.O_TRUNC, 0o666)
+    flags |= os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
+    with atomic_path(path) as part, os.fdopen(os.open(part, flags, mode), "wb") as stream:
         yield stream
         if sync:
             stream.flush()

@@ -80,15 +80,21 @@ class SavedState:
 def _read(path: Path) -> tuple[Pose | None, Calibration | None]:
     try:
         with path.open("rb") as file:
-            document: Any = json.loads(file.read(_MAX_BYTES))
-        if not isinstance(document, dict) or document.get("format") != _FORMAT:
-            raise ValueError("it is something else")
-        if document.get("version") != _VERSION:
-            raise ValueError(f"version {document.get('version')!r:.20}, this release reads {_VERSION}")
+            document = read_document(file.read(_MAX_BYTES), _FORMAT, _VERSION)
         pose = None if document["T_map_body"] is None else read_pose(document, "T_map_body")
         return pose, read_calibration(document["calibration"])
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError) as error:
         raise InputError(f"{path}: is no state to be used ({error}); delete it to begin without") from error
+
+
+def read_document(data: bytes, form: str, version: int) -> dict[str, Any]:
+    """Return a JSON document that names its format and version; ValueError or RecursionError if it is none of these."""
+    document: Any = json.loads(data)
+    if not isinstance(document, dict) or document.get("format") != form:
+        raise ValueError("it is something else")
+    if document.get("version") != version:
+        raise ValueError(f"version {document.get('version')!r:.20}, this release reads {version}")
+    return document
 
 
 def read_pose(document: Any, name: str) -> Pose:

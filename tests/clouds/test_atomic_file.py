@@ -47,6 +47,21 @@ def test_atomic_path_uses_the_given_temporary_name(tmp_path):
     assert not temporary.exists()
 
 
+@pytest.mark.skipif(os.name != "posix", reason="modes and links as in POSIX")
+def test_private_file_is_its_owners_and_follows_no_link(tmp_path):
+    path, foreign = tmp_path / "a.json", tmp_path / "foreign"
+    foreign.write_text("mine")
+    with atomic_path(path) as part:
+        part.symlink_to(foreign)
+        with pytest.raises(FileExistsError), atomic_file(path, private=True):
+            pass
+        part.touch()
+    with atomic_file(path, private=True):
+        pass
+    assert foreign.read_text() == "mine"
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
 def test_missing_directory_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="no"), atomic_file(tmp_path / "no" / "a.bin"):
         pass

@@ -6,8 +6,6 @@ Every such place is a hypothesis: the engine verifies it like any other
 
 from __future__ import annotations
 
-import contextlib
-import glob
 import hashlib
 import json
 import logging
@@ -23,10 +21,11 @@ from urllib.parse import quote
 
 import numpy as np
 
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError, InputError, MessageError
 from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.saved_state import read_calibration, read_pose
+from coview_stream.localization.saved_state import read_calibration, read_document, read_pose
 from coview_stream.localization.search.hints import MAX_DISTANCE, PlaceGuess
 from coview_stream.messages import decode_pose
 from coview_stream.messages.types import Sample
@@ -75,7 +74,7 @@ def save(folder: Path, robot: str, place: LastPlace) -> Path:
     """Write a robot's place and return the file; OSError if the directory cannot be made or written.
 
     Only the owner may read the file. A robot's day usually ends with a power cut: the bytes are on the disk before the
-    file gets its name, and :func:`remove_parts` deletes the remains of a cut at the next start.
+    file gets its name.
     """
     path = file_of(folder, robot, place.map_sha256)
     document = {
@@ -89,16 +88,8 @@ def save(folder: Path, robot: str, place: LastPlace) -> Path:
     if place.calibration is not None:
         document["calibration"] = asdict(place.calibration)  # radians and metres
     _make(folder)
-    handle, name = tempfile.mkstemp(dir=folder, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(json.dumps(document, indent=1).encode())
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)  # a link in its place is replaced, not followed
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic_file(path, sync=True, private=True) as file:  # a link in its place is replaced, not followed
+        file.write(json.dumps(document, indent=1).encode())
     return path
 
 
@@ -113,11 +104,7 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
             data = file.read(_MAX_BYTES + 1)
         if len(data) > _MAX_BYTES:
             raise ValueError(f"longer than {_MAX_BYTES} bytes")
-        document: Any = json.loads(data.decode("utf-8"))
-        if not isinstance(document, dict) or document.get("format") != _FORMAT:
-            raise ValueError("it is something else")
-        if document.get("version") != VERSION:
-            raise ValueError(f"version {document.get('version')!r:.20}, this release reads {VERSION}")
+        document = read_document(data, _FORMAT, VERSION)
         if (str(document["robot"]), str(document["map_sha256"])) != (robot, map_sha256):
             raise ValueError("it is of another robot or map")
         return LastPlace(
@@ -146,14 +133,6 @@ def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
     if name != robot.lower() or len(name) > _MAX_NAME:  # 'R1' and 'r1' are one file on some systems
         name = f"{name[:_MAX_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
     return folder / f"{name}-{map_sha256[:16]}.json"
-
-
-def remove_parts(folder: Path, robot: str, map_sha256: str) -> None:
-    """Delete the remains of interrupted writes for a robot on a map; not while a write may be under way."""
-    path = file_of(folder, robot, map_sha256)
-    with contextlib.suppress(OSError):
-        for part in path.parent.glob(f"{glob.escape(path.stem)}*.part"):
-            part.unlink(missing_ok=True)
 
 
 def try_out(folder: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.geometry.transforms import Pose, inverse, rotation_angle
-from coview_stream.stream.node.last_place import forget, load, remove_parts, save
+from coview_stream.stream.node.last_place import forget, load, save
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
@@ -45,7 +45,6 @@ class LastPlaceKeeper:
         for session in self._sessions:
             robot = session.keys.robot
             with self._errors.catch(f"{robot}: its last pose"):
-                remove_parts(self.folder, robot, session.site_sha256)
                 last = load(self.folder, robot, session.site_sha256)
                 if last is not None and last.T_map_body is not None:
                     x, y = last.T_map_body[:2, 3]

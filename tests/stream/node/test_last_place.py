@@ -14,7 +14,7 @@ from se3 import exp_se3
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
-from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, load, remove_parts, save
+from coview_stream.stream.node.last_place import LastPlace, default_folder, file_of, load, save
 
 SHA = "0123456789abcdef" * 4
 UTM = [512_345.678_901, 5_403_210.123_456, 287.4]
@@ -169,7 +169,6 @@ def test_only_the_owner_may_read_and_no_link_is_followed(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o600
     path.unlink()
     path.symlink_to(foreign)
-    path.with_suffix(".part").symlink_to(foreign)
     save(folder, "r1", LAST)
     assert foreign.read_text() == "mine"
     assert not path.is_symlink()
@@ -185,17 +184,6 @@ def test_anything_but_a_file_is_a_warning(tmp_path, caplog, kind):
         (os.mkfifo if kind == "pipe" else os.mkdir)(path)
     assert load(tmp_path, "r1", SHA) is None
     assert f"{path}: the last pose cannot be read" in caplog.text
-
-
-def test_parts_that_a_power_cut_left_are_removed(tmp_path):
-    path = save(tmp_path, "r1", LAST)
-    path.with_suffix(".part").write_text("of an earlier release")
-    (tmp_path / f"{path.stem}.k2j3h4.part").write_text("half")
-    other = tmp_path / f"r2-{SHA[:16]}.abc.part"
-    other.write_text("of another robot")
-    remove_parts(tmp_path, "r1", SHA)
-    same(load(tmp_path, "r1", SHA), LAST)
-    assert {p.name for p in tmp_path.iterdir()} == {path.name, other.name}
 
 
 @pytest.mark.parametrize(
