@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import math
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -45,7 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = "las, laz, copc, e57, ply, pcd, npy, bin; xyz, pts, asc, txt, csv, also .gz"
     parser.add_argument(
-        "maps", nargs="+", metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them, http(s):// addresses"
+        "maps",
+        nargs="+",
+        metavar="MAP",
+        help=f"clouds ({kinds}), folders or patterns of them, http(s):// addresses, - for stdin",
     )
     parser.add_argument(
         "--window", metavar="X0,Y0,X1,Y1", help="read only this rectangle, of COPC files (also by http ranges)"
@@ -197,13 +201,19 @@ def _build_site(
 
 @contextlib.contextmanager
 def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str | os.PathLike[str]]]:
-    """Fetch clouds of web servers, and windows of COPC files, into a temporary folder, and yield the local files.
+    """Yield local files of clouds; those of web servers, stdin (``-``) and windows of COPC files are temporary.
 
     ``window`` is ``X0,Y0,X1,Y1`` of all clouds; None takes whole files.
 
     Raises:
         ConfigError: a malformed window. CloudError: a file cannot be fetched, or is no COPC file and has a window.
     """
+    if "-" in given:
+        with tempfile.TemporaryDirectory(prefix="coview-clouds-") as folder:
+            read = str(_read_stdin(Path(folder)))
+            with local_clouds([read if name == "-" else name for name in given], window) as clouds:
+                yield clouds
+        return
     from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address
     from coview_stream.clouds.files import expand_cloud_paths
 
@@ -227,3 +237,18 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
                     size = f"{cloud.points} points in the window{received}"
                 print(f"{cloud_name}: {size}", file=sys.stderr)
         yield out
+
+
+def _read_stdin(folder: Path) -> Path:
+    """Write the cloud on stdin into a folder, named by its first bytes; CloudError if they are of no format."""
+    from coview_stream.clouds.files import suffix_of_content
+    from coview_stream.errors import CloudError
+
+    path = folder / "stdin"
+    with path.open("wb") as file:
+        shutil.copyfileobj(sys.stdin.buffer, file)
+    with path.open("rb") as file:
+        suffix = suffix_of_content(file.read(512))
+    if suffix is None:
+        raise CloudError("-: stdin is no cloud of a format that its first bytes tell; write it to a file")
+    return path.rename(path.with_suffix(suffix))

@@ -94,6 +94,16 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
     return tuple((1, int(part), "") if k % 2 else (0, 0, part) for k, part in enumerate(parts))
 
 
+def suffix_of_content(head: bytes) -> str | None:
+    """Return the suffix of a cloud by its first bytes, of text if they are no other; None if they are of no cloud."""
+    content = sniff(head)
+    if content == "gzip":
+        return ".xyz.gz"
+    if content is None:
+        return ".xyz" if head.strip() and b"\0" not in head else None
+    return next((suffix for suffix, name in _FORMATS.items() if name == content), None)
+
+
 def check_format(path: Path) -> str:
     """Return the format that a file's suffix names; CloudError if the first bytes are of another one."""
     suffix = suffix_of(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import itertools
 import json
 import re
@@ -203,3 +205,16 @@ def test_large_build_says_how_long_it_takes(tmp_path, capsys):
     write_cloud(tmp_path / "town.las", corners, origin=[448_000.0, 5_400_000.0, 90.0])
     _announce([str(tmp_path / "town.las")], tiles=False)
     assert re.search(r"0\.0 million points on 2 km2: 3 min .* a map of 0\.7 GB", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("packed", [False, True], ids=["xyz", "xyz.gz"])
+def test_cloud_on_stdin_is_read_by_its_first_bytes(map_points, tmp_path, capsys, monkeypatch, refused, packed):
+    near = map_points[(np.abs(map_points[:, :2]) < 8.0).all(axis=1)]
+    text = "\n".join("{:.2f} {:.2f} {:.2f}".format(*row) for row in near).encode()
+    stdin = io.TextIOWrapper(io.BytesIO(gzip.compress(text) if packed else text))
+    monkeypatch.setattr("sys.stdin", stdin)
+    assert main(["build", "-", "-o", str(tmp_path / "site.coview"), "--radius", "20", "--no-learned"]) == 0
+    assert f"{len(near)} points read" in capsys.readouterr().out
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"PK\x03\x04\0\0")))
+    assert "stdin is no cloud" in refused("build", "-", "-o", tmp_path / "x.coview")

@@ -77,15 +77,19 @@ class ErrorLog:
 
     def __init__(self) -> None:
         self.texts: deque[str] = deque(maxlen=_MAX_ERRORS)
-        self._logged = 0
+        self._logged: set[str] = set()
 
     def add(self, text: str, logged: bool = True) -> None:
-        """Add an error unless it is there already; ``logged``: log it as well."""
+        """Add an error unless it is there already; ``logged``: log it as well, once."""
         if text not in self.texts:
             self.texts.append(text)
-            if logged and self._logged < _MAX_LOGGED:
-                self._logged += 1
+            if logged and len(self._logged) < _MAX_LOGGED and text not in self._logged:
+                self._logged.add(text)
                 log.warning("%s", text)
+
+    def clear(self) -> None:
+        """Forget the errors, which are over: the next one of a kind is its first again."""
+        self.texts.clear()
 
     def add_first(self, kind: str, text: str) -> None:
         """Add only the first error of a kind whose texts all differ."""

@@ -227,18 +227,20 @@ class StateHistory:
         self._newest: deque[tuple[dict[str, Any], KeyframeEvidence | None]] = deque(maxlen=_MAX_TRANSITIONS)
         self._count = 0
 
-    def add(self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None) -> None:
-        """Record the state at the newest processed frame: a change if it is reported as another one.
+    def add(self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None) -> bool:
+        """Record the state at the newest processed frame; return whether it is reported as another one.
 
         LOST for another reason counts as well, for that changes the search.
         """
         lost_again = state is State.LOST and reason != self._reason
-        if state.reported != self._state.reported or lost_again:
+        changed = state.reported != self._state.reported
+        if changed or lost_again:
             self._count += 1
             ends = {"from": self._state.reported, "to": state.reported}
             change = {"number": self._count, "stamp_ns": stamp_ns, **ends, "reason": reason}
             self._newest.append((change, evidence))
             self._state, self._reason = state, reason
+        return changed
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the newest ones, oldest first."""

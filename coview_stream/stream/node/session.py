@@ -306,6 +306,8 @@ class Session:
             return LastPlace(self.site_sha256, pose.stamp_ns, pose.T_map_body, pose.T_map_odom, calibration)
 
     def _record_state(self) -> None:
-        """Add the state to the history, wherever it may have changed."""
-        reason = self.robot_state.reason() or self.inputs.waiting_for()
-        self.history.add(self.robot_state.state, reason, self.robot_state.last_frame_ns, self.robot_state.evidence)
+        """Add the state to the history, wherever it may have changed; errors from before a robot is found are over."""
+        state, reason = self.robot_state.state, self.robot_state.reason() or self.inputs.waiting_for()
+        changed = self.history.add(state, reason, self.robot_state.last_frame_ns, self.robot_state.evidence)
+        if changed and state is State.TRACKING:
+            self.errors.clear()

@@ -385,3 +385,14 @@ def test_two_clouds_with_one_stamp_are_an_error_of_the_status(robot):
         robot.saw(0.5, now=1001.0)
     (text,) = robot.session.errors.texts
     assert "with the stamp of another cloud" in text
+
+
+def test_errors_from_before_a_robot_is_found_are_over(robot):
+    robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
+    assert any("video/raw" in text for text in robot.session.errors.texts)
+    robot.localized(0.0)
+    assert not robot.session.errors.texts
+    robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.1)
+    robot.frame(0.2)
+    assert len(robot.session.errors.texts) == 1
+    assert robot.counters.unknown_encoding == 2
