@@ -28,6 +28,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.saved_state import read_calibration, read_document, read_pose
 from coview_stream.localization.search.hints import MAX_DISTANCE, PlaceGuess
 from coview_stream.messages import decode_pose
+from coview_stream.messages.json_messages import read_object
 from coview_stream.messages.types import Sample
 
 log = logging.getLogger(__name__)
@@ -210,11 +211,7 @@ def decode_guess(sample: Sample) -> PlaceGuess:
     if len(payload) > _MAX_GUESS_BYTES:
         raise MessageError(f"{sample.key}: an initial pose of more than {_MAX_GUESS_BYTES} bytes")
     if payload.lstrip().startswith(b"{"):
-        try:
-            given = json.loads(payload)
-        except (ValueError, RecursionError) as error:
-            raise MessageError(f"{sample.key}: no JSON ({str(error)[:80]})") from error
-        return guess_of_fields(given)
+        return guess_of_fields(read_object(payload))
     pose = decode_pose(sample, "cdr")
     spread = math.sqrt(max(float(np.nanmax(np.diag(pose.covariance)[:2])), 0.0)) if pose.covariance.size else 0.0
     turn = math.sqrt(max(float(np.nan_to_num(pose.covariance[5, 5])), 0.0)) if pose.covariance.size else 0.0
