@@ -30,6 +30,7 @@ from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.mapped import Windows, take_rows
 from coview_kernels.similarity import unit_columns
+from coview_kernels.warm_up import compiled_by
 
 ANGLES = 60
 """Angles at which :meth:`StationCodes.best` looks."""
@@ -451,3 +452,15 @@ def _unpack(pair: I16) -> F32:
     whole[..., 0, :] = pair.astype(np.int8)
     np.multiply(pair, np.float32(1.0 / 256.0), out=whole[..., 1, :])
     return whole
+
+
+def _compile() -> None:
+    for count in (1,) if runtime.workers() == 1 else (1, _MIN_PARALLEL):
+        codes, basis = np.zeros(StationCodes.shape_of(count), dtype=np.int16), np.ones((_ROWS, _LANES, 1), np.complex64)
+        step, norm = np.ones((_ROWS, 2, _LANES), dtype=np.float32), np.ones(2 * _LANES + 1, dtype=np.float32)
+        stations = StationCodes(codes, basis, step, norm, 2)
+        query = stations.query(np.ones((1, 2)))
+        _ = stations.best(query), stations.all_shifts(query, [0]), stations.at(query, [0], [0])
+
+
+compiled_by("StationCodes", _compile)

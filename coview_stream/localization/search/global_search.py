@@ -35,7 +35,8 @@ class GlobalSearch:
     """
 
     KERNELS = (
-        "transform_unique", "polar_bin", "distinct_poses", "field_scores", "align_planes", "crop_points",
+        "transform_unique", "polar_bin", "StationCodes", "distinct_poses", "field_scores", "align_planes",
+        "crop_points",
     )  # fmt: skip
     """Names of its kernels, for :func:`coview_kernels.warm_up`."""
 

@@ -124,7 +124,8 @@ class SearchEngine(Engine):
     """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = GlobalSearch.KERNELS
-    later_kernels = ("PointGrid",)  # of a place that has been accepted
+    # of learned features, and of a place that has been accepted
+    later_kernels = ("height_columns", "window_products", "PointGrid")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
