@@ -44,7 +44,8 @@ class RosRobot:
         self.poses, self.diagnostics = self.heard[f"/{name}/pose"], self.heard["/diagnostics"]
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        threading.Thread(target=self._executor.spin, daemon=True).start()
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
 
     def until(self, condition, seconds=10.0):
         deadline = time.monotonic() + seconds
@@ -77,6 +78,7 @@ class RosRobot:
 
     def close(self):
         self._executor.shutdown(0.5)
+        self._thread.join(5.0)
         self.node.destroy_node()
         self.context.try_shutdown()
 
