@@ -230,7 +230,7 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 def _ros_parameters(args: argparse.Namespace, declared: argparse.ArgumentParser) -> dict[str, dict[str, Any]]:
     """Start the ROS 2 node that is asked for, set options to its parameters, and return its tables."""
-    from coview_stream.stream.transport.ros2_transport import settings_of, start_node
+    from coview_stream.stream.transport.ros2_node import settings_of, start_node
 
     from_file = args.from_file
     args.ros_node = start_node(args.ros_args or ())

@@ -43,7 +43,7 @@ class NetworkOptions:
     connect: Sequence[str] = ()
     listen: Sequence[str] = ()
     zenoh_config: Path | None = None
-    ros2: Any = None  # of :func:`~coview_stream.stream.transport.ros2_transport.start_node`
+    ros2: Any = None  # of :func:`~coview_stream.stream.transport.ros2_node.start_node`
     check_frames: bool = True  # of ROS 2: refuse clouds in another frame than the one whose odometry comes
 
 

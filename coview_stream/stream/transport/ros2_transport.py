@@ -10,7 +10,6 @@ import atexit
 import contextlib
 import json
 import logging
-import sys
 import threading
 import time
 from collections import defaultdict
@@ -19,91 +18,29 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coview_stream.basemap.summary import MapView
 from coview_stream.config.mount import Mount
-from coview_stream.errors import (
-    ConfigError,
-    CoViewError,
-    DependencyError,
-    MessageError,
-    TransportError,
-    install_command,
-    printable,
-)
+from coview_stream.errors import ConfigError, CoViewError, MessageError, TransportError, printable
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import json_messages, ros2, ros2_outputs
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.ros2_node import latched, message_type
 from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_io import THREADS, Inbox, Inboxes
 
 _log = logging.getLogger(__name__)
 
-_NODE = "coview_stream"
-_OWN_PARAMETERS = ("use_sim_time", "start_type_description_service")
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry
 _CACHE = 10.0  # seconds of transforms that a tf2 buffer keeps: with older stamps no user of ours finds any
 _JOIN = 0.3  # seconds for each thread at closing
 _MAP_TOPIC, _GUESS_TOPIC = "map_points", "initialpose"  # relative: a namespace moves them
-
-
-def start_node(args: Sequence[str]) -> Any:
-    """Return a ROS 2 node in a context of its own; ``args`` are those behind ``--ros-args``.
-
-    Raises:
-        DependencyError: there is no rclpy, or one of another Python. ConfigError: it refuses the arguments.
-    """
-    rclpy = _import_rclpy()
-    context = rclpy.context.Context()
-    try:
-        signals = import_module("rclpy.signals").SignalHandlerOptions.NO  # the command ends the node
-        rclpy.init(args=["--ros-args", *args], context=context, signal_handler_options=signals)
-        return rclpy.node.Node(_NODE, context=context, automatically_declare_parameters_from_overrides=True)
-    except Exception as error:  # its own kinds differ from release to release
-        raise ConfigError(f"--ros-args {' '.join(args)}: {printable(error)}") from error
-
-
-def _import_rclpy() -> Any:
-    try:
-        for name in ("context", "executors", "node", "qos"):
-            import_module(f"rclpy.{name}")
-        return import_module("rclpy")
-    except Exception as error:  # a library of another release may raise anything
-        spec = find_spec("rclpy")
-        if spec is None:
-            raise DependencyError(
-                f"--ros2: there is no rclpy here; source ROS 2, or {install_command('ros2')} (Python 3.11 to 3.13)"
-            ) from error
-        folder = Path(spec.origin or "").parent
-        built = sorted(path.name.split(".")[1] for path in folder.glob("_rclpy_pybind11.*.so"))
-        tag = f"cpython-{sys.version_info.major}{sys.version_info.minor}"
-        if built and not any(name.startswith(tag) for name in built):
-            why = f"is built for {', '.join(built)}, and this is {tag}: use that Python"
-        else:
-            why = f"cannot be loaded ({printable(error)}): is ROS 2 sourced?"
-        raise DependencyError(f"--ros2: the rclpy in {folder} {why}, or {install_command('ros2')}") from error
-
-
-def settings_of(node: Any) -> dict[str, Any]:
-    """Return the parameters of a node that are not its own, those with dots as tables."""
-    settings: dict[str, Any] = {}
-    for name, parameter in sorted(node.get_parameters_by_prefix("").items()):
-        if name in _OWN_PARAMETERS or name.startswith("qos_overrides."):
-            continue
-        *tables, last = name.split(".")
-        table = settings
-        for part in tables:
-            table = table.setdefault(part, {})
-        value = parameter.value
-        table[last] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-    return settings
 
 
 @dataclass
@@ -180,7 +117,7 @@ class _Output:
 
     def put(self, message: Encoded) -> None:
         self._transport.deliver(Sample(self._key, message.payload, message.encoding, message.attachment))
-        if self._write is not None:
+        if self._write is not None and not self._transport.closed.is_set():
             with self._transport.guard.catch(self._key):
                 self._write(message.payload)
 
@@ -192,9 +129,9 @@ class Ros2Transport:
     """A ROS 2 node's topics under the keys of its robots; all methods may be called from any thread.
 
     Args:
-        node: from :func:`start_node`; it is destroyed at closing.
+        node: from :func:`~coview_stream.stream.transport.ros2_node.start_node`; it is destroyed at closing.
         keys: of the robots; clouds, odometry and poses are topics without their first slash.
-        check_frames: refuse clouds in another frame than the one whose odometry comes.
+        check_frames: refuse clouds in a frame that nothing joins to the one whose odometry comes.
     """
 
     def __init__(self, node: Any, keys: Sequence[RobotKeys], check_frames: bool = True) -> None:
@@ -209,7 +146,7 @@ class Ros2Transport:
         self._map_publisher: Any = None
         self._shown = ""  # hash of the map that has been published
         self._lock = threading.RLock()
-        self._closed = threading.Event()
+        self.closed = threading.Event()
         self._inboxes = Inboxes(self.guard)
         self._map_wanted = self._inboxes.open("map", lambda _: self._publish_map(), 1)
         self._robots = [_Robot(k, f"{k.robot}/" if len(keys) > 1 else "", check_frames) for k in keys]
@@ -237,8 +174,8 @@ class Ros2Transport:
         if find_spec("tf2_msgs") is not None:
             outputs["tf"] = self._create_publisher(ros2_outputs.TRANSFORMS, f"/{prefix}tf", 100)
             self._node.create_subscription(
-                _type(ros2_outputs.TRANSFORMS), f"/{prefix}tf_static", partial(self._on_static, robot),
-                _latched(100), raw=True,
+                message_type(ros2_outputs.TRANSFORMS), f"/{prefix}tf_static", partial(self._on_static, robot),
+                latched(100), raw=True,
             )  # fmt: skip
         self._inputs |= {
             keys.cloud: _Input(f"/{keys.cloud}", ros2.CLOUD, robot.check_cloud),
@@ -254,7 +191,7 @@ class Ros2Transport:
         self._services |= {keys.relocalize: f"/{keys.robot}/relocalize", keys.reset: f"/{keys.robot}/reset"}
 
     def _create_publisher(self, kind: str, topic: str, depth: Any = 10) -> Any:
-        return self._node.create_publisher(_type(kind), topic, depth)
+        return self._node.create_publisher(message_type(kind), topic, depth)
 
     # ---- as of Transport
 
@@ -267,11 +204,11 @@ class Ros2Transport:
             with self._lock:
                 self._readers[key] = tuple(other for other in self._readers[key] if other is not inbox)
                 subscription = None if self._readers[key] else self._subscribed.pop(key, None)
-                if subscription is not None and not self._closed.is_set():
+                if subscription is not None and not self.closed.is_set():
                     self._node.destroy_subscription(subscription)
 
         with self._lock:
-            if self._closed.is_set():
+            if self.closed.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")
             self._readers[key] = (*self._readers[key], inbox)
             source = self._inputs.get(key)
@@ -295,7 +232,7 @@ class Ros2Transport:
 
         depth = 5 if source.kind == ros2.CLOUD else _QUEUE
         profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
-        subscription = self._node.create_subscription(_type(source.kind), source.topic, take, profile, raw=True)
+        subscription = self._node.create_subscription(message_type(source.kind), source.topic, take, profile, raw=True)
         _log.info("%s comes on topic %s", source.kind, subscription.topic_name)
         return subscription
 
@@ -328,7 +265,7 @@ class Ros2Transport:
         service = self._node.create_service(trigger, self._services[key], reply)
 
         def end() -> None:
-            if not self._closed.is_set():
+            if not self.closed.is_set():
                 self._node.destroy_service(service)
 
         return end
@@ -374,9 +311,9 @@ class Ros2Transport:
     def close(self) -> None:
         """As :meth:`Transport.close`."""
         with self._lock:
-            if self._closed.is_set():
+            if self.closed.is_set():
                 return
-            self._closed.set()
+            self.closed.set()
         atexit.unregister(self.close)
         self._inboxes.end()
         with contextlib.suppress(Exception):  # rclpy's own kinds, while it takes down the rest
@@ -390,7 +327,7 @@ class Ros2Transport:
             self._node.context.try_shutdown()
 
     def _spin(self) -> None:
-        while not self._closed.is_set():
+        while not self.closed.is_set():
             with self.guard.catch("rclpy"):
                 self._executor.spin()
 
@@ -450,21 +387,6 @@ class Ros2Transport:
             return
         view = MapView.from_json(self._show_map())
         if self._map_publisher is None:
-            self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, _latched(1))
+            self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, latched(1))
         points = (view.points + view.origin).astype(np.float32)
         self._map_publisher.publish(ros2_outputs.encode_map(points, self._node.get_clock().now().nanoseconds))
-
-
-def _latched(depth: int) -> Any:
-    """Return a QoS by which who comes later gets the newest messages too."""
-    qos = import_module("rclpy.qos")
-    return qos.QoSProfile(depth=depth, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def _type(name: str) -> Any:
-    """Import a message type; DependencyError if its package is missing."""
-    package, _, message = name.split("/")
-    try:
-        return getattr(import_module(f"{package}.msg"), message)
-    except ImportError as error:
-        raise DependencyError(f"--ros2: ROS package {package} is missing; {install_command('ros2')}") from error

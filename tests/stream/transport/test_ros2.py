@@ -25,7 +25,8 @@ from coview_stream.geometry.transforms import transform as transform_points
 from coview_stream.messages import ros2, ros2_outputs
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.rmw import type_hash
-from coview_stream.stream.transport.ros2_transport import Ros2Transport, settings_of, start_node
+from coview_stream.stream.transport.ros2_node import settings_of, start_node
+from coview_stream.stream.transport.ros2_transport import Ros2Transport
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "node"))
 from fake_node import Site
@@ -408,7 +409,7 @@ def test_rclpy_of_another_python_is_named(tmp_path):
     (tmp_path / "rclpy").mkdir()
     (tmp_path / "rclpy/__init__.py").write_text("")
     (tmp_path / "rclpy/_rclpy_pybind11.cpython-399-x86_64-linux-gnu.so").write_text("")
-    code = "from coview_stream.stream.transport.ros2_transport import start_node; start_node(())"
+    code = "from coview_stream.stream.transport.ros2_node import start_node; start_node(())"
     paths = f"import sys; sys.path[:0] = {[str(tmp_path)]!r}; "
     done = subprocess.run(
         [sys.executable, "-c", paths + code], env=python_environment(), capture_output=True, text=True
