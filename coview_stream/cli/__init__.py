@@ -147,8 +147,11 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def _check_options(words: list[str], known: list[str], command: str) -> None:
-    """Refuse a long option that is none of a command's, nor the beginning of one (ConfigError)."""
-    for word in itertools.takewhile(lambda word: word != "--", words):
+    """Refuse a long option that is none of a command's, nor the beginning of one (ConfigError).
+
+    Those behind ``--`` and ``--ros-args`` are not the command's.
+    """
+    for word in itertools.takewhile(lambda word: word not in ("--", "--ros-args"), words):
         option = word.partition("=")[0]
         if option.startswith("--") and not any(name.startswith(option) for name in known):
             near = did_you_mean(option, [name for name in known if name.startswith("--")])

@@ -387,6 +387,7 @@ def test_names_that_ros_does_not_allow_are_refused(ros):
     [
         (["--ros2", "--connect", "tcp/127.0.0.1:1"], "--connect is for zenoh"),
         (["--ros2", "--ros-args", "-p", "risks:=1.0"], "ROS parameters: unknown key 'risks'"),
+        (["--ros2", "--ros-args", "--params-file", "/nowhere.yaml", "--ros-args"], "--ros-args --params-file /nowhere"),
     ],
 )
 def test_options_that_do_not_go_with_ros_are_refused(ros, capfd, arguments, text):
@@ -493,11 +494,14 @@ def errors(robot, truth):
 @pytest.mark.slow
 def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side(robot, scene, world_file, tmp_path):
     run = small_world.record_along(scene, small_world.drive(), 0.4)
-    served = Served(world_file, tmp_path)
+    file = tmp_path / "patient.yaml"  # however slow the machine is
+    file.write_text("coview_stream: {ros__parameters: {odometry_timeout: 20.0, max_outage: 30.0}}\n")
+    arguments = ("--ros-args", "--params-file", str(file))
+    served = Served(world_file, tmp_path, *arguments)
     try:
         robot.found()
         robot.clouds.publish(cloud_message(time.time_ns(), np.zeros((0, 3))))  # zero width
-        truth, at = play(robot, run, 60.0, 0, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 150.0, 0, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
         robot.until(lambda: robot.level() == b"\0")
         assert robot.heard["/map_points"][0].header.frame_id == "map"
@@ -511,16 +515,16 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
         robot.close()
         robot.__init__(node="driver_again")
         robot.found()
-        truth, at = play(robot, run, 60.0, at, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 150.0, at, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
         # and so does the node
         code, seconds = served.end()
         assert (code, seconds < 2.0) == (0, True)
-        served = Served(world_file, tmp_path)
+        served = Served(world_file, tmp_path, *arguments)
         robot.until(lambda: not robot.clouds.get_subscription_count(), 40.0)
         robot.found()
         robot.poses.clear()
-        truth, at = play(robot, run, 60.0, at, lambda: len(robot.poses) > 10)
+        truth, at = play(robot, run, 150.0, at, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
     finally:
         served.end()
