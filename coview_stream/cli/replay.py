@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from dataclasses import replace
 
 from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_of
@@ -13,6 +12,7 @@ HELP = "feed a recorded run into zenoh as a live robot"
 
 _NO_ODOMETRY = "none"
 _LAST_WAIT = 0.5  # seconds, set by hand: a session learns of subscribers a moment after it first asks
+_STARTS = 120.0  # seconds of an engine's start, at most: EngineProcess; the first one compiles kernels
 _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odometry_timeout
 
 
@@ -95,12 +95,10 @@ def run(args: argparse.Namespace) -> int:
             else:
                 print(f"{said}; use --odometry-rate {rate:g}", file=sys.stderr)
         with stop_on_signals() as stop:
-            begin = time.monotonic()
             heard = transport.await_subscriber(sender.cloud_key, args.wait, stop.wait)
             if not heard and not stop.requested:
                 print(f"nothing subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
-            left = args.wait - (time.monotonic() - begin)
-            if heard and left > 0 and not await_engines(transport, args.base, args.robot, left, stop.wait):
+            if heard and args.wait > 0 and not await_engines(transport, args.base, args.robot, _STARTS, stop.wait):
                 print("the node's engines are not ready yet; sending all the same", file=sys.stderr)
             total = None if args.loop else len(recorded)
             quiet = not (args.progress or sys.stderr.isatty())
