@@ -31,6 +31,7 @@ _CELL = 1.0  # metres
 _CELL_POINTS = 5
 _THICKNESS = 0.15  # metres, one sigma across
 _FLATTER = 2.0  # times as wide as thick
+_RANGE_NOISE = 0.03  # metres: points along one ring are a line, which noise alone makes wider than it is thick
 
 
 def motion_prior(T_start: Pose, far: float) -> kernels.Prior:
@@ -76,7 +77,8 @@ def surface_points(points: Points) -> tuple[Points, Floats32]:
         moments[:, i, j] = _means(off[:, i] * off[:, j], cell_of, count)
     variances, axes = np.linalg.eigh(moments)
     thin = np.maximum(variances[:, 0], 0.0)
-    flat = ((thin < _THICKNESS**2) & (variances[:, 1] > _FLATTER**2 * thin))[cell_of]
+    wide = variances[:, 1] > _FLATTER**2 * np.maximum(thin, _RANGE_NOISE**2)
+    flat = ((thin < _THICKNESS**2) & wide)[cell_of]
     return points[flat], axes[:, :, 0][cell_of[flat]].astype(np.float32)
 
 

@@ -3,7 +3,8 @@
 The registration starts at odometry's motion. Where another start could explain the clouds as well (no motion at all, as
 of a scan that is repeated) or the clouds fit less than usual (a sensor that was turned, a cloud of another time), the
 clouds' own fit chooses: the share of the structure that lies on the earlier cloud's surfaces. So odometry cannot hide
-a motion that it does not have. Motions are planar: (x, y, heading) in the level axes of the earlier body.
+a motion that it does not have. In foliage few points lie on any surface, their own cloud's either, and the usual fit is
+relative to that share. Motions are planar: (x, y, heading) in the level axes of the earlier body.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ _LEARNS = 0.1  # weight of a new fit in the usual one
 _STARTS = 2  # registered of those, the best
 ALIKE = 0.03
 """Difference of fits that counting so many points does not resolve (one sigma)."""
+APART = 2.0
+"""Misfit from which clouds do not fit each other."""
 _STAYS = 0.06  # metres: three sigmas of a motion
 _NEAR_ZERO = 0.3  # metres and radians of a motion that a copy may show
 _SAME = 0.05  # metres within which a lidar's noise leaves a point of a copy
@@ -51,9 +54,14 @@ class CloudMotion(NamedTuple):
     motion: Floats  # (3,) x, y, heading
     covariance: Floats  # (3, 3), wide along a tunnel
     fit: float  # share of the structure that lies on the earlier surfaces
-    usual: float  # the same, of the motions before
+    usual: float  # the same, as expected by the motions before and the structure on the scan's own surfaces
     T: Pose | None  # (4, 4) in the axes of the earlier body; None where none can be registered
     same: float | None = None  # share of the structure's points that stand where they stood, of a motion near zero
+
+    @property
+    def misfit(self) -> float:
+        """How many times worse than usual the clouds fit."""
+        return (self.usual + ALIKE) / (self.fit + ALIKE)
 
 
 class CloudMotionMeter:
@@ -61,7 +69,7 @@ class CloudMotionMeter:
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._usual = 0.0
+        self._usual: float | None = None  # share of a scan's structure on its own surfaces that lies on earlier ones
 
     def measure(
         self, before: RawScan, now: RawScan, calibration: Calibration, guess: Floats | None = None
@@ -72,7 +80,8 @@ class CloudMotionMeter:
         """
         here = np.zeros(3)
         target = LocalMap(*surface_points(before.levelled(calibration) - before.position.astype(np.float32)))
-        scan = prepare_scan(now.levelled(calibration) - now.position.astype(np.float32), here, self._config)
+        scan_points = now.levelled(calibration) - now.position.astype(np.float32)
+        scan = prepare_scan(scan_points, here, self._config)
         if len(target.points) < MIN_PAIRS or int(scan.above.sum()) < _FEWEST:
             return None  # bare ground looks alike everywhere
         target.prepare()
@@ -90,17 +99,22 @@ class CloudMotionMeter:
             # rings lie on each other where nothing moves, too; but a copy stays where it began
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
-        if max(fit for *_, fit in found) < _USUAL * self._usual:
+        flat = fit_of(scan, LocalMap(*surface_points(scan_points)), np.eye(4))
+        if max(fit for *_, fit in found) < _USUAL * flat * (self._usual or 0.0):
             starts = _starts(odometry)
             fits = np.array([fit_of(scan, target, T, _COARSE) for T in starts])
             found += [self._registered(scan, target, starts[k]) for k in np.argsort(-fits)[:_STARTS]]
         best = max(found[1:], key=lambda each: each[2], default=found[0])
         if best[2] <= found[0][2] + 2.0 * ALIKE:
             best = found[0]
-        usual = self._usual or best[2]
         if best[0] is None:
-            return CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), 0.0, usual, None)
-        self._usual = usual + _LEARNS * (best[2] - usual)
+            usual = flat * (self._usual or 0.0)
+            unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit_of(scan, target, odometry), usual, None)
+            return unknown if unknown.misfit > APART else None
+        if self._usual is None:
+            self._usual = best[2] / max(flat, ALIKE)
+        usual = flat * self._usual
+        self._usual += _LEARNS * (best[2] - usual)
         T_now = pose_from(best[0][:3, :3] @ now.T_odom_body[:3, :3], before.position + best[0][:3, 3])
         motion, covariance = _in_plane(T_now, best[1], before.T_odom_body)
         same: float | None = None

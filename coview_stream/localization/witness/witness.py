@@ -33,7 +33,7 @@ from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.tracker import Tracker
 from coview_stream.localization.witness.agreement import FAILS, Seen, Step
-from coview_stream.localization.witness.cloud_motion import CloudMotion, CloudMotionMeter
+from coview_stream.localization.witness.cloud_motion import APART, CloudMotion, CloudMotionMeter
 from coview_stream.localization.witness.faults import LAGS, Accusation, FaultPosterior
 from coview_stream.localization.witness.first_motions import Conventions
 from coview_stream.localization.witness.stamps import step_stamps
@@ -46,7 +46,6 @@ _RECENT = 3  # frames of odometry of which the velocities are taken
 _SHORT = 0.05  # seconds: stamps nearer to each other are of one moment
 _HISTORY = 600  # frames of odometry
 _HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
-_APART = 2.0  # times worse than usual: clouds do not fit each other
 _RISK = 1e-3  # of a protection level
 _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
 
@@ -253,14 +252,14 @@ class Witness:
         if driven <= LONGEST or (guess is not None and float(np.linalg.norm(guess[:2])) <= LONGEST):
             seen = self._meter.measure(before.scan, now.scan, calibration, guess)
         clouds = None if seen is None else Seen(seen.motion, seen.covariance)
-        misfit = 1.0 if seen is None or not seen.usual else seen.usual / max(seen.fit, 1e-3)
+        misfit = 1.0 if seen is None else seen.misfit
         parts: tuple[tuple[float, Floats, Floats], ...] = ()
         if seen is not None and (contradicted or _contradicts(o, noise, seen)):
             parts = self._parts(seen, before, middle, now, calibration)
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
-            fails=fails, apart=misfit > _APART, copied=now.copied, parts=parts,
+            fails=fails, apart=misfit > APART, copied=now.copied, parts=parts,
             same=None if seen is None else seen.same,
             unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), stamps=stamps,
             start=guess, tilting=self._tilting,
