@@ -19,7 +19,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate
-from coview_stream.localization.witness.cloud_motion import CloudMotionMeter
+from coview_stream.localization.witness.cloud_motion import APART, CloudMotionMeter
 from coview_stream.localization.witness.faults import FaultPosterior
 from coview_stream.localization.witness.witness import Witness
 
@@ -64,6 +64,25 @@ def test_bare_ground_shows_no_motion(scene):
             RawScan(transform(T, cloud), T) for cloud, T in zip(drive.clouds[:2], drive.T_odom_body, strict=False)
         )
         assert (meter.measure(before, now, Calibration()) is not None) is seen
+
+
+def test_foliage_is_no_cloud_of_another_place():
+    """A lidar sees other leaves from each place; where walls end, clouds fit less, but so do their own surfaces."""
+    rng = np.random.default_rng(5)
+    ground = np.column_stack([*rng.uniform(-15.0, 15.0, (2, 4000)), rng.normal(-1.5, 0.02, 4000)])
+    wall = np.column_stack([rng.uniform(-15.0, 15.0, 3000), rng.normal(6.0, 0.02, 3000), rng.uniform(-1.5, 4.0, 3000)])
+    across = wall[:, [1, 0, 2]]
+    meter, misfits = CloudMotionMeter(RegistrationConfig()), []
+    for walls in (True, True, True, True, False, False, False, False):
+        scans = []
+        for x in (0.0, 1.0):
+            bush = rng.uniform([-12.0, -12.0, -0.5], [12.0, 12.0, 3.0], (600, 3)) * rng.choice([-1.0, 1.0], (600, 1))
+            bush[:, 2] = np.abs(bush[:, 2])
+            seen = np.concatenate([ground, wall, across]) if walls else np.concatenate([ground, bush])
+            scans.append(RawScan(seen.astype(np.float32), pose_from(np.eye(3), [x, 0.0, 0.0])))
+        seen = meter.measure(*scans, Calibration())
+        misfits.append(1.0 if seen is None else seen.misfit)
+    assert max(misfits) < APART
 
 
 class Steps(FaultPosterior):
