@@ -22,13 +22,16 @@ _PSEUDO = 6.0  # chance places that it counts as
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
 _MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
-_LEAST = 0.05  # probability of any outcome: one missing at few chance places is not impossible elsewhere
 _COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _MANY = 20  # places from which the second largest share is meaningful
 _CALIBRATED = 1.75
 """Factor on the number of independent observations by the scatter: searches on maps of other sites then state an error
 below e in less than a share e of them (``python -m bench.integrity.calibrate``)."""
+OPEN = 0.01
+"""Share of places that are as clear of structure and as level as the right one, presumed: open roads."""
+PRESUMED = 1.0 / OPEN
+"""Chance places that the presumed share counts as: one of them is open."""
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
 _TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
@@ -53,12 +56,14 @@ class Background:
         passed: probability that a free point lies on map structure.
         ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
         number: effective numbers of independent structure points and of free points.
+        open: probability that a chance place is as clear and level as the right one; (Q, L) by the nuisances' values.
     """
 
     structure: Floats
     passed: float
     ground: tuple[float, float]
     number: tuple[float, float]
+    open: float | Floats = OPEN
 
 
 def outcomes(observed: Floats32) -> Floats:
@@ -120,9 +125,8 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     most = most or Most()
     counts = outcomes(now)
     total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
-    structure = np.maximum(total / total.sum(), _LEAST)
+    structure = total / total.sum()
     passed = float(np.clip(now[:, Share.PASSED].mean(), *_PASSED)) if len(now) else 0.05
-    structure = structure / structure.sum()
     chance = np.append(np.cumsum(structure[:3]), passed)
     chance = chance * (1.0 - chance)
     count = np.where(np.isfinite(variance), len(now), 0)

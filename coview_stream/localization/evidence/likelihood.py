@@ -13,7 +13,7 @@ their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that ex
 as q >= 0. Points outside the survey add nothing; a rival that covers them gains.
 
 The ground counts as one observation, as a road is level everywhere: its share is compared with the Beta distribution of
-the chance places' shares. One chance place in a hundred counts as clear and level as the right one.
+the chance places' shares. Some chance places are as clear and level as the right one (:func:`open_shares`).
 
 The prior is even between "one of these places" and "none of these" (outside the map, a wrong map, a rearranged site),
 and falls with a place's rank in the votes. Likelihoods are against chance, so "none of these" has the likelihood 1.
@@ -23,14 +23,13 @@ N / R equally good ones by chance, in expectation.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.distributions import log_beta
-from coview_stream.localization.evidence.background import Background, outcomes
+from coview_stream.localization.evidence.background import OPEN, PRESUMED, Background, outcomes
 from coview_stream.localization.evidence.observation import Share
 
 KEPT = np.linspace(0.05, 1.0, 20)  # shares q
@@ -49,7 +48,6 @@ _EDGES = _SURVEYS[:, 2] / _SURVEYS[:, :3].sum(axis=1)  # share of the explained 
 _EDGES_WIDTH = 0.1  # excess of that share over chance's by which a survey's odds fall e-fold
 _LEAKS = np.array([0.05, 0.3, 0.6])  # rays through unchanged structure, as a share of the background's
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
-_OPEN = 0.01  # share of chance places that are as clear of structure and as level as the right one: an open road
 _EDGE = 0.02  # shares of the ground are clipped to this margin
 
 NUISANCES = (len(KEPT), len(_SURVEYS), len(_LEAKS))
@@ -88,6 +86,22 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     q = KEPT[:, None, None]
     explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
     structure = np.einsum("pc,qdc->pqd", counts, np.log(explained / background.structure)) * background.number[0]
+    rest = _clear_and_level(observed, background)
+    rest -= np.logaddexp(np.log1p(-background.open), np.log(background.open) + rest)  # a chance place may be open, too
+    return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
+
+
+def open_shares(chance: Floats32, background: Background) -> Floats:
+    """Return the probability (Q, L) that a chance place is as clear and level as the right one, by the nuisances.
+
+    It is the mean responsibility of open places at the chance places (P, 7), and of :data:`PRESUMED` more.
+    """
+    odds = OPEN * np.exp(np.minimum(_clear_and_level(chance, background), 500.0))
+    return np.asarray(((odds / (1.0 - OPEN + odds)).sum(axis=0) + OPEN * PRESUMED) / (len(chance) + PRESUMED))
+
+
+def _clear_and_level(observed: Floats32, background: Background) -> Floats:
+    """Return log-likelihood ratios (P, Q, L) of free space and ground against a chance place that is not open."""
     passed = background.passed * (KEPT[:, None] * _LEAKS + 1.0 - KEPT[:, None])  # (Q, L)
     hit = observed[:, Share.PASSED].astype(np.float64)
     covered = np.maximum(observed[:, Share.COVERED], observed[:, Share.COVERED_GROUND])
@@ -103,9 +117,7 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     gain, usual = (_beta(x, *_GROUND) - _beta(x, a, b) for x in (share, mean))
     # a place rougher than chance gets no more than one like chance, however rare it is
     level = np.clip(ground, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain)
-    rest = free + level[:, None, None]
-    rest -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + rest)  # a chance place, too, may be on an open road
-    return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
+    return np.asarray(free + level[:, None, None])
 
 
 def _beta(x: Floats, a: float, b: float) -> Floats:

@@ -19,7 +19,12 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
-from coview_stream.localization.evidence.likelihood import expected_by_chance, log_likelihood_ratios, posterior
+from coview_stream.localization.evidence.likelihood import (
+    expected_by_chance,
+    log_likelihood_ratios,
+    open_shares,
+    posterior,
+)  # fmt: skip
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
 from coview_stream.localization.search.consensus import Hypothesis
@@ -30,7 +35,7 @@ _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # places that stay by their evidence, at any rank at the newest keyframe
 _KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones farthest apart
 _NEWEST = 8  # keyframes that are searched for a moved part
-_CHANCE = 128  # places that measure the correlation of chance over keyframes
+_CHANCE = 112  # places that measure the correlation of chance over keyframes
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
@@ -270,8 +275,10 @@ class PlaceScorer:
         history = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
-            history[row >= 0] = before.observed[row[row >= 0]]
-            history[row < 0] = self._look_back(T[newest[row < 0]])
+            # a pose that more keyframes have moved is better: the best places are looked up anew from there
+            anew = row < min(_KEPT, count)
+            history[~anew] = before.observed[row[~anew]]
+            history[anew] = self._look_back(T[newest[anew]])
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
         return _Followed([place for _, place in chosen], votes, shares, newest)
 
@@ -300,7 +307,9 @@ class PlaceScorer:
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             spread = np.mean(measured, axis=0) * left_in_mean(over_time[chance[sample]])
-            background = estimate_background(observed.shares[first][chance], spread, mean[distant], most)
+            now = observed.shares[first][chance]
+            background = estimate_background(now, spread, mean[distant], most)
+            background = replace(background, open=open_shares(now, background))
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break

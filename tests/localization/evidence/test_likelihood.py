@@ -31,6 +31,7 @@ from coview_stream.localization.evidence.likelihood import (
     expected_by_chance,
     log_likelihood_ratios,
     nuisance_prior,
+    open_shares,
     posterior,
 )
 from coview_stream.localization.evidence.observation import Share
@@ -71,7 +72,7 @@ def plain_sum(row, background):
         free = background.number[1] * passed * math.log(hit / background.passed)
         free += background.number[1] * clear * math.log((1 - hit) / (1 - background.passed))
         beside = free + ground
-        log += beside - math.log(1 - likelihood._OPEN + likelihood._OPEN * math.exp(beside))
+        log += beside - math.log(1 - background.open + background.open * math.exp(beside))
         total += math.exp(log) * q / sum(likelihood.KEPT) * kind / len(likelihood._LEAKS)
     return math.log(total)
 
@@ -142,6 +143,23 @@ def test_ground_is_one_observation_and_bounded(background):
     assert np.isfinite(grounds).all()
     assert grounds[-3] >= grounds[0]
     assert (np.diff(grounds) >= -1.0).all()
+
+
+def test_open_places_among_chance_make_another_open_one_worth_less():
+    """One in a hundred is presumed; chance places that are rough, or open, say more."""
+    known = Background(CHANCE, PASSED, (0.8, 8.0), (30.0, 60.0))
+    rough = observation(np.tile(CHANCE, (300, 1)), passed=PASSED, ground=0.05)
+    clear = observation(np.tile(CHANCE, (300, 1)), passed=0.0, ground=0.95)
+    assert open_shares(rough[:0], known) == pytest.approx(0.01)
+    assert open_shares(rough, known) == pytest.approx(1 / 400, rel=0.05)
+    some = open_shares(np.concatenate([rough[:285], clear[:15]]), known)
+    assert some == pytest.approx(16 / 400, rel=0.01)
+    few, usual, many = (
+        ratio([GOOD], passed=0.0, ground=0.95, background=replace(known, open=share))[0]
+        for share in (open_shares(rough, known), 0.01, some)
+    )
+    assert few > usual + 1.0
+    assert many < usual - 1.0
 
 
 def test_few_explained_points_of_a_changed_site_are_worth_something():
@@ -236,6 +254,7 @@ def smallest_error(places, rng, times=1.0):
             spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
             known = estimate_background(now[others], spread, mean[others])
             known = replace(known, number=(times * known.number[0], times * known.number[1]))
+            known = replace(known, open=open_shares(now[others], known))
             ratios = log_likelihood_ratios(mean, known)
             if not last:  # the leader is not among what it is compared with
                 others = np.arange(count) != np.argmin(np.log1p(votes) - ratios)
