@@ -146,7 +146,8 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
         times = best.probability / max(second.probability, 1e-300)
         ratio = f"{times:,.0f}" if times < 1e6 else "over 1,000,000"
         lead = "equally" if times < 1.5 else f"the first is {ratio} times as probable"
-        return State.AMBIGUOUS, f"two places fit: {lead}"
+        left = scored.left
+        return State.AMBIGUOUS, f"{left if left > 2 else 'two'} places fit: {lead}"
     if scored.error >= 0.5:
-        return State.AMBIGUOUS, "several places fit, none is more likely than all others"
+        return State.AMBIGUOUS, f"{max(2, scored.left)} places fit, none is more likely than all others"
     return State.AMBIGUOUS, f"one place leads: wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"

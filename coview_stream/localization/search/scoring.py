@@ -85,6 +85,13 @@ class Scored:
     second: Hypothesis | None = None
     moved: MovedPart = NO_PART
 
+    @property
+    def left(self) -> int:
+        """Number of equally probable places that are as uncertain as these (the exponential of their entropy)."""
+        probability = np.array([place.probability for place in self.places])
+        share = probability[probability > 0.0] / max(float(probability.sum()), 1e-300)
+        return round(float(np.exp(-(share * np.log(share)).sum())))
+
     def doubted(self, moved: MovedPart) -> Scored:
         """Add the error by a moved part: either part may be the unmoved one."""
         return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)

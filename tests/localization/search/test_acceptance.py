@@ -49,6 +49,11 @@ def two(first, second, T, **more):
         (two(0.5, 0.49, moved(0, 180), error=0.5), "two places fit: equally"),
         (two(0.5, 0.5, moved(20), undecided=1.14), "two places fit: equally"),
         (two(0.98, 0.02, moved(20), error=0.02), "two places fit: the first is 49 times as probable"),
+        (judged(*(place(0.3, moved(20 * k)) for k in range(3)), error=0.7), "3 places fit: equally"),
+        (
+            judged(place(0.2), *(place(0.06, moved(20 * k)) for k in range(1, 7)), error=0.8),
+            "6 places fit, none is more likely than all others",
+        ),
         (two(0.99, 0.001, moved(20), error=0.01), "one place leads: wrong 1 in 100, 1 in 10,000 needed"),
         (
             judged(place(1.0), error=1e-12, undecided=1.14),
