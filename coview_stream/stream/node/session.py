@@ -13,7 +13,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.map_parts import MapParts
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import MessageError
+from coview_stream.errors import InputError, MessageError
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.state import State
@@ -166,12 +166,17 @@ class Session:
     def guess_place(self, guess: PlaceGuess) -> bool:
         """Have the search try a guess; return False, and do nothing, while a place is known.
 
-        InputError: one of several maps has to be named, and none of that name is there, or it has no ground there.
+        InputError: one of several maps has to be named, and none of that name is there, or one of one map is named, or
+        it has no ground there.
         """
         if self.parts is not None:
             part = self.parts.named(guess.map)
             x, y = guess.x + part.shift[0], guess.y + part.shift[1]
             guess = replace(guess, x=x, y=y, map=None, begin=part.begin, end=part.end)
+        elif guess.map is not None:
+            raise InputError(
+                f"initial pose: it is in frame {guess.map!r}; set RViz' fixed frame to 'map', or name none"
+            )
         if self._base_map is not None:
             require_ground(guess, self._base_map)
         with self.lock:

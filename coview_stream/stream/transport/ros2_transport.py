@@ -86,13 +86,17 @@ class _Robot:
         self.odometry_frame, self.body_frame = frame, ros2.frame_id(sample.payload, 1)
         return sample
 
-    def check_guess(self, sample: Sample) -> Sample:
-        """Refuse an initial pose in odometry's frame or the body's."""
-        frame = ros2.frame_id(sample.payload)
-        if frame and frame in (self.odometry_frame, self.body_frame):
-            text = f"an initial pose in frame {frame!r}: set RViz' fixed frame to {self.map_frame!r}"
-            return _refused(sample, text)
-        return sample
+    def clock(self, now_ns: int) -> str:
+        """Return how the stamps contradict the node's clock; empty if they do not."""
+        if self.newest_ns is None:
+            return ""
+        if not now_ns:
+            return "use_sim_time is set and nothing comes on /clock"
+        late = (now_ns - self.newest_ns) / 1e9
+        if abs(late) <= _CACHE:
+            return ""
+        side = "before" if late > 0 else "after"
+        return f"stamps lie {abs(late):.0f} s {side} this node's clock: is use_sim_time as the sender's?"
 
 
 def _refused(sample: Sample, reason: str) -> Sample:
@@ -103,7 +107,7 @@ def _refused(sample: Sample, reason: str) -> Sample:
 class _Input:
     topic: str
     kind: str
-    check: Callable[[Sample], Sample]
+    check: Callable[[Sample], Sample] = lambda sample: sample
     then: Callable[[], None] = lambda: None  # after it has been handed on
 
 
@@ -182,7 +186,7 @@ class Ros2Transport:
             keys.odometry: _Input(
                 f"/{keys.odometry}", ros2.ODOMETRY, robot.check_odometry, lambda: self._broadcast(robot)
             ),
-            keys.initial_pose: _Input(prefix + _GUESS_TOPIC, ros2.POSE, robot.check_guess),
+            keys.initial_pose: _Input(prefix + _GUESS_TOPIC, ros2.POSE),
         }
         self._writers |= {
             keys.pose: lambda payload: self._write_pose(robot, payload),
@@ -357,7 +361,7 @@ class Ros2Transport:
         if status["map_sha256"] != self._shown:
             self._shown = status["map_sha256"]
             self._map_wanted.put(Sample("map", b""))
-        clock = self._clock(robot, now_ns)
+        clock = robot.clock(now_ns)
         if clock and not robot.clock_said:
             _log.warning("%s: %s", robot.keys.robot, clock)
         robot.clock_said = bool(clock)
@@ -368,18 +372,6 @@ class Ros2Transport:
         else:
             transform = f"frozen for {time.monotonic() - robot.posed_at:.0f} s"
         self._diagnostics.publish(ros2_outputs.encode_diagnostics(status, now_ns, transform, clock))
-
-    def _clock(self, robot: _Robot, now_ns: int) -> str:
-        """Return how the stamps contradict this node's clock; empty if they do not."""
-        if robot.newest_ns is None:
-            return ""
-        if not now_ns:
-            return "use_sim_time is set and nothing comes on /clock"
-        late = (now_ns - robot.newest_ns) / 1e9
-        if abs(late) <= _CACHE:
-            return ""
-        side = "before" if late > 0 else "after"
-        return f"stamps lie {abs(late):.0f} s {side} this node's clock: is use_sim_time as the sender's?"
 
     def _publish_map(self) -> None:
         """Publish the map's points for all who subscribe, also later."""

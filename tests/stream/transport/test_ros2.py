@@ -280,7 +280,7 @@ def test_sim_time_comes_from_the_clock_topic(robot):
 
 
 @pytest.mark.slow
-def test_initial_pose_is_a_hypothesis_and_one_in_odometrys_frame_is_refused(robot, site):
+def test_initial_pose_is_a_hypothesis_and_one_in_another_frame_is_refused(robot, site):
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
     robot.move(ns(0.0), message(0.0).T_odom_body)
@@ -321,6 +321,21 @@ def test_publisher_of_another_type_is_named(robot, site, caplog):
     robot.until(lambda: site.net.connection() and any("sensor_msgs/msg/Imu" in line for line in caplog.messages))
     robot.until(lambda: site.net.connection().peers == ("/driver", "/imu"))
     other.close()
+
+
+@pytest.mark.slow
+def test_topics_of_two_robots_are_apart(robot):
+    keys = [robot_keys("native", "coview", n, f"{n}/points", f"{n}/odom", f"{n}/pose") for n in ("r1", "r2")]
+    net = Ros2Transport(start_node(["-r", "__ns:=/hall"]), keys)
+    try:
+        for k in keys:
+            for key in (k.cloud, k.odometry, k.initial_pose):
+                net.subscribe(key, print, "all")
+        wanted = {"/diagnostics", *(f"/{n}/{t}" for n in ("r1", "r2") for t in ("points", "odom", "pose"))}
+        wanted |= {"/hall/r1/initialpose", "/hall/r2/initialpose"}
+        robot.until(lambda: wanted <= {name for name, _ in robot.node.get_topic_names_and_types()})
+    finally:
+        net.close()
 
 
 def test_type_hashes_are_those_of_rclpy(robot):
