@@ -328,7 +328,7 @@ def from_stream(
             if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
                 located.keyframes.append(evidence)
     if live := [status for status in statuses if "counters" in status and not status["node"]["ending"]]:
-        located.node_reason = live[-1]["reason"] + _dropped(live[-1]["counters"], len(stamps))
+        located.node_reason = _dropped(live[-1]["counters"], len(stamps)) + live[-1]["reason"]
     return located
 
 
@@ -340,7 +340,7 @@ def _dropped(counters: dict[str, int], frames: int) -> str:
         (counters["searches_skipped"], searches, "keyframes to search for"),
     ]
     said = [f"{number} of {total} {name}" for number, total, name in parts if number]
-    return f"; the machine had no time for {' and '.join(said)}" if said else ""
+    return f"the machine had no time for {' and '.join(said)}; " if said else ""
 
 
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:

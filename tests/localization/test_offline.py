@@ -210,6 +210,6 @@ def test_run_without_a_pose_has_the_nodes_last_reason_and_the_work_that_it_had_n
     idle = [status("waiting for clouds"), status("too little has been seen"), end]
     assert from_stream([0.0, 0.1], [], idle).reason == "too little has been seen"
     busy = [status("too little has been seen", dropped=1, searches_skipped=3), end]
-    late = "; the machine had no time for 1 of 2 frames and 3 of 4 keyframes to search for"
-    assert from_stream([0.0, 0.1], [], busy).reason == f"too little has been seen{late}"
+    late = "the machine had no time for 1 of 2 frames and 3 of 4 keyframes to search for"
+    assert from_stream([0.0, 0.1], [], busy).reason == f"{late}; too little has been seen"
     assert from_stream([0.0, 0.1], [], []).reason == ""
