@@ -73,6 +73,7 @@ class BaseMap:
             self.sources: dict[str, str] = dict(parameters["sources"])
             if not isinstance(self.crs, str | None):
                 raise TypeError("crs is no text")
+            json.dumps(parameters, ensure_ascii=False).encode()  # no half of a surrogate pair: can be printed
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise MapError(f"the map's parameters cannot be read ({error}); build it again") from error
         self.arrays, self.parameters, self.sha256 = arrays, parameters, sha256

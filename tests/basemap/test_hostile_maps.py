@@ -141,7 +141,8 @@ def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path)
     "parameters",
     [
         None, [], "x", {}, {"config": None}, {"config": []}, {"config": {}}, {"sources": [1, 2]}, {"sources": "ab"},
-        {"sources": None}, {"crs": 7}, {"config": {"descriptor": {"channels": ["coview"], "radius": -1.0}}},
+        {"sources": None}, {"crs": 7}, {"crs": "\ud800"},
+        {"config": {"descriptor": {"channels": ["coview"], "radius": -1.0}}},
         {"config": {"descriptor": {"channels": ["coview"], "colour": 1}}},
     ],
 )  # fmt: skip

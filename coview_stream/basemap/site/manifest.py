@@ -209,6 +209,7 @@ class Manifest:
             if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
                 raise ValueError("tile, crs or parameters are invalid")
             _check_depth(parameters, _MAX_DEPTH)
+            json.dumps([crs, parameters], ensure_ascii=False).encode()  # no half of a surrogate pair: can be printed
             grid = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
             if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
                 raise ValueError("a tile is named twice")

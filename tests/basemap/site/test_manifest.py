@@ -51,7 +51,8 @@ def test_manifest_of_the_version_before_keeps_its_hash(tmp_path):
         (("parameters", "config", "descriptor", "radius"), 900.0),
         (("tiles", 0, "stations"), 410_000), (("tiles", 0, "layers", "cloud", "bytes"), 1 << 25),
         (("tiles", 0, "points"), 400),
-        (("parameters", "x"), float("nan")), (("parameters", "x"), float("-inf")),
+        (("crs",), "\ud800"), (("parameters", "sources"), {"\udfff": "a"}), (("parameters", "x"), float("nan")),
+        (("parameters", "x"), float("-inf")),
     ],
 )  # fmt: skip
 def test_manifest_with_something_else_is_refused(path, value):
