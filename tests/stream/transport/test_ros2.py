@@ -23,8 +23,8 @@ from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
 from coview_stream.geometry.transforms import transform as transform_points
 from coview_stream.messages import ros2, ros2_outputs
-from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.rmw import type_hash
+from coview_stream.stream.transport.keys import matches, robot_keys
+from coview_stream.stream.transport.rmw import dds_type, publisher_token, type_hash
 from coview_stream.stream.transport.ros2_node import settings_of, start_node
 from coview_stream.stream.transport.ros2_transport import Ros2Transport
 
@@ -347,6 +347,21 @@ def test_type_hashes_are_those_of_rclpy(robot):
         assert str(end.topic_type_hash).endswith(type_hash(kind).removeprefix("RIHS01_"))
 
 
+def test_keys_of_rmw_zenoh_are_those_of_another_library():
+    pamoja = pytest.importorskip("pamoja.ros2", reason="pip install pamoja-ros2")
+    ours = robot_keys("rmw_zenoh", "coview", "rover1", domain=7)
+    assert ours.pose == pamoja.entity_key(7, "/rover1/coview/pose", ros2.POSE, type_hash(ros2.POSE))
+    for kind, topic, wanted in (
+        (ros2.CLOUD, "/rover1/points", ours.cloud),
+        (ros2.ODOMETRY, "/rover1/odom", ours.odometry),
+    ):
+        assert matches(wanted, pamoja.entity_key(7, topic, kind, type_hash(kind)))
+        assert dds_type(kind) == pamoja.dds_type_name(kind)
+        assert pamoja.type_hash_digest(type_hash(kind)) is not None
+    token = publisher_token(ours.pose, "ab", "coview_stream", 1)
+    assert pamoja.percent_mangle("/rover1/coview/pose") in token.split("/")
+
+
 def test_bag_of_rclpys_bytes_is_a_run(ros, tmp_path):
     from nav_msgs.msg import Odometry
     from rclpy.serialization import serialize_message
@@ -421,6 +436,7 @@ def test_without_rclpy_the_message_names_the_extra():
         start_node(())
 
 
+@pytest.mark.slow
 def test_rclpy_of_another_python_is_named(tmp_path):
     (tmp_path / "rclpy").mkdir()
     (tmp_path / "rclpy/__init__.py").write_text("")
