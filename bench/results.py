@@ -5,7 +5,8 @@ its command, date, machine and the commit of the code (``+``: with uncommitted c
 own.
 
 ``python -m bench release --work DIR [--quick]`` makes a page of one code, for a release: a table is kept in DIR as soon
-as it is there, a second call goes on with those that are missing, and the page is written once all are of one code.
+as it is there, a second call goes on with those that are missing, and the page is written once all are of one code
+(in DIR, if they are quick). Tables that no command makes any more are not taken over.
 """
 
 from __future__ import annotations
@@ -166,8 +167,10 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
     missing = [name for name, file in files.items() if not file.is_file()]
     print(f"code {code}: {len(files) - len(missing)} of {len(files)} tables; missing: {', '.join(missing) or 'none'}")
     if not missing:
-        with atomic_path(asked.page) as file:
+        page = tables / "results.md" if asked.quick else asked.page
+        with atomic_path(page) as file:
             file.write_text(introduction(asked.page) + "".join(file.read_text() for file in files.values()))
+        print(page)
     return int(bool(missing))
 
 

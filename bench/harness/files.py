@@ -80,7 +80,7 @@ def fingerprint(*parts: str) -> str:
 
 @functools.cache
 def code_of(content: bytes, suffix: str = ".py") -> bytes:
-    """Return what the interpreter gets of a Python source; any other file as it is."""
+    """Return the instructions of a Python source, the same for every comment and layout; any other file as it is."""
     return repr(_operations(compile(content, "", "exec", optimize=2))).encode() if suffix == ".py" else content
 
 

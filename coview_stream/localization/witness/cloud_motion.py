@@ -112,7 +112,7 @@ class CloudMotionMeter:
             unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit_of(scan, target, odometry), usual, None)
             return unknown if unknown.misfit > APART else None
         if self._usual is None:
-            self._usual = best[2] / max(flat, ALIKE)
+            self._usual = min(1.0, best[2] / max(flat, ALIKE))  # on no surfaces does a cloud lie better than on its own
         usual = flat * self._usual
         self._usual += _LEARNS * (best[2] - usual)
         T_now = pose_from(best[0][:3, :3] @ now.T_odom_body[:3, :3], before.position + best[0][:3, 3])

@@ -85,6 +85,21 @@ def test_foliage_is_no_cloud_of_another_place():
     assert max(misfits) < APART
 
 
+def test_a_sparse_first_cloud_makes_no_later_one_unusual():
+    """A cloud of few points has no surfaces of its own, which says nothing about how well clouds fit usually."""
+    rng = np.random.default_rng(6)
+    wall = np.column_stack([rng.uniform(-15.0, 15.0, 3000), rng.normal(6.0, 0.02, 3000), rng.uniform(-1.5, 4.0, 3000)])
+    cloud = np.concatenate([wall, wall[:, [1, 0, 2]]])
+    meter, misfits = CloudMotionMeter(RegistrationConfig()), []
+    for step in (10, 1, 1, 1):
+        before = RawScan(cloud.astype(np.float32), np.eye(4))
+        now = RawScan(cloud[::step].astype(np.float32), pose_from(np.eye(3), [0.5, 0.0, 0.0]))
+        motion = meter.measure(before, now, Calibration())
+        assert motion is not None
+        misfits.append(motion.misfit)
+    assert max(misfits[1:]) < APART
+
+
 class Steps(FaultPosterior):
     """Note of the steps that a witness compares."""
 
