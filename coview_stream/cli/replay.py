@@ -40,7 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
     add_shared(parser, "--mount", "--cloud-topic", "--odometry-topic")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait for a node that is ready (10)")
+    parser.add_argument(
+        "--wait",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="wait for a node (10), then up to 120 s until its engines are ready; 0: for neither",
+    )
     add_shared(parser, "--progress")
     parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 

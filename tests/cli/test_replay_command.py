@@ -170,28 +170,23 @@ def test_bad_replay_usage_is_one_line(run_folder, refused, options, text):
 @pytest.mark.slow
 def test_replay_waits_until_the_node_is_ready(node, run_folder, capsys):
     """A node subscribes before its engines have opened the map; clouds that come earlier are lost."""
-    began, sent_before = threading.Event(), []
-
-    def health(ok):
-        return {"robots": {"r1": {}}, "ready": {"ok": ok, "reasons": []}}
+    sent_before = []
 
     def start():
-        publisher = node.transport.publisher("coview/@node/x/out/health", "report")
+        key = "coview/@node/x/out/health"
+        publisher = node.transport.publisher(key, "report")
+        node.transport.await_subscriber(key, 20.0)
         for ok in (False, False, False, False, True):
-            if ok:
-                sent_before.extend(node.sent)
-            publisher.put(Encoded(json.dumps(health(ok)).encode(), "application/json"))
             time.sleep(0.3)
+            sent_before.append(len(node.sent))
+            health = {"robots": {"r1": {}}, "ready": {"ok": ok, "reasons": []}}
+            publisher.put(Encoded(json.dumps(health).encode(), "application/json"))
 
-    def asked(parameters):
-        if not began.is_set():
-            began.set()
-            threading.Thread(target=start, daemon=True).start()
-        return health(False)
-
-    node.transport.answer("coview/@node/x/rpc/health", asked)
     node.subscribe()
+    engines = threading.Thread(target=start, daemon=True)
+    engines.start()
     assert node.replay(run_folder, "--rate", "50") == 0
+    engines.join()
     until(lambda: len(node.clouds()) == 6)
-    assert not sent_before
+    assert sent_before == [0] * 5
     assert "not ready" not in capsys.readouterr().err

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from coview_stream.errors import CloudError, ConfigError, TransportError
+from coview_stream.errors import CloudError, ConfigError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, interpolate
 from coview_stream.messages.json_messages import read_object
@@ -120,7 +120,7 @@ def _period(times: Floats, single: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else single
 
 
-_SILENT = 2.5  # seconds: a node tells of its health once a second
+_SILENT = 3.0  # seconds: a node tells of its health once a second
 
 
 def await_engines(
@@ -128,8 +128,8 @@ def await_engines(
 ) -> bool:
     """Wait up to ``seconds`` until a node that serves a robot tells that its engines are ready; False if none has.
 
-    Nothing is waited for where no node answers: another program has subscribed. ``wait`` as of
-    :meth:`Transport.await_subscriber`.
+    Where no node tells of its health for three seconds, another program has subscribed, and nothing more is waited
+    for. ``wait`` as of :meth:`Transport.await_subscriber`; where it ends the wait, this is True.
     """
     told = dict[str, bool]()  # by key, of the nodes that serve the robot
 
@@ -138,17 +138,14 @@ def await_engines(
         if robot in document.get("robots", ()):
             told[sample.key] = document["ready"]["ok"] is True
 
-    nodes = node_keys(base, ANY)
-    end = transport.subscribe(nodes.health, hear, "all")
+    end = transport.subscribe(node_keys(base, ANY).health, hear, "all")
     try:
-        transport.query(nodes.ask_health, timeout=min(_SILENT, seconds))
         begin = time.monotonic()
-        while not any(told.values()):
-            waited = time.monotonic() - begin
-            if waited >= (seconds if told else min(_SILENT, seconds)) or wait(0.1):
+        while True not in tuple(told.values()):
+            if time.monotonic() - begin >= (seconds if told else _SILENT):
                 return not told
-    except TransportError:
-        pass  # no node, or one that does not answer
+            if wait(0.1):
+                break
     finally:
         end()
     return True
