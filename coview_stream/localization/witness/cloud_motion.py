@@ -110,7 +110,8 @@ class CloudMotionMeter:
         if best[0] is None:
             usual = flat * (self._usual or 0.0)
             unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit_of(scan, target, odometry), usual, None)
-            return unknown if unknown.misfit > APART else None
+            # as many pairs as a registration takes have to be possible
+            return unknown if unknown.misfit > APART and flat * int(scan.above.sum()) >= MIN_PAIRS else None
         if self._usual is None:
             self._usual = min(1.0, best[2] / max(flat, ALIKE))  # on no surfaces does a cloud lie better than on its own
         usual = flat * self._usual
