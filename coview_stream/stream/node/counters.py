@@ -79,12 +79,13 @@ class ErrorLog:
         self.texts: deque[str] = deque(maxlen=_MAX_ERRORS)
         self._logged: set[str] = set()
 
-    def add(self, text: str, logged: bool = True) -> None:
-        """Add an error unless it is there already; ``logged``: log it as well, once."""
+    def add(self, text: str, logged: bool = True, kind: str | None = None) -> None:
+        """Add an error unless it is there already; ``logged``: log it as well, once, or the first one of its kind."""
         if text not in self.texts:
             self.texts.append(text)
-            if logged and len(self._logged) < _MAX_LOGGED and text not in self._logged:
-                self._logged.add(text)
+            kind = kind or text
+            if logged and len(self._logged) < _MAX_LOGGED and kind not in self._logged:
+                self._logged.add(kind)
                 log.warning("%s", text)
 
     def clear(self) -> None:
@@ -95,7 +96,7 @@ class ErrorLog:
         """Add only the first error of a kind whose texts all differ."""
         start = f"{kind}; the first: "
         if not any(earlier.startswith(start) for earlier in self.texts):
-            self.add(start + text)
+            self.add(start + text, kind=kind)
 
 
 class Latency:

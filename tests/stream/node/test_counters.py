@@ -1,10 +1,10 @@
-"""Missing frames, latencies, and the deadlines of regular work."""
+"""Errors, missing frames, latencies, and the deadlines of regular work."""
 
 from __future__ import annotations
 
 import pytest
 
-from coview_stream.stream.node.counters import Latency, MissingFrames, PoseRate, Rate
+from coview_stream.stream.node.counters import ErrorLog, Latency, MissingFrames, PoseRate, Rate
 
 FRAME = 100_000_000  # ns
 
@@ -91,3 +91,17 @@ def test_slack_catches_up_late_ticks():
     assert not rate.take_tick(0.2)
     assert rate.remaining(0.2) == pytest.approx(0.01)
     assert rate.remaining(0.3) == 0.0
+
+
+def test_kind_of_error_is_logged_once_however_often_it_begins_again(caplog):
+    """A robot that is lost and found in turns, with a bad message each time, must not use up what may be logged."""
+    errors = ErrorLog()
+    for k in range(30):
+        errors.add_first("r1: malformed messages", f"{k} bytes")
+        assert errors.texts[-1].endswith(f"; the first: {k} bytes")
+        errors.clear()
+    errors.add_first("r1: failed searches", "out of memory")
+    assert caplog.messages == [
+        "r1: malformed messages; the first: 0 bytes",
+        "r1: failed searches; the first: out of memory",
+    ]
