@@ -340,6 +340,15 @@ class EngineQueue:
         self._request = request
         self._requested_at = now if self._requested_at is None else self._requested_at
 
+    def pending_search(self, now: float) -> str:
+        """Return how long the search that waits or runs has taken, and the frames dropped so far; empty for none."""
+        since = self._requested_at if self._searching_since is None else self._searching_since
+        if since is None:
+            return ""
+        dropped, received = self._counters.dropped, self._counters.received
+        behind = f": this machine is too slow or busy, {dropped} of {received} clouds were dropped" if dropped else ""
+        return f"a search of the map waits or runs since {max(0.0, now - since):.0f} s{behind}"
+
     @property
     def search_demand(self) -> SearchDemand | None:
         """Demand for a search; None without a keyframe, or while a search is under way. Without the lock."""

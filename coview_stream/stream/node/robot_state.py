@@ -122,8 +122,11 @@ class RobotState:
 
     # ---- published
 
-    def reason(self) -> str | None:
-        """Return one clause that gives the reason of the state; None before the first frame has been processed."""
+    def reason(self, pending: str = "") -> str | None:
+        """Return one clause that gives the reason of the state; None before the first frame has been processed.
+
+        ``pending`` is the search that has not ended, which is the reason where none has.
+        """
         evidence = self.evidence.reason if self.evidence else ""
         if self.state is State.TRACKING:
             return evidence
@@ -133,7 +136,7 @@ class RobotState:
             return "verifying the place after a pause of odometry"
         if self.last_frame_ns is None:
             return None
-        return evidence or self._restart_reason or "too little has been seen"
+        return evidence or self._restart_reason or pending or "too little has been seen"
 
     def searched(self) -> str:
         """Return why a place that was lost is not found again; empty where nothing has been searched since."""

@@ -290,7 +290,7 @@ class Session:
     def state(self) -> tuple[State, str]:
         """Return the state and one clause that gives its reason."""
         with self.lock:
-            state, reason = self.robot_state.state, self.robot_state.reason()
+            state, reason = self.robot_state.state, self.robot_state.reason(self.queue.pending_search(self._now))
             if reason is None:
                 reason = self.inputs.waiting_for()
             elif not state.has_place:

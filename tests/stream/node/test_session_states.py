@@ -370,6 +370,24 @@ def test_clouds_whose_stamp_stands_are_named_within_five_seconds(robot, stamp):
     assert re.search(r"clouds come with no stamp after [\d.]+ s for [2-5] s|no common stamps", reason(robot))
 
 
+def test_first_search_that_takes_long_is_the_reason_until_it_ends(robot):
+    robot.frame(0.0, unknown, reason="")
+    assert reason(robot) == "too little has been seen"
+    robot.frame(0.1, unknown, reason="", ask=search_request(0.1))
+    robot.session.tick(robot.now)
+    assert reason(robot) == "a search of the map waits or runs since 0 s"
+    job = robot.session.take_job("search")
+    for k in range(2, 362):
+        robot.moved(0.1 * k)
+        robot.saw(0.1 * k - 0.05)
+    robot.session.tick(robot.now)
+    behind = ": this machine is too slow or busy, 359 of 362 clouds were dropped"
+    assert reason(robot) == f"a search of the map waits or runs since 36 s{behind}"
+    robot.session.handle_result(job, search_result(), robot.now)
+    robot.answered(unknown, reason="two places fit")
+    assert reason(robot) == "two places fit"
+
+
 def test_odometry_whose_stamp_stands_is_named_where_a_place_was_lost_for_it(robot):
     robot.frame(1.0)
     assert state(robot) is State.TRACKING
