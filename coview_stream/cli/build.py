@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from coview_stream.cli.map_argument import check_map_name
+from coview_stream.errors import CoViewError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import SigningKey
@@ -34,6 +35,7 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
 Clouds: TypeAlias = "Sequence[str | os.PathLike[str]]"
 
 _FIELDS = {"block_size": "block"}
+_STDIN = {"-", "/dev/stdin", "/dev/fd/0"}
 _MAX_WORKERS = 8  # by default: each may take 2 GB
 
 # of two airborne towns, 1.0 and 1.5 km2 of 3.6 and 3.2 points/m2, on two cores
@@ -208,11 +210,14 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
     Raises:
         ConfigError: a malformed window. CloudError: a file cannot be fetched, or is no COPC file and has a window.
     """
-    if "-" in given:
+    if not _STDIN.isdisjoint(given):
         with tempfile.TemporaryDirectory(prefix="coview-clouds-") as folder:
             read = str(_read_stdin(Path(folder)))
-            with local_clouds([read if name == "-" else name for name in given], window) as clouds:
-                yield clouds
+            try:
+                with local_clouds([read if name in _STDIN else name for name in given], window) as clouds:
+                    yield clouds
+            except CoViewError as error:  # names the file that nobody has given
+                raise type(error)(str(error).replace(read, "stdin")) from error
         return
     from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address
     from coview_stream.clouds.files import expand_cloud_paths
@@ -249,6 +254,8 @@ def _read_stdin(folder: Path) -> Path:
         shutil.copyfileobj(sys.stdin.buffer, file)
     with path.open("rb") as file:
         suffix = suffix_of_content(file.read(512))
+    if not path.stat().st_size:
+        raise CloudError("stdin: nothing came (0 bytes)")
     if suffix is None:
         raise CloudError("-: stdin is no cloud of a format that its first bytes tell; write it to a file")
     return path.rename(path.with_suffix(suffix))

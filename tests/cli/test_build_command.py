@@ -207,6 +207,13 @@ def test_large_build_says_how_long_it_takes(tmp_path, capsys):
     assert re.search(r"0\.0 million points on 2 km2: 3 min .* a map of 0\.7 GB", capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("name", ["-", "/dev/stdin"])
+def test_stdin_that_is_no_cloud_is_called_stdin(tmp_path, monkeypatch, refused, name):
+    for sent, found in ((b"", "stdin: nothing came (0 bytes)"), (b"hello\n", "stdin: no point in the first 100 lines")):
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(sent)))
+        assert f"error: {found}" in refused("build", name, "-o", tmp_path / "x.coview")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True], ids=["xyz", "xyz.gz"])
 def test_cloud_on_stdin_is_read_by_its_first_bytes(map_points, tmp_path, capsys, monkeypatch, refused, packed):
