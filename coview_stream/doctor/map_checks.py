@@ -89,6 +89,7 @@ _SEARCHED = 60  # frames
 _ENOUGH = 20.0  # metres: most robots are found within ten
 _BETWEEN = 0.21  # seconds, at most, between frames that are watched: odometry in between does not hide accelerations
 _WATCHED = 1500  # frames: five minutes
+_MAX_REBUILT = 5_000_000  # points of a map that is built again, in memory: a million takes a core 7 s and 0.2 GB
 
 
 def run_findings(
@@ -114,7 +115,7 @@ def run_findings(
     if lies or not wrong:
         yield from sensors
     if base_map is not None and not wrong and not lies:
-        yield place_finding(run, base_map, config)
+        yield place_finding(run, base_map, config, progress)
 
 
 def stamps_finding(run: Run) -> Finding:
@@ -160,8 +161,11 @@ def seen_frames(run: Run) -> list[SeenFrame]:
     return frames
 
 
-def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Finding:
-    """Search the map for the beginning of the run; FAIL where no place stands out after enough metres."""
+def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress: Progress | None = None) -> Finding:
+    """Search the map for the beginning of the run; FAIL where no place stands out after enough metres.
+
+    A map without a reference system may be in feet: then it is searched once more in metres, unless it is too large.
+    """
     try:
         from coview_stream.localization.localizer import Localizer
         from coview_stream.localization.state import State
@@ -174,7 +178,9 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
         localizer = Localizer(on, config)
         reason, driven = "", 0.0
         before = run.poses[0, :3, 3]
-        for index in indices:
+        for done, index in enumerate(indices, start=1):
+            if progress is not None:
+                progress(done, len(indices))
             try:
                 frame = run.read(index)
             except CloudError:
@@ -194,25 +200,32 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig) -> Findi
     if state is State.TRACKING:
         return Finding("ok", "place", f"found {text}")
     sure = driven >= _ENOUGH and state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
-    if sure and base_map.crs is None:
-        in_metres = in_feet(base_map)
+    untried = ""
+    if sure and base_map.crs is None and len(base_map.points) > _MAX_REBUILT:
+        millions = f"{len(base_map.points) / 1e6:.1f} million points to build again, {_MAX_REBUILT / 1e6:g} at most"
+        untried = f" (feet were not tried: {millions})"
+    elif sure and base_map.crs is None:
+        in_metres = in_feet(base_map, progress is not None)
         _, state, converted = (0.0, state, "") if in_metres is None else searched(in_metres)
         if state is State.TRACKING:
             found = f"the map is in feet: none on it {text}; found {converted} once it is converted"
             return Finding("FAIL", "place", found, "multiply the survey's coordinates by 0.3048, and build it again")
     remedy = (
-        "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres, "
-        "and has the site not changed? `coview-stream help reasons`"
+        "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres"
+        f"{untried}, and has the site not changed? `coview-stream help reasons`"
     )
     return Finding("FAIL" if sure else "warn", "place", f"none on this map {text}", remedy)
 
 
-def in_feet(base_map: BaseMap) -> BaseMap | None:
-    """Return the map that would have been built if its coordinates were feet; None where there would be none."""
+def in_feet(base_map: BaseMap, progress: bool = False) -> BaseMap | None:
+    """Return the map that would have been built if its coordinates were feet; None where there would be none.
+
+    ``progress``: show a bar on stderr.
+    """
     from coview_stream.basemap.basemap import BaseMap
 
     try:
-        return BaseMap.build(np.asarray(base_map.points) * np.float32(FOOT), config=base_map.config)
+        return BaseMap.build(np.asarray(base_map.points) * np.float32(FOOT), config=base_map.config, progress=progress)
     except CoViewError:
         return None
 

@@ -13,6 +13,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.reference_system import FOOT
 from coview_stream.config import LocalizerConfig
+from coview_stream.doctor import map_checks
 from coview_stream.doctor.map_checks import place_finding, run_findings
 from coview_stream.recordings.run import Run
 
@@ -64,12 +65,29 @@ def test_sensor_that_lies_is_named_once_with_its_cause(way, fault, says):
     assert [what for what, finding in found.items() if finding.verdict == "FAIL"] == ["sensors"]
 
 
-def test_map_in_feet_is_named(map_points, scene):
-    """No reference system says so; the robot is found on the same map in metres."""
+@pytest.fixture(scope="module")
+def in_feet(map_points, scene):
+    """Return a run, and a map in feet of which no reference system says so."""
     drive = small_world.record_along(scene, small_world.drive(12), 1.0)
     near = map_points[np.abs(map_points[:, :2]).max(axis=1) < 32.0]
     base_map = BaseMap.build((near / FOOT).astype(np.float32), radius=30.0)
-    finding = place_finding(run_of(drive.clouds, drive.T_odom_body), base_map, LocalizerConfig())
+    return run_of(drive.clouds, drive.T_odom_body), base_map
+
+
+def test_map_in_feet_is_named(in_feet):
+    """The robot is found on the same map in metres; both searches tell of their progress."""
+    told = []
+    finding = place_finding(*in_feet, LocalizerConfig(), lambda *done: told.append(done))
     assert finding.verdict == "FAIL"
     assert re.match(r"the map is in feet: none on it after \d+ m: .*; found after .*wrong .*1 in", finding.found)
     assert "0.3048" in finding.remedy
+    total = len(in_feet[0])
+    assert told[: total + 1] == [*((k, total) for k in range(1, total + 1)), (1, total)]
+
+
+def test_large_map_is_not_built_again_in_metres(in_feet, monkeypatch):
+    run, base_map = in_feet
+    monkeypatch.setattr(map_checks, "_MAX_REBUILT", len(base_map.points) - 1)
+    finding = place_finding(run, base_map, LocalizerConfig())
+    assert finding.found.startswith("none on this map after")
+    assert "(feet were not tried: " in finding.remedy
