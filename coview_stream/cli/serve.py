@@ -10,7 +10,7 @@ import os
 import socket
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -201,20 +201,21 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     if args.config is not None or args.ros2:
         add_arguments(declared)
     parameters: dict[str, dict[str, Any]] = _ros_parameters(args, declared) if args.ros2 else {}
+    in_file: set[str] = args.in_file if args.ros2 else set()
     if args.config is not None:
         tables |= fill_from_file(args, args.config, declared, TABLES)
-        for option, (table, *path) in _TWICE.items():
-            field: Any = tables[table]
-            for name in path:
-                field = field.get(name) if isinstance(field, dict) else None
-            if option in args.in_file and field is not None:
-                raise ConfigError(
-                    f"{args.config}: {option} and [{'.'.join([table, *path[:-1]])}] {path[-1]}: set one of them"
-                )
+        in_file |= args.in_file
     if args.ros2 and args.ros_node is None:  # the file says so
         parameters = _ros_parameters(args, declared)
-    for name, of_ros in parameters.items():
-        tables[name] |= of_ros
+        in_file |= args.in_file
+    _merge(tables, parameters)
+    source = " and ".join(str(name) for name in (args.config, args.ros2 and _PARAMETERS) if name)
+    for option, (table, *path) in _TWICE.items():
+        field: Any = tables[table]
+        for name in path:
+            field = field.get(name) if isinstance(field, dict) else None
+        if option in in_file and field is not None:
+            raise ConfigError(f"{source}: {option} and [{'.'.join([table, *path[:-1]])}] {path[-1]}: set one of them")
     if args.ros_args is not None and not args.ros2:
         raise ConfigError("--ros-args goes with --ros2")
     if args.ros2 and (other := [f"--{name.replace('_', '-')}" for name in _OF_ZENOH if getattr(args, name)]):
@@ -226,6 +227,15 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
         if not value:
             raise ConfigError(f"{name} is missing: give it here, or as {key} = ... in the file of --config")
     return tables
+
+
+def _merge(into: dict[str, Any], tables: Mapping[str, Any]) -> None:
+    """Set the fields of nested tables in others."""
+    for name, value in tables.items():
+        if isinstance(value, Mapping) and isinstance(into.get(name), dict):
+            _merge(into[name], value)
+        else:
+            into[name] = value
 
 
 def _ros_parameters(args: argparse.Namespace, declared: argparse.ArgumentParser) -> dict[str, dict[str, Any]]:
@@ -301,7 +311,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
             [DEFAULT_ENDPOINT] if by_default else args.listen,
             args.zenoh_config,
             ros2=args.ros_node,
-            check_frames=args.mount is None,
+            check_frames=args.mount is None and lidar is None,
         ),
         codecs=CodecOptions(args.cloud_encoding, args.odometry_encoding, args.pose_encoding, args.geo),
         node=node,

@@ -68,9 +68,9 @@ class FrameTree:
         self._samples: dict[str, list[tuple[int, Pose]]] = {}  # by child, of those that are not static
 
     def add(self, payload: bytes, static: bool) -> None:
-        """Add the transforms of a TFMessage in CDR; MessageError if it is damaged."""
+        """Add the transforms of a TFMessage in CDR; a static one replaces that of before; MessageError if damaged."""
         for stamp_ns, parent, child, T in read_transforms(payload):
-            if child not in self._parents and len(self._parents) < _MAX_FRAMES:
+            if static if child in self._parents else len(self._parents) < _MAX_FRAMES:
                 self._parents[child] = parent, T
             before = self._parents.get(child)
             if static or before is None or before[0] != parent:

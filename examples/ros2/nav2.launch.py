@@ -9,7 +9,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return what launch starts."""
+    """Return the map server, coview_stream and Nav2."""
     site, params = LaunchConfiguration("site"), LaunchConfiguration("params")
     navigation = PathJoinSubstitution([FindPackageShare("nav2_bringup"), "launch", "navigation_launch.py"])
     return LaunchDescription(
@@ -25,6 +25,7 @@ def generate_launch_description() -> LaunchDescription:
                 remappings=[("/robot/points", "/points"), ("/robot/odom", "/odom")],
                 output="screen",
                 respawn=True,
+                respawn_delay=2.0,
             ),
             # the grid that the planner needs: AMCL alone is replaced
             Node(package="nav2_map_server", executable="map_server", name="map_server", parameters=[params]),

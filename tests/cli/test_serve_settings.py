@@ -26,6 +26,8 @@ def options_of(*argv):
         ([], lambda o: o.node.mount, NodeConfig().mount),
         (["--mount=180,10,90,0.3,-0.2,0.5"], lambda o: o.node.mount, parse_mount("180,10,90,0.3,-0.2,0.5")),
         (["--odometry-timeout", "1.5"], lambda o: (o.node.odometry_timeout, o.node.max_gap), (1.5, 1.5)),
+        ([], lambda o: o.network.check_frames, True),
+        (["--odometry", "kiss-icp"], lambda o: o.network.check_frames, False),
         (["--max-payload", "99"], lambda o: o.node.max_payload, 99),
         (["--max-outage", "7"], lambda o: o.node.max_outage, 7.0),
         (["--cloud-delay", "-0.1"], lambda o: o.localizer.cloud_delay, -0.1),

@@ -17,8 +17,10 @@ from coview_stream.clouds import write_tum
 from coview_stream.config.mount import parse_mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.messages import ros2_outputs
 from coview_stream.recordings.bag_reader import BagReader
 from coview_stream.recordings.bags import Track
+from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.recordings.open_run import open_run
 
 START = 1_700_000_000_000_000_000
@@ -228,6 +230,14 @@ def test_mount_is_read_from_static_transforms(tmp_path, name):
     assert len(run.notes) == 1
     np.testing.assert_allclose(run.mount.T_body_sensor, MOUNT.T_body_sensor, atol=1e-12)
     np.testing.assert_allclose(run.read(3).points, POINTS + 0, atol=1e-4)
+
+
+def test_newest_static_transform_is_in_force():
+    tree, T = FrameTree(), pose_from(rot_z(0.2), [1.0, 0.0, 0.5])
+    for T_body_lidar in (np.eye(4), T):
+        tree.add(ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "lidar"), static=True)
+    tree.lidar = "lidar"
+    np.testing.assert_allclose(tree.mount("base_link"), T, atol=1e-12)
 
 
 def test_transform_that_nobody_has_set_does_not_hide_the_others(tmp_path):

@@ -300,12 +300,12 @@ class Inputs:
         has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
         if not counters.received:
             return f"waiting for clouds on {keys.cloud}"
+        if not has_odometry and not counters.odometry_received:
+            return f"waiting for odometry on {keys.odometry}"
         if counters.received == counters.malformed + counters.oversized + counters.unknown_encoding:
             return "not one cloud could be read; see errors"
-        if not has_odometry and counters.odometry_received:
-            return "not one odometry sample could be read; see errors"
         if not has_odometry:
-            return f"waiting for odometry on {keys.odometry}"
+            return "not one odometry sample could be read; see errors"
         if counters.engine_errors:
             return f"frames at which the engine failed: {counters.engine_errors}; see errors"
         if counters.rejected:

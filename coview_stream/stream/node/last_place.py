@@ -177,7 +177,8 @@ def _open_regular(path: Path) -> BinaryIO:
 def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess of named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
 
-    With ``map``, a name, they are in the frame of that one of several maps; ``within``: as of a :class:`PlaceGuess`.
+    With ``map``, a name, they are in the frame of that one of several maps; ``map`` itself, the frame of a single map,
+    counts as no name. ``within``: as of a :class:`PlaceGuess`.
     InputError if x or y is missing, a name is unknown, or a value is no number or out of its range.
     """
     unknown = sorted(set(given) - set(_GUESS_FIELDS))
@@ -186,7 +187,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
         raise InputError(
             f"initial pose: {problem}; give x, y and perhaps yaw, distance, angle, within (metres, radians)"
         )
-    map_name = given.get("map")
+    map_name = None if given.get("map") in ("", "map") else given.get("map")
     if not isinstance(map_name, str | None):
         raise InputError(f"initial pose: map is {str(map_name)[:40]!r}, which is no name")
     numbers: dict[str, float] = {}
@@ -218,5 +219,5 @@ def decode_guess(sample: Sample) -> PlaceGuess:
     return guess_of_fields({
         "x": pose.T_map_body[0, 3], "y": pose.T_map_body[1, 3], "yaw": yaw_of(pose.T_map_body),
         "distance": min(max(_SIGMAS * spread, 3.0), MAX_DISTANCE), "angle": min(max(_SIGMAS * turn, 0.3), math.pi),
-        "map": None if pose.frame_id in ("", "map") else pose.frame_id,
+        "map": pose.frame_id,
     })  # fmt: skip

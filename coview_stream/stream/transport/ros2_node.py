@@ -53,7 +53,11 @@ def _import_rclpy() -> Any:
 
 
 def settings_of(node: Any) -> dict[str, Any]:
-    """Return the parameters of a node that are not its own, those with dots as tables."""
+    """Return the parameters of a node that are not its own, those with dots as tables.
+
+    Raises:
+        ConfigError: a name is that of a value and of a table.
+    """
     settings: dict[str, Any] = {}
     for name, parameter in sorted(node.get_parameters_by_prefix("").items()):
         if name in _OWN_PARAMETERS or name.startswith("qos_overrides."):
@@ -62,13 +66,15 @@ def settings_of(node: Any) -> dict[str, Any]:
         table = settings
         for part in tables:
             table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise ConfigError(f"ROS parameters: {name} and {part} are given: a table and a value of one name")
         value = parameter.value
         table[last] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
     return settings
 
 
 def latched(depth: int) -> Any:
-    """Return a QoS by which who comes later gets the newest messages too."""
+    """Return a QoS that delivers the newest ``depth`` messages to later subscribers as well."""
     qos = import_module("rclpy.qos")
     return qos.QoSProfile(depth=depth, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
 

@@ -40,6 +40,8 @@ _log = logging.getLogger(__name__)
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry
 _CACHE = 10.0  # seconds of transforms that a tf2 buffer keeps: with older stamps no user of ours finds any
 _JOIN = 0.3  # seconds for each thread at closing
+RETRY = 10.0  # seconds until a view of the map that could not be made is asked for again
+_NO_TF = "as ROS package tf2_msgs is missing"
 _MAP_TOPIC, _GUESS_TOPIC = "map_points", "initialpose"  # relative: a namespace moves them
 
 
@@ -60,19 +62,23 @@ class _Robot:
     odometry_ns: int | None = None  # of the newest odometry
     clock_said: bool = False  # that the stamps contradict this node's clock
     outputs: dict[str, Any] = field(default_factory=dict)  # rclpy's publishers
+    lock: threading.Lock = field(default_factory=threading.Lock)  # of ``T_map_odom`` with ``odometry_ns``
 
     def check_cloud(self, sample: Sample) -> Sample:
         """Return a cloud with its mount, of /tf_static, or refused for its frame."""
         self.newest_ns, frame, body = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload), self.body_frame
+        if self.check_frames and frame and self.odometry_ns is None:
+            return _refused(sample, "clouds before the first odometry, which names the body's frame, are not used")
         if not (self.check_frames and frame and body) or frame == body:
             return sample
         self.frames.lidar = frame
         if (T_body_lidar := self.frames.mount(body)) is not None:
             return replace(sample, mount=Mount().moved(T_body_lidar))
+        why = "/tf_static does not join them" if "tf" in self.outputs else f"/tf_static is not read, {_NO_TF}"
         return _refused(
             sample,
-            f"the cloud is in frame {frame!r}, odometry is of {body!r}, and /tf_static does not join them: give the "
-            "lidar's pose on it by --mount, --mount=0,0,0 if the two are one",
+            f"the cloud is in frame {frame!r}, odometry is of {body!r}, and {why}: give the lidar's pose on it by "
+            "--mount, --mount=0,0,0 if the two are one",
         )
 
     def check_odometry(self, sample: Sample) -> Sample:
@@ -80,9 +86,10 @@ class _Robot:
         frame, stamp_ns = ros2.frame_id(sample.payload), ros2.header_stamp(sample.payload)
         if frame == self.map_frame:
             return _refused(sample, f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?")
-        if self.odometry_ns is not None and stamp_ns < self.odometry_ns - _CACHE * 1e9:
-            self.T_map_odom = None  # the sender began anew, and so did its frame
-        self.newest_ns = self.odometry_ns = stamp_ns
+        with self.lock:
+            if self.odometry_ns is not None and stamp_ns < self.odometry_ns - _CACHE * 1e9:
+                self.T_map_odom = None  # the sender began anew, and so did its frame
+            self.newest_ns = self.odometry_ns = stamp_ns
         self.odometry_frame, self.body_frame = frame, ros2.frame_id(sample.payload, 1)
         return sample
 
@@ -149,12 +156,15 @@ class Ros2Transport:
         self._show_map: Callable[[], dict[str, Any]] | None = None
         self._map_publisher: Any = None
         self._shown = ""  # hash of the map that has been published
+        self._retry_at = 0.0  # local time
         self._lock = threading.RLock()
         self.closed = threading.Event()
         self._inboxes = Inboxes(self.guard)
         self._map_wanted = self._inboxes.open("map", lambda _: self._publish_map(), 1)
         self._robots = [_Robot(k, f"{k.robot}/" if len(keys) > 1 else "", check_frames) for k in keys]
         try:
+            if find_spec("tf2_msgs") is None:
+                _log.warning("there is no TF, %s", _NO_TF)
             self._diagnostics = self._create_publisher(ros2_outputs.DIAGNOSTICS, "/diagnostics")
             for robot in self._robots:
                 self._declare(robot)
@@ -343,13 +353,16 @@ class Ros2Transport:
 
     def _write_pose(self, robot: _Robot, payload: bytes) -> None:
         pose = json_messages.decode_pose(Sample("", payload))
-        robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
+        with robot.lock:
+            if robot.odometry_ns is not None and pose.stamp_ns > robot.odometry_ns:
+                return  # of before the sender began anew
+            robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
         robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
 
     def _broadcast(self, robot: _Robot) -> None:
         """Broadcast map -> odom as it is known at the stamp of odometry that came; while the place is lost, as it was.
 
-        With odometry, not with poses: who looks up the body at odometry's stamp need not wait for the next pose.
+        With odometry, not with poses: a lookup of the body at odometry's stamp then does not wait for the next pose.
         """
         publisher, T, frame = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame
         if publisher is not None and T is not None and frame and robot.odometry_ns is not None:
@@ -358,8 +371,7 @@ class Ros2Transport:
     def _write_status(self, robot: _Robot, payload: bytes) -> None:
         status = json.loads(payload)
         now_ns = self._node.get_clock().now().nanoseconds
-        if status["map_sha256"] != self._shown:
-            self._shown = status["map_sha256"]
+        if status["map_sha256"] != self._shown and time.monotonic() >= self._retry_at:
             self._map_wanted.put(Sample("map", b""))
         clock = robot.clock(now_ns)
         if clock and not robot.clock_said:
@@ -374,11 +386,17 @@ class Ros2Transport:
         self._diagnostics.publish(ros2_outputs.encode_diagnostics(status, now_ns, transform, clock))
 
     def _publish_map(self) -> None:
-        """Publish the map's points for all who subscribe, also later."""
+        """Publish the points of the map that is served, to later subscribers too, unless they have been published."""
         if self._show_map is None:
             return
-        view = MapView.from_json(self._show_map())
+        self._retry_at = time.monotonic() + RETRY
+        answer = self._show_map()
+        self._retry_at = 0.0
+        if answer["map_sha256"] == self._shown:  # a robot is on another map as yet
+            return
+        view = MapView.from_json(answer)
         if self._map_publisher is None:
             self._map_publisher = self._create_publisher(ros2.CLOUD, _MAP_TOPIC, latched(1))
         points = (view.points + view.origin).astype(np.float32)
         self._map_publisher.publish(ros2_outputs.encode_map(points, self._node.get_clock().now().nanoseconds))
+        self._shown = view.sha256

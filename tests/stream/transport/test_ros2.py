@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import small_world
 from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
 
+from coview_stream.basemap.summary import MapView
 from coview_stream.cli import main, options, serve
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
 from coview_stream.geometry.transforms import transform as transform_points
-from coview_stream.messages import ros2, ros2_outputs
+from coview_stream.messages import encode_pose, ros2, ros2_outputs
+from coview_stream.messages.types import Encoded
+from coview_stream.stream.transport import ros2_transport
 from coview_stream.stream.transport.keys import matches, robot_keys
 from coview_stream.stream.transport.rmw import dds_type, publisher_token, type_hash
 from coview_stream.stream.transport.ros2_node import settings_of, start_node
@@ -188,6 +193,7 @@ def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, t
         parent, child, _, live = transform(heard[-1])
         assert (parent, child) == ("map", "odom")
         pose = site.sessions["r1"].pose()
+        before = encode_pose(pose, "json")
         np.testing.assert_allclose(live, pose_to_tum(pose.T_map_body @ inverse(message(0.25).T_odom_body)), atol=1e-9)
         site.sessions["r1"].restart_search("asked", forget=True)
         site.told(robot, lambda: "frozen" in robot.values()["map -> odom"])
@@ -198,6 +204,10 @@ def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, t
         for k in range(5):  # the sender began anew: its frame is another
             robot.move(ns(-60.0 + 0.1 * k), message(0.1 * k).T_odom_body)
         robot.until(lambda: site.counters().odometry_received > received + 3)
+        site.net.publisher(KEYS.pose, "pose").put(before)  # as long as the restart is not certain
+        received = site.counters().odometry_received
+        robot.move(ns(-59.0), message(0.5).T_odom_body)
+        robot.until(lambda: site.counters().odometry_received > received)
         assert len(heard) == count
     finally:
         site.net.close()
@@ -212,9 +222,12 @@ def transform(payload):
 
 @pytest.mark.slow
 def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog):
+    static = "does not join them" if find_spec("tf2_msgs") else "is not read, as ROS package tf2_msgs is missing"
     bad = {
         "no numeric field 'z'": cloud_message(ns(0.1), POINTS[:, :2], names="xy"),
-        "frame 'velodyne', odometry is of 'base_link'": cloud_message(ns(0.2), POINTS, frame="velodyne"),
+        f"frame 'velodyne', odometry is of 'base_link', and /tf_static {static}": cloud_message(
+            ns(0.2), POINTS, frame="velodyne"
+        ),
     }
     robot.move(ns(0.0), message(0.0).T_odom_body)
     robot.until(lambda: site.sessions["r1"].inputs.odometry.newest.stamp_ns == ns(0.0))
@@ -229,6 +242,60 @@ def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog)
     assert robot.values()["malformed"] == "4"
     assert robot.level() == b"\1"
     assert not robot.poses
+
+
+@pytest.mark.slow
+def test_cloud_before_the_first_odometry_is_refused(robot):
+    net, samples = Ros2Transport(start_node(()), [KEYS]), []
+    try:
+        for key in (KEYS.cloud, KEYS.odometry):
+            net.subscribe(key, samples.append, "all")
+        robot.until(lambda: robot.clouds.get_subscription_count() and robot.odometry.get_subscription_count())
+
+        def heard(move):
+            if move:
+                robot.move(ns(0.0), message(0.0).T_odom_body)
+            robot.clouds.publish(cloud_message(ns(0.0), POINTS))
+            time.sleep(0.02)
+            return [sample.refused for sample in samples if sample.key == KEYS.cloud]
+
+        robot.until(lambda: heard(move=False))
+        assert all("before the first odometry" in reason for reason in heard(move=False))
+        robot.until(lambda: not heard(move=True)[-1])
+    finally:
+        net.close()
+
+
+@pytest.mark.slow
+def test_map_is_published_again_until_it_is_the_one_that_is_served(robot, monkeypatch):
+    monkeypatch.setattr(ros2_transport, "RETRY", 0.0)
+    net = Ros2Transport(start_node(()), [KEYS])
+    views = {name: MapView.of_cloud(POINTS[:n], np.zeros(3)) for n, name in ((2, "old"), (3, "new"))}
+    served, shown = [], robot.heard["/map_points"]
+
+    def view(_):
+        return replace(views[served[0]], sha256=served[0]).to_json()  # IndexError at first: a failed view
+
+    def told(condition):
+        net.publisher(KEYS.status, "status").put(Encoded(json.dumps(status).encode()))
+        time.sleep(0.05)
+        return condition()
+
+    status = {"state": "LOST", "reason": "", "robot": "r1", "map_sha256": "new"}
+    status["pose"] = dict.fromkeys(("protection_level", "rate_hz", "age_s", "confidence"))
+    try:
+        net.answer(KEYS.map_view, view)
+        for _ in range(3):
+            told(lambda: None)
+        served.append("old")  # the node's other robot has not changed over yet
+        robot.until(lambda: told(lambda: shown and shown[-1].width == 2))
+        served[0] = "new"
+        robot.until(lambda: told(lambda: shown[-1].width == 3))
+        for _ in range(3):
+            told(lambda: None)
+        assert len(shown) == 2
+    finally:
+        net.close()
 
 
 @pytest.mark.slow
@@ -291,7 +358,7 @@ def test_initial_pose_is_a_hypothesis_and_one_in_another_frame_is_refused(robot,
     guess.header.frame_id = "odom"
     robot.guesses.publish(guess)
     session = site.sessions["r1"]
-    robot.until(lambda: any("fixed frame" in text for text in session.errors.texts))
+    robot.until(lambda: any("give it in 'map'" in text for text in session.errors.texts))
     assert session.hints.guess is None
     guess.header.frame_id = "map"
     robot.guesses.publish(guess)
@@ -404,6 +471,38 @@ def test_parameters_are_options_by_their_names(ros, tmp_path):
         node.context.try_shutdown()
 
 
+def test_parameters_that_are_a_value_and_a_table_are_refused():
+    given = {"odometry": "kiss-icp", "odometry.x": 1}
+    parameters = {name: SimpleNamespace(value=value) for name, value in given.items()}
+    with pytest.raises(ConfigError, match=r"odometry\.x and odometry"):
+        settings_of(SimpleNamespace(get_parameters_by_prefix=lambda _: parameters))
+
+
+def merged(path, text, *parameters):
+    path.write_text(text)
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    given = ["site.coview", "--robot", "r1", "--config", str(path), "--ros2", "--ros-args", *parameters]
+    args = parser.parse_args(given)
+    try:
+        return serve.settings(args)
+    finally:
+        args.ros_node.destroy_node()
+        args.ros_node.context.try_shutdown()
+
+
+def test_parameters_leave_the_rest_of_a_files_table(ros, tmp_path):
+    text = "[localizer.acceptance]\nmax_doubt_s = 9\nrisk = 1e-3\n"
+    tables = merged(tmp_path / "a.toml", text, "-p", "localizer.acceptance.risk:=1.0e-6")
+    assert tables["localizer"]["acceptance"] == {"max_doubt_s": 9, "risk": 1e-6}
+
+
+@pytest.mark.parametrize(("text", "given"), [("risk = 1e-3\n", ()), ("", ("-p", "risk:=1.0e-3"))])
+def test_parameter_and_option_of_one_setting_are_refused(ros, tmp_path, text, given):
+    with pytest.raises(ConfigError, match=r"ROS parameters: risk and \[localizer.acceptance\] risk: set one"):
+        merged(tmp_path / "a.toml", text, "-p", "localizer.acceptance.risk:=1.0e-6", *given)
+
+
 def test_names_that_ros_does_not_allow_are_refused(ros):
     node = start_node(())
     with pytest.raises(ConfigError, match="--ros2"):
@@ -462,7 +561,7 @@ def test_launch_file_and_parameters_of_the_example_are_right(tmp_path):
     serve.add_arguments(parser)
     args = parser.parse_args(["site.coview", "--robot", "r1"])
     assert options.fill_from_settings(args, ours, "nav2.yaml", parser, serve.TABLES)["node"] == {"pairing_wait": 0.3}
-    assert (float(args.risk), args.state) == (1e-4, "/var/lib/coview")
+    assert (float(args.risk), args.state) == (1e-4, None)  # the user's own folder
 
 
 # ---- a process of its own
