@@ -54,6 +54,16 @@ def check_map_name(output: str, directory: bool) -> None:
         )
 
 
+def refuse_run(path: Path) -> None:
+    """Refuse a run in the place of a map (MapError): arguments change places easily."""
+    if path.suffix == ".coview" or (path / "manifest.json").exists():
+        return
+    from coview_stream.recordings.layouts import is_run
+
+    if is_run(path):
+        raise MapError(f"{path}: is a run; the map comes first")
+
+
 def local_map(
     name: str,
     around: str | None = None,
@@ -74,6 +84,7 @@ def local_map(
     if around is None and "://" not in name:
         if not Path(name).exists():
             raise MapError(f"{name}: cannot read the map (No such file or directory); check the path")
+        refuse_run(Path(name))
         return LocalMap(Path(name))  # without the modules below: most maps are files
 
     from coview_stream.basemap.site.fetch import is_site_address

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 
@@ -52,7 +53,10 @@ def find_layout(path: Path) -> Layout:
         RunError: missing, of an unknown layout, or without frames; the message names the layouts.
     """
     if not path.exists():
-        raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
+        beside = [other.name for other in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = get_close_matches(path.name, beside, 1)
+        remedy = f"did you mean {path.parent / near[0]}?" if near else "check the path"
+        raise RunError(f"{path}: no such file or directory; {remedy}")
     if path.is_file():
         if suffix_of(path) not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
@@ -74,6 +78,11 @@ def find_layout(path: Path) -> Layout:
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a path is a recording, or a directory with a run's frames."""
+    return find_bag(path) is not None or any((path / folder).is_dir() for folder in _FOLDERS)
 
 
 def find_bag(path: Path) -> Path | None:

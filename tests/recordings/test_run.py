@@ -162,7 +162,7 @@ def test_binary_odometry_file_is_refused(run: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda d: d / "nothing", "no such run"),
+        (lambda d: d / "nothing", r"nothing: no such file or directory; check the path$"),
         (lambda d: d, "no frames/ directory"),
         (lambda d: (d / "frames").mkdir() or d, "no frames"),
         (lambda d: write_cloud(d / "a.pcd", POINTS) or d, "in the directory itself"),
@@ -174,6 +174,12 @@ def test_binary_odometry_file_is_refused(run: Path) -> None:
 def test_path_without_a_run_is_refused(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
     with pytest.raises(RunError, match=reason):
         open_run(make(tmp_path))
+
+
+def test_run_that_does_not_exist_is_answered_by_its_neighbour(run: Path) -> None:
+    with pytest.raises(RunError, match=f"no such file or directory; did you mean {run}") as caught:
+        open_run(run.with_name(f"{run.name}s"))
+    assert "odom_poses.txt" not in str(caught.value)
 
 
 def test_duplicate_frames_and_broken_links_are_refused(run: Path) -> None:
