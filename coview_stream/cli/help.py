@@ -38,7 +38,24 @@ def run(args: argparse.Namespace) -> int:
     elif topic.removesuffix(".md") in known:
         print(known[topic.removesuffix(".md")].read_text(encoding="utf-8"), end="")
     else:
-        raise ConfigError(
-            f"no command or page is called {topic!r}; {did_you_mean(topic, list(dict.fromkeys([*COMMANDS, *known])))}"
-        )
+        remedy = did_you_mean(topic, list(dict.fromkeys([*COMMANDS, *known])))
+        if (page := page_about(topic)) is not None:
+            near = f"{remedy} or " if remedy.endswith("?") else ""
+            remedy = f"{near}see `{PROGRAM} help {page}.md`"
+        raise ConfigError(f"no command or page is called {topic!r}; {remedy}")
     return 0
+
+
+def page_about(word: str) -> str | None:
+    """Return the page with a word in a section's title, else the one that has it most often; None if none has."""
+    word, found = _squeezed(word), dict[str, tuple[bool, int]]()
+    for name, path in pages().items():
+        text = path.read_text(encoding="utf-8")
+        titles = [line for line in text.splitlines() if line.startswith("##")]
+        found[name] = any(word in _squeezed(title) for title in titles), _squeezed(text).count(word)
+    best = max(found, key=lambda name: found[name], default=None)
+    return None if best is None or found[best] == (False, 0) else best
+
+
+def _squeezed(text: str) -> str:
+    return "".join(text.split()).casefold()  # ros2 is ROS 2

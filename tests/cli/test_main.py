@@ -52,6 +52,12 @@ def test_misspelt_names_are_answered_by_the_nearest(argv, near, capsys):
     assert f"did you mean '{near}'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("word", "page"), [("ros2", "wire"), ("nav2", "wire"), ("stdin", "build")])
+def test_help_names_the_page_about_a_word(word, page, capsys):
+    assert cli.main(["help", word]) == 2
+    assert f"see `coview-stream help {page}.md`" in capsys.readouterr().err
+
+
 def test_help_prints_commands_and_pages(capsys):
     assert cli.main([]) == 0
     commands = capsys.readouterr().out
