@@ -84,8 +84,10 @@ class _Ground:
     lean: float  # angle between the ground's normal and odometry's vertical, radians
 
 
-def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Iterator[Finding]:
-    """Judge frames in order, a metre or two apart, with their odometry."""
+def frame_findings(
+    frames: Sequence[SeenFrame], robot: str | None = None, given: Mount | None = None
+) -> Iterator[Finding]:
+    """Judge frames in order, a metre or two apart, with their odometry; ``given``: mount that moved their points."""
     if len(frames) < 2:
         return
     unit = float(np.median([unit_of(frame.points) for frame in frames]))
@@ -95,7 +97,7 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
     pairs, missing = _pairs(frames, ground)
     if missing:
         if ground is not None:
-            yield _ground_finding(ground, robot)
+            yield _ground_finding(ground, robot, given)
         remedy = f"{install_command('node')} here, or ask the doctor where that is installed"
         yield Finding("warn", "motion", f"not compared with odometry: {missing}", remedy, robot)
         return
@@ -103,10 +105,10 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
     if still is not None:
         yield still
         if still.verdict == "ok" and ground is not None:
-            yield _ground_finding(ground, robot)
+            yield _ground_finding(ground, robot, given)
         return
     seen = None if ground is None else fit(pairs)
-    explanation = _explanation(frames, ground, pairs, seen, robot, unit)
+    explanation = _explanation(frames, ground, pairs, seen, robot, unit, given)
     if explanation is not None:
         yield explanation
         return
@@ -114,7 +116,7 @@ def frame_findings(frames: Sequence[SeenFrame], robot: str | None = None) -> Ite
         remedy = "is z up, are points in metres, and are those on the ground sent too? `coview-stream help reasons`"
         yield Finding("warn", "ground", "none is seen below the sensor", remedy, robot)
         return
-    yield _ground_finding(ground, robot)
+    yield _ground_finding(ground, robot, given)
     yield _motion_finding(seen, robot)
 
 
@@ -167,6 +169,7 @@ def _explanation(
     seen: Fit | None,
     robot: str | None,
     unit: float,
+    given: Mount | None,
 ) -> Finding | None:
     """Return the mistake that explains why the lidar contradicts odometry; both where two explain it alike.
 
@@ -188,9 +191,7 @@ def _explanation(
     if ground is not None and seen is not None:
         R = rot_z(-seen.yaw) @ turning(ground.up, UP)
         if seen.spread < HEADING and abs(seen.scale - 1.0) < SCALE and (ground.axis or abs(seen.yaw) > HEADING):
-            consider(
-                turned_clouds(ground.axis, seen.yaw), _mount_finding(ground.axis, Mount(drawn=False).turned(R), robot)
-            )
+            consider(turned_clouds(ground.axis, seen.yaw), _mount_finding(ground.axis, R, robot, given))
         if unit != 1.0:
             consider(MILLIMETRES)
         for reading in (
@@ -248,14 +249,23 @@ def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, lis
         yield reading, [replace(f, points=transform(M, f.points)) for f, M in zip(frames, levelled, strict=True)]
 
 
-def _mount_finding(axis: int, mount: Mount, robot: str | None) -> Finding:
-    turned = f"turned by {math.degrees(mount.yaw):.0f} degrees"
+def _mount_finding(axis: int, R: Floats, robot: str | None, given: Mount | None) -> Finding:
+    yaw = Mount().turned(R).yaw
+    turned = f"turned by {math.degrees(yaw):.0f} degrees"
     if not axis:
         found = f"the lidar is {turned} against the motion of the body"
     else:
         found = "the lidar is upside down" if axis == 1 else f"the lidar's {AXIS_NAMES[axis]} axis points up, not its z"
-        found += f", {turned} about the vertical" if abs(mount.yaw) > HEADING else ""
+        found += f", {turned} about the vertical" if abs(yaw) > HEADING else ""
+    mount = _turned_in_place(replace(given or Mount(), drawn=False), R)
+    if given is not None and given != Mount():
+        found = f"by --mount={given.option} {found}"
     return Finding("FAIL", "mount", found, f"set --mount={mount.option}; {_GUESSED}", robot)
+
+
+def _turned_in_place(given: Mount, R: Floats) -> Mount:
+    """Return the mount whose clouds are turned by ``R`` (3, 3) besides; its place is the given one, as in a drawing."""
+    return replace(given.turned(R), x=given.x, y=given.y, z=given.z)
 
 
 def _still(frames: Sequence[SeenFrame], pairs: Sequence[Pair], robot: str | None) -> Finding | None:
@@ -272,7 +282,7 @@ def _still(frames: Sequence[SeenFrame], pairs: Sequence[Pair], robot: str | None
     return Finding("ok", "motion", found, "drive ten metres and ask again", robot)
 
 
-def _ground_finding(ground: _Ground, robot: str | None) -> Finding:
+def _ground_finding(ground: _Ground, robot: str | None, given: Mount | None) -> Finding:
     if ground.axis:
         found = "the ground is not where z points down"
         return Finding("FAIL", "ground", found, f"are clouds and odometry sent with {AS_SENT_WORDS}?", robot)
@@ -282,12 +292,14 @@ def _ground_finding(ground: _Ground, robot: str | None) -> Finding:
     height = f"the sensor is {ground.height:.1f} m above it"
     if ground.lean < _LEAN:
         return Finding("ok", "ground", f"level to {math.degrees(ground.lean):.1f} degrees, {height}", robot=robot)
-    mount = Mount().turned(turning(ground.up_level, UP))
+    R = turning(ground.up_level, UP)
+    mount = Mount().turned(R)
     found = (
         f"the sensor leans {math.degrees(ground.lean):.1f} degrees against odometry's level "
         f"({math.degrees(mount.pitch):.1f} in pitch, {math.degrees(mount.roll):.1f} in roll); {height}"
     )
-    remedy = f"set --mount={mount.option} if it is the sensor; align odometry to gravity if it is odometry"
+    right = _turned_in_place(given or Mount(), R)
+    remedy = f"set --mount={right.option} if it is the sensor; align odometry to gravity if it is odometry"
     verdict: Verdict = "warn" if ground.lean < _TOO_FAR else "FAIL"
     return Finding(verdict, "ground", found, remedy, robot)
 

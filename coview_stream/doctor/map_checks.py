@@ -105,7 +105,7 @@ def run_findings(
     except CoViewError as error:
         yield from_error("run", error)
         return
-    found = list(frame_findings(frames))
+    found = list(frame_findings(frames, given=run.mount))
     wrong = [finding.what for finding in found if finding.verdict == "FAIL"]
     sensors = []
     if len(run) > 1 and wrong in ([], ["motion"]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from coview_stream.errors import CloudError
 from coview_stream.geometry.transforms import (
     exp_so3,
     inverse,
+    log_so3,
     pose_from,
     quat_to_matrix,
     quaternion_of,
@@ -131,6 +133,26 @@ def test_remedy_of_an_upside_down_lidar_is_its_mount(frames):
     for f in frames[:3]:
         back = mount.to_body(spoil(f).points)
         assert np.linalg.norm(back - f.points, axis=1).max() < 0.1 * np.linalg.norm(f.points, axis=1).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("180,0,0", "by --mount=180,0,0 the lidar is upside down"),
+        ("0,0,90,1,0,0.5", "by --mount=0,0,90,1,0,0.5 the lidar is turned by -9"),
+        ("0,10,0", "leans"),
+    ],
+)
+def test_remedy_of_a_wrong_mount_is_the_right_one(frames, given, words):
+    wrong = parse_mount(given)
+    seen = [SeenFrame(f.stamp, wrong.to_body(f.points), f.T_odom_body) for f in frames]
+    finding = next(f for f in frame_findings(seen, given=wrong) if f.verdict != "ok")
+    assert words in finding.found
+    mount = parse_mount(re.search(r"--mount=(\S+?)[; ]", finding.remedy)[1])
+    turned = np.linalg.norm(log_so3(mount.T_body_sensor[:3, :3]))
+    assert turned < np.radians(8.0)
+    assert (mount.x, mount.y, mount.z) == (wrong.x, wrong.y, wrong.z)
 
 
 def test_run_of_which_no_frame_can_be_read_is_not_ok(world_drive, tmp_path):
