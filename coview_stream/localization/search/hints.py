@@ -51,7 +51,7 @@ class PlaceGuess:
         yaw: heading of the body's x axis, radians, counter-clockwise from the map's x axis; None: any.
         distance: metres around it that are tried as well, up to :data:`MAX_DISTANCE`.
         angle: radians to either side of ``yaw`` that are tried as well.
-        map: name of the one of several maps in whose frame it is; None of one map.
+        map: name of the one of several maps in whose frame it is; None or ``map`` of one map.
         within: metres around it outside of which nothing is searched; None: all of the map is. Unlike the rest this
             is trusted: of a robot that is elsewhere no place is found.
         begin, end: of x, beyond which ``within`` does not reach: where one of several maps ends.

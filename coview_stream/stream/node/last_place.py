@@ -177,8 +177,8 @@ def _open_regular(path: Path) -> BinaryIO:
 def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess of named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
 
-    With ``map``, a name, they are in the frame of that one of several maps; ``map`` itself, the frame of a single map,
-    counts as no name. ``within``: as of a :class:`PlaceGuess`.
+    With ``map``, a name, they are in the frame of that one of several maps, or ``map``, that of a single one;
+    ``within``: as of a :class:`PlaceGuess`.
     InputError if x or y is missing, a name is unknown, or a value is no number or out of its range.
     """
     unknown = sorted(set(given) - set(_GUESS_FIELDS))
@@ -187,7 +187,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
         raise InputError(
             f"initial pose: {problem}; give x, y and perhaps yaw, distance, angle, within (metres, radians)"
         )
-    map_name = None if given.get("map") in ("", "map") else given.get("map")
+    map_name = given.get("map") or None
     if not isinstance(map_name, str | None):
         raise InputError(f"initial pose: map is {str(map_name)[:40]!r}, which is no name")
     numbers: dict[str, float] = {}

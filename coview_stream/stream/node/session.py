@@ -173,7 +173,7 @@ class Session:
             part = self.parts.named(guess.map)
             x, y = guess.x + part.shift[0], guess.y + part.shift[1]
             guess = replace(guess, x=x, y=y, map=None, begin=part.begin, end=part.end)
-        elif guess.map is not None:
+        elif guess.map not in (None, "map"):
             raise InputError(f"initial pose: it is in frame {guess.map!r}; give it in 'map', or name none")
         if self._base_map is not None:
             require_ground(guess, self._base_map)

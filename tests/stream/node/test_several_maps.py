@@ -85,5 +85,6 @@ def test_guess_names_its_map(robot):
     assert guess_of_fields({"x": 1, "y": 2, "yaw": math.pi / 2, "map": "east"}).map == "east"
     with pytest.raises(InputError, match="map is '3'"):
         guess_of_fields({"x": 1, "y": 2, "map": 3})
+    assert Robot().session.guess_place(guess_of_fields({"x": 1, "y": 2, "map": "map"}))
     with pytest.raises(InputError, match="give it in 'map'"):
         Robot().session.guess_place(PlaceGuess(1.0, 2.0, map="any"))
