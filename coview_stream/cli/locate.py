@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if args.run_path.is_dir() and args.run_path.resolve() in (here := args.output.resolve(), *here.parents):
         raise InputError(f"{args.output}: lies in the run, which is only read; give another directory for the results")
     draws = not args.no_pictures and _can_draw()
+    asked = _doctor_command(args)
     open_map_argument(args)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     geo = reference_for(base_map.crs, formats)  # before anything slow: there may be none
@@ -98,9 +100,18 @@ def run(args: argparse.Namespace) -> int:
         written += [name for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG) if (args.output / name).exists()]
     print(summary(located))
     print(f"{'written':<18} {args.output}: {', '.join(written)}")
-    if not located.posed:
-        print(f"why, and what to do: coview-stream doctor {args.map} --run {args.run_path}")
+    if not located.posed or located.faults:
+        print(f"why, and what to do: {asked}")
     return 0 if located.posed else 1
+
+
+def _doctor_command(args: argparse.Namespace) -> str:
+    """Return the command of a shell that judges the same data; ``args`` name the map as it was given."""
+    words = ["coview-stream", "doctor", str(args.map), "--run", str(args.run_path)]
+    for name in ("around", "odometry", "mount", "cloud_delay", "cloud_topic", "odometry_topic"):
+        value = getattr(args, name)
+        words += [] if value in (None, "auto") else [f"--{name.replace('_', '-')}={value}"]  # it may begin with a minus
+    return shlex.join(words)
 
 
 def _can_draw() -> bool:

@@ -388,7 +388,9 @@ def summary(located: RunResult) -> str:
     begin = located.fixes[0].stamp if located.fixes else 0.0
     for cause, told in located.faults.items():
         span = f"{told.frames} frames from {told.first - begin:.1f} s to {told.last - begin:.1f} s"
-        lines.append(f"{'FAULT ' + cause.value:<18} {span}: {told.reason}")
+        never_mended = cause is RejectionReason.CONVENTIONS and bool(posed) and posed[-1].stamp < told.last
+        doubtful = "; poses before it are not to be trusted" * never_mended
+        lines.append(f"{'FAULT ' + cause.value:<18} {span}: {told.reason}{doubtful}")
     if located.smoothed is not None and not posed:
         lines.append(f"{'smoothed':<18} nothing: there was no fix to smooth from")
     if located.skipped:

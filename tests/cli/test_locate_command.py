@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 
 import numpy as np
@@ -57,9 +58,12 @@ def test_smoothed_poses_are_written_beside_the_live_ones(world_file, world_run, 
 
 def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["locate", str(world_file), str(elsewhere_run), "-o", str(out), "--no-pictures"]) == 1
+    given = ["--mount=0,0,1", "--cloud-delay=-0.01"]
+    assert main(["locate", str(world_file), str(elsewhere_run), "-o", str(out), "--no-pictures", *given]) == 1
     captured = capsys.readouterr()
     assert "0 of 3 frames" in captured.out
+    asked = shlex.join(["coview-stream", "doctor", str(world_file), "--run", str(elsewhere_run), *given])
+    assert captured.out.endswith(f"\nwhy, and what to do: {asked}\n")
     assert captured.err == ""
     assert (out / "trajectory.tum").read_text() == ""
     result = json.loads((out / "result.json").read_text())
@@ -94,7 +98,9 @@ def test_clouds_of_identical_bytes_are_named_in_the_summary(world_file, world_ru
     for path in others:
         shutil.copy(first, path)
     main(["locate", str(world_file), str(run), "-o", str(tmp_path / "out"), "--no-pictures"])
-    assert "the lidar repeats itself" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "the lidar repeats itself" in printed
+    assert printed.endswith(f"\nwhy, and what to do: coview-stream doctor {world_file} --run {run}\n")
 
 
 @pytest.mark.parametrize(

@@ -195,6 +195,11 @@ def test_faults_of_sensors_are_reported_whether_there_are_poses_or_not(world_map
         {"cause": "clock", "first_stamp": 12.0, "last_stamp": 12.0, "frames": 1, "reason": f"{clock} at 12"},
     ]
     assert re.search(r"^FAULT repeated +2 frames from 0\.5 s to 1\.5 s: .* at 11\.5$", summary(found), re.MULTILINE)
+    distrust = "; poses before it are not to be trusted"
+    axes = fix(13.0, RejectionReason.CONVENTIONS)
+    assert re.search(rf"^FAULT conventions .*{distrust}$", summary(RunResult(6, [*found.fixes, axes])), re.MULTILINE)
+    assert distrust not in summary(found)
+    assert distrust not in summary(RunResult(6, [axes, fix(14.0, None, True)]))  # it went by
     unposed = RunResult(2, found.fixes[1:3])
     assert "FAULT repeated" in summary(unposed)
     assert "FAULT" not in summary(RunResult(1, found.fixes[:1]))
