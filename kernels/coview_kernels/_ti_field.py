@@ -9,7 +9,6 @@ from coview_kernels import runtime
 from coview_kernels.launch import SPAN
 from coview_kernels.reference.field import (
     EDGE_STEP,
-    LEAN,
     NEAR_STEP,
     NEAR_TURN,
     NOT_SURVEYED,
@@ -105,14 +104,14 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
 
 @ti.func
 def fine_hits(
-    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, a, b, step,
+    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     for p in range(structure.shape[0] // 3):
         u, v = structure[3 * p], structure[3 * p + 1]
-        level = ti.cast(ti.floor(2.0 * (z + a * u + b * v + structure[3 * p + 2])), ti.i64) & 63
+        level = ti.cast(ti.floor(2.0 * (z + structure[3 * p + 2])), ti.i64) & 63
         rows = ti.Vector.zero(ti.i32, 3)
         columns = ti.Vector.zero(ti.i32, 3)
         for k in ti.static(range(3)):
@@ -126,7 +125,7 @@ def fine_hits(
 
 @ti.func
 def hits_at(
-    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, a, b
+    table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw
 ) -> ti.i32:  # fmt: skip
     """Count at a pose points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
@@ -134,36 +133,27 @@ def hits_at(
     for p in range(structure.shape[0] // 3):
         u, v = structure[3 * p], structure[3 * p + 1]
         at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v) + first
-        level = z + a * u + b * v + structure[3 * p + 2]
+        level = z + structure[3 * p + 2]
         hits += bit(bits[at], level) + bit(bits[at + 1], level)
     return hits
 
 
 @ti.func
-def change(
+def rise(
     table: ti.template(), down, across, base: ti.template(), surface: ti.template(), low: ti.template(),
-    x, y, z, yaw, a, b, reach,
-):  # fmt: skip
-    """Return by how much the scan has to rise and to lean to lie on the map's ground, from points within ``reach``."""
+    x, y, z, yaw, reach,
+) -> ti.f32:  # fmt: skip
+    """Return by how much the scan has to rise to the map's ground, from points within ``reach`` of it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
-    number = ti.cast(0.0, ti.f32)
-    sums = ti.Vector.zero(ti.f32, 3)  # u, v, d
-    squares = ti.Vector.zero(ti.f32, 5)  # uu, uv, vv, ud, vd
+    total, number = ti.cast(0.0, ti.f32), 0
     for p in range(low.shape[0] // 3):
         u, v = low[3 * p], low[3 * p + 1]
         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - a * u - b * v - low[3 * p + 2]
-        if ground_of(surface[at]) > NOT_SURVEYED and ti.abs(d) < reach:
-            number += 1.0
-            sums += ti.Vector([u, v, d])
-            squares += ti.Vector([u * u, u * v, v * v, u * d, v * d])
-    u, v, d = sums[0] / ti.max(number, 1.0), sums[1] / ti.max(number, 1.0), sums[2] / ti.max(number, 1.0)
-    ridge = ti.cast((ON_GROUND / LEAN) ** 2, ti.f32)
-    uu, uv, vv = squares[0] - u * sums[0] + ridge, squares[1] - u * sums[1], squares[2] - v * sums[1] + ridge
-    ud, vd = squares[3] - u * sums[2] - ridge * a, squares[4] - v * sums[2] - ridge * b
-    size = uu * vv - uv * uv
-    more_a, more_b = (vv * ud - uv * vd) / size, (uu * vd - uv * ud) / size
-    return ti.Vector([d - more_a * u - more_b * v, more_a, more_b])
+        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[3 * p + 2]
+        counts = ti.cast(ground_of(surface[at]) > NOT_SURVEYED, ti.i32) & ti.cast(ti.abs(d) < reach, ti.i32)
+        total += ti.select(counts > 0, d, 0.0)
+        number += counts
+    return total / ti.max(number, 1)
 
 
 @runtime.kernel
@@ -185,7 +175,6 @@ def score(
                     y = ti.cast(poses[4 * h + 1], ti.f32)
                     z = ti.cast(poses[4 * h + 2], ti.f32)
                     yaw = ti.cast(poses[4 * h + 3], ti.f32)
-                    lean_x, lean_y = ti.cast(0.0, ti.f32), ti.cast(0.0, ti.f32)  # rise per metre along the scan's axes
                     step, angle = ti.cast(NEAR_STEP, ti.f32), ti.cast(NEAR_TURN, ti.f32)
                     if levels > 0:
                         if coarse > 0:
@@ -196,16 +185,11 @@ def score(
                             step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                         for k in range(2):  # a loop: each call in the source is compiled by itself
                             reach = ti.select(k == 0, ti.cast(2.0, ti.f32), ti.cast(0.5, ti.f32))
-                            more = change(
-                                table, down, across, base, surface, lows, x, y, z, yaw, lean_x, lean_y, reach
-                            )  # fmt: skip
-                            z += more[0]
-                            lean_x += more[1]
-                            lean_y += more[2]
+                            z += rise(table, down, across, base, surface, lows, x, y, z, yaw, reach)
                     for _ in range(levels):
                         # the shift first, then the heading there: a third of what all pairs of them would cost
                         hits = ti.Vector.zero(ti.i32, 9)
-                        fine_hits(table, down, across, bits, first, some, x, y, z, yaw, lean_x, lean_y, step, hits)
+                        fine_hits(table, down, across, bits, first, some, x, y, z, yaw, step, hits)
                         best, bi, bj, bk = -1, 0, 0, 0
                         for i in ti.static(range(3)):
                             for j in ti.static(range(3)):
@@ -216,18 +200,14 @@ def score(
                         y += step * bi
                         for k in range(2):
                             turned = yaw + angle * (2 * k - 1)
-                            there = hits_at(table, down, across, bits, first, some, x, y, z, turned, lean_x, lean_y)
-                            value = 4 * there - 1
+                            value = 4 * hits_at(table, down, across, bits, first, some, x, y, z, turned) - 1
                             if value > best:
                                 best, bk = value, 2 * k - 1
                         yaw += angle * bk
                         step *= 0.5
                         angle *= 0.5
                     if levels > 0:
-                        more = change(table, down, across, base, surface, lows, x, y, z, yaw, lean_x, lean_y, 0.5)
-                        z += more[0]
-                        lean_x += more[1]
-                        lean_y += more[2]
+                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     c, s = ti.cos(yaw), ti.sin(yaw)
                     inside, close, covered, inside_low, grounded, passed, on = 0, 0, 0, 0, 0, 0, 0
                     for p in range(structure.shape[0] // 3):
@@ -235,7 +215,7 @@ def score(
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
                         word = surface[at]
                         known = ti.cast(ground_of(word) != NOT_SURVEYED, ti.i32)
-                        level = z + lean_x * u + lean_y * v + structure[3 * p + 2]
+                        level = z + structure[3 * p + 2]
                         edge = word >> 16
                         hit = bit(bits[2 * at + first], level)
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
@@ -248,7 +228,7 @@ def score(
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
                         height = ground_of(surface[at])
                         known = ti.cast(height != NOT_SURVEYED, ti.i32)
-                        level = z + lean_x * u + lean_y * v + low[3 * p + 2]
+                        level = z + low[3 * p + 2]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
                         upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1 + first], level)
@@ -257,7 +237,7 @@ def score(
                     for p in range(free.shape[0] // 3):
                         u, v = free[3 * p], free[3 * p + 1]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-                        passed += bit(bits[2 * at + 1 + first], z + lean_x * u + lean_y * v + free[3 * p + 2])
+                        passed += bit(bits[2 * at + 1 + first], z + free[3 * p + 2])
                     poses[4 * h] = x
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z

@@ -6,8 +6,7 @@ points that the map explains there (:class:`FieldScores`). It only looks up: no 
 
 1. coarse: some of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
    to six degrees off: one pass over the points for each heading, since shifts are neighbouring cells.
-2. height and lean: the plane through the differences of the map's ground and the scan's, twice: a sensor is mounted by
-   eye. The lean is a rise of the scan's points by their distance; poses stay level.
+2. height: the mean difference of the map's ground and the scan's, twice.
 3. fine: the eight neighbours half a metre away, and two headings a degree off at the best; then the same at half these
    steps. A point counts twice on half-metre cells with structure, once within half a metre of one.
 4. counts, with all points.

@@ -22,9 +22,6 @@ ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
 """Metres: off the ground that still are on it; above a roof edge that still are below it; above the lowest surface from
 which on the bits alone tell a floor; a unit of the stored edges."""
 
-LEAN = 0.0698
-"""Radians, one sigma of roll and pitch of a scan: sensors are mounted by eye, odometry's gravity drifts."""
-
 
 class FieldLayers(NamedTuple):
     """Rasters of a map as they are looked up; tile 0 is empty and stands for what has not been surveyed."""
@@ -63,11 +60,9 @@ def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]
     """
     poses, counts = start.copy(), np.zeros((len(start), 7), dtype=np.int32)
     for pose, count in zip(poses, counts, strict=True):
-        leaning = np.append(pose, (0.0, 0.0))  # and the rise per metre along the scan's axes
         if plan.levels:
-            _refine(layers, plan, leaning)
-        count[:] = _counts(layers, plan, leaning)
-        pose[:] = leaning[:4]
+            _refine(layers, plan, pose)
+        count[:] = _counts(layers, plan, pose)
     return poses, counts
 
 
@@ -77,23 +72,23 @@ def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
         pose += _coarse_shift(layers, plan, pose)
         step, angle = 0.5, 0.5 * TURN
     for reach in (2.0, 0.5):
-        pose += _change(layers, plan.lows, pose, reach)
+        pose[2] += _rise(layers, plan.lows, pose, reach)
     for _ in range(plan.levels):
-        best, move = -1, np.zeros(6)
+        best, move = -1, np.zeros(4)
         for i, j in np.ndindex(3, 3):
-            there = np.array([step * (j - 1), step * (i - 1), 0.0, 0.0, 0.0, 0.0])
+            there = np.array([step * (j - 1), step * (i - 1), 0.0, 0.0])
             value = 4 * _fine_hits(layers, plan.some, pose + there) - abs(i - 1) - abs(j - 1)
             if value > best:
                 best, move = value, there
         pose += move
         turn = 0.0
         for k in (-1, 1):
-            value = 4 * _fine_hits(layers, plan.some, pose + np.array([0.0, 0.0, 0.0, angle * k, 0.0, 0.0])) - 1
+            value = 4 * _fine_hits(layers, plan.some, pose + np.array([0.0, 0.0, 0.0, angle * k])) - 1
             if value > best:
                 best, turn = value, angle * k
         pose[3] += turn
         step, angle = 0.5 * step, 0.5 * angle
-    pose += _change(layers, plan.lows, pose, 0.5)
+    pose[2] += _rise(layers, plan.lows, pose, 0.5)
 
 
 def _coarse_shift(layers: FieldLayers, plan: Plan, pose: F64) -> F64:
@@ -105,15 +100,14 @@ def _coarse_shift(layers: FieldLayers, plan: Plan, pose: F64) -> F64:
             value = 16 * int(hits[i, j]) - abs(i - REACH) - abs(j - REACH) - abs(a - TURNS // 2)
             if value > best:
                 best, shift = value, (i - REACH, j - REACH, a - TURNS // 2)
-    return np.array([shift[1], shift[0], 0.0, TURN * shift[2], 0.0, 0.0])
+    return np.array([shift[1], shift[0], 0.0, TURN * shift[2]])
 
 
 def _placed(points: F32, pose: F64) -> F32:
-    x, y, z, yaw, *lean = pose.astype(np.float32)
+    x, y, z, yaw = pose.astype(np.float32)
     c, s = np.cos(yaw), np.sin(yaw)
     u, v, w = points.T
-    a, b = lean or (np.float32(0.0), np.float32(0.0))
-    return np.stack([x + c * u - s * v, y + s * u + c * v, z + a * u + b * v + w], axis=1)
+    return np.stack([x + c * u - s * v, y + s * u + c * v, z + w], axis=1)
 
 
 def _coarse_hits(planes: U16, structure: F32, pose: F64, yaw: float) -> I64:
@@ -155,16 +149,13 @@ def ground_heights(layers: FieldLayers, points: F32) -> F32:
     return np.where(has, height, np.float32(np.nan))
 
 
-def _change(layers: FieldLayers, low: F32, pose: F64, reach: float) -> F64:
-    """Change (6,) of a pose after which the scan's ground lies on the map's, from points within ``reach`` of it."""
+def _rise(layers: FieldLayers, low: F32, pose: F64, reach: float) -> float:
+    """Metres by which the scan has to rise for its ground to lie on the map's, from points within ``reach`` of it."""
     placed = _placed(low, pose)
     height, has, _ = _heights(layers, _cells(layers, placed))
     off = height - placed[:, 2]
     some = has & (np.abs(off) < reach)
-    A = np.column_stack([np.ones(int(some.sum())), low[some, :2]]).astype(np.float64)
-    prior = np.diag([1e-9, *2 * [(ON_GROUND / LEAN) ** 2]])
-    rise, a, b = np.linalg.solve(A.T @ A + prior, A.T @ off[some] - prior @ np.append(0.0, pose[4:]))
-    return np.array([0.0, 0.0, rise, 0.0, a, b])
+    return float(off[some].mean()) if some.any() else 0.0
 
 
 def _fine_hits(layers: FieldLayers, structure: F32, pose: F64) -> int:
