@@ -216,7 +216,7 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
             try:
                 with local_clouds([read if name in _STDIN else name for name in given], window) as clouds:
                     yield clouds
-            except CoViewError as error:  # names the file that nobody has given
+            except CoViewError as error:  # names the temporary file, which the user does not know
                 raise type(error)(str(error).replace(read, "stdin")) from error
         return
     from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address

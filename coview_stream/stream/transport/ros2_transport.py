@@ -290,7 +290,7 @@ class Ros2Transport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
     ) -> dict[str, Any]:
-        """Raise TransportError: nobody answers our keys in ROS."""
+        """Raise TransportError: no ROS node answers queries by key."""
         raise TransportError(f"{key}: no answer: ROS 2 has topics and services instead")
 
     def tokens(self, expression: str) -> list[str]:
