@@ -39,6 +39,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.fleet import Fleet
 from coview_stream.stream.node.last_place import LastPlace
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 _ODD: dict[str, tuple[Any, ...]] = {
@@ -309,6 +310,10 @@ def ghosts(folder: Path, data: bytes) -> object:
     def turn(real: bool = True) -> None:
         for fleet in fleets if real else ():
             fleet.tell()
+            for robot in robots:
+                if fleet._endpoints[robot].serving:
+                    status = json.dumps({"node": NodeIdentity(fleet.node).to_json()}).encode()
+                    net.publish(Sample(f"coview/{robot}/out/status", status, "application/json"))
         for fleet in fleets:
             fleet.look()
 

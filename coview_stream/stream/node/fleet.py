@@ -3,8 +3,9 @@
 Every node ranks all nodes that are alive for each robot by a hash of both names (rendezvous hashing), and the first one
 serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. A node
 is alive that holds a liveliness token and tells the others the places of its robots once a second: a token goes at once
-with its process, but any session may hold one. A node whose engines have not been ready for 7 s tells nothing, and
-gives its robots up when the others have noticed, if there are any.
+with its process, but any session may hold one. That a node serves a robot is believed of the robot's statuses alone: a
+robot is given up once a node that ranks higher has sent one, and taken by another when none has come for 3 s. A node
+whose engines have not been ready for 7 s tells nothing, ranks last, and takes no robots on while there are others.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from coview_stream.errors import TransportError
+from coview_stream.errors import TransportError, printable
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.last_place import LastPlace
 from coview_stream.stream.node.robot_endpoints import RobotEndpoints
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
@@ -33,7 +35,7 @@ LEASE_MS = 1000
 _MISSED = 2  # looks in a row that do not show a node, before it counts as gone
 _LOOK = 0.1  # seconds between two looks at the tokens
 _TELL = 1.0  # seconds between two messages of the robots' places
-_SILENT = 30  # looks in a row without such a message, 3 s, before a token alone counts for nothing
+_SILENT = 30  # looks in a row without such a message, 3 s, before a token alone counts for nothing; as of statuses
 _UNREADY = 70  # looks in a row, 7 s, at engines that are not ready: one that died has been started again sooner
 _MAX_HEARD = 1024  # messages between two looks
 _MAX_BYTES = 4 << 20  # of such a message that are read
@@ -48,6 +50,10 @@ def owner(robot: str, nodes: Collection[str]) -> str | None:
     return max(nodes, key=rank, default=None)
 
 
+def _names(nodes: Collection[str]) -> str:
+    return ", ".join(printable(node)[:64] for node in sorted(nodes)[:5]) + ", ..." * (len(nodes) > 5)
+
+
 class FleetMembers:
     """The nodes of a fleet that are alive: they hold a liveliness token and have been heard in the last 30 looks. Pure.
 
@@ -57,7 +63,7 @@ class FleetMembers:
     def __init__(self, node: str) -> None:
         self._node = node
         self._missed: dict[str, int] = {node: 0}
-        self._looks = 0  # that showed this node: a clock that stands still with it
+        self.looks = 0  # that showed this node: a clock that stands still with it
         self._heard: dict[str, int] = {}  # look of the newest message of those who have a token
         self._tokens: frozenset[str] = frozenset()
 
@@ -69,18 +75,18 @@ class FleetMembers:
     @property
     def settled(self) -> bool:
         """Whether all who hold a token have been heard, or have had the time: until then robots may have a node."""
-        return self._looks > _SILENT or self._tokens <= self.alive
+        return self.looks > _SILENT or self._tokens <= self.alive
 
     def look(self, tokens: Collection[str], heard: Collection[str] = ()) -> bool:
         """Take in who has a token now, and who was heard since the last look; return True if membership changed."""
         if self._node not in tokens:
             return False
         before = self.alive
-        self._looks += 1
+        self.looks += 1
         self._tokens = frozenset(tokens)
-        self._heard |= dict.fromkeys(heard, self._looks)
+        self._heard |= dict.fromkeys(heard, self.looks)
         self._heard = {node: look for node, look in self._heard.items() if node in tokens}
-        here = {node for node, look in self._heard.items() if self._looks - look < _SILENT} | {self._node}
+        here = {node for node, look in self._heard.items() if self.looks - look < _SILENT} | {self._node}
         for node in here:
             self._missed[node] = 0
         for node in before - here:
@@ -99,6 +105,7 @@ class Fleet:
         endpoints: of all robots of the fleet, by name; none of them is served yet.
         transport: of tokens and places.
         ready: tells whether this node's engines are.
+        period: seconds between two statuses of a robot, the same in all nodes.
     """
 
     def __init__(
@@ -108,6 +115,7 @@ class Fleet:
         endpoints: Mapping[str, RobotEndpoints],
         transport: Transport,
         ready: Callable[[], bool] = lambda: True,
+        period: float = 1.0,
     ) -> None:
         self.prefix, self.node = prefix, node
         self.members = FleetMembers(node)
@@ -116,12 +124,21 @@ class Fleet:
         self._ready, self._unready = ready, 0  # looks in a row at engines that were not
         self._errors = RateLimitedErrors(log)
         self._heard: deque[str] = deque(maxlen=_MAX_HEARD)  # nodes that have told something since the last look
-        self._told = float("-inf")  # local time
+        self._told = self._logged_at = float("-inf")  # local time
+        self._logged = frozenset({node})  # nodes that were alive at the newest log line about that
         self._ranked: frozenset[str] = frozenset()  # nodes by which robots have been shared; none before the first look
+        self._owners: dict[str, str | None] = {}  # of the robots, among these nodes
+        self._patience = max(_SILENT, round(3.0 * period / _LOOK))  # looks without a status of a robot
+        self._statuses: dict[tuple[str, str], bool] = {}  # since the last look, by robot and node: whether it ends
+        self._lock = threading.Lock()  # of these
+        self._servers: dict[str, dict[str, int]] = {robot: {} for robot in endpoints}  # look of each node's newest
+        self._served: dict[str, int] = {}  # newest look at which each robot was known to be served
+        self.unserved: tuple[str, ...] = ()  # robots that no node is known to serve
         self._places: dict[str, LastPlace] = {}  # of robots of other nodes, as these told
         self._arriving: dict[str, LastPlace] = {}  # of robots that were taken on, and whose odometry has not come yet
         self._publisher = transport.publisher(f"{prefix}/places/{node}", "data")
         transport.subscribe(f"{prefix}/places/*", self._on_places, "all")
+        transport.subscribe(f"{prefix.rsplit('/', 2)[0]}/*/out/status", self._on_status, "all")
         transport.announce(f"{prefix}/nodes/{node}")
         log.info("%s: this node is %s", prefix, node)
 
@@ -144,26 +161,62 @@ class Fleet:
         except TransportError:
             return  # cut off: nothing is known
         before = self.members.alive
-        if self.members.look(tokens, [self._heard.popleft() for _ in range(len(self._heard))]):
-            after = self.members.alive
-            if after - before:
-                self._told = float("-inf")  # one that has come does not know this node yet
-            changes = ((after - before, "came"), (before - after, "went"))
-            news = "; ".join(f"{', '.join(sorted(nodes))} {verb}" for nodes, verb in changes if nodes)
-            log.info("fleet: %s: %d nodes", news, len(after))
+        self.members.look(tokens, [self._heard.popleft() for _ in range(len(self._heard))])
+        after = self.members.alive
+        if after - before:
+            self._told = float("-inf")  # one that has come does not know this node yet
+        if after != self._logged and time.monotonic() - self._logged_at > _TELL:
+            changes = ((after - self._logged, "came"), (self._logged - after, "went"))
+            log.info(
+                "fleet: %s: %d nodes", "; ".join(f"{_names(new)} {verb}" for new, verb in changes if new), len(after)
+            )
+            self._logged, self._logged_at = after, time.monotonic()
         self._unready = 0 if self._ready() else self._unready + 1
-        others = self.members.alive - {self.node}
-        alive = others if others and self._unready >= _UNREADY + _SILENT else self.members.alive
-        if self.node in tokens and self.members.settled and self._ranked != alive:
-            self._ranked = alive
-            self._move({robot for robot in self._endpoints if owner(robot, self._ranked) == self.node})
+        with self._lock:
+            statuses, self._statuses = self._statuses, {}
+        for (robot, node), ends in statuses.items():
+            self._servers[robot].pop(node, None)
+            if not ends:
+                self._servers[robot][node] = self._served[robot] = self.members.looks
+        if self.node in tokens and self.members.settled:
+            self._share()
         for robot, place in list(self._arriving.items()):
             if self._endpoints[robot].session.offer(place):
                 del self._arriving[robot]
 
-    def _move(self, owned: set[str]) -> None:
-        served = {name for name, robot in self._endpoints.items() if robot.serving}
-        given_up, taken = served - owned, owned - served
+    def _share(self) -> None:
+        """Give up the robots that a node of a higher rank serves; take those of this node, and those of nobody."""
+        alive, look = self.members.alive, self.members.looks
+        if alive != self._ranked:
+            self._ranked, self._owners = alive, {robot: owner(robot, alive) for robot in self._endpoints}
+            for robot, nodes in self._servers.items():
+                self._servers[robot] = {node: at for node, at in nodes.items() if node in alive}
+        servers = {
+            robot: {node for node, at in nodes.items() if look - at < self._patience}
+            for robot, nodes in self._servers.items()
+        }
+        at_work = {self.node}.union(*servers.values())
+        last, others = self._unready >= _UNREADY, alive - {self.node}
+        given_up, taken, orphans, unserved = list[str](), list[str](), list[str](), list[str]()
+        for robot, endpoints in self._endpoints.items():
+            self._served[robot] = look if endpoints.serving else self._served.get(robot, look)
+            if endpoints.serving:
+                if any(last or owner(robot, (self.node, node)) == node for node in servers[robot]):
+                    given_up.append(robot)
+            elif self._owners[robot] == self.node and not (last and others):
+                taken.append(robot)
+            elif not servers[robot]:
+                unserved.append(robot)
+                if look - self._served[robot] >= self._patience and not last and owner(robot, at_work) == self.node:
+                    orphans.append(robot)
+        if orphans:
+            names = _names({str(self._owners[robot]) for robot in orphans})
+            log.warning("fleet: %d robots that nobody serves: %s should", len(orphans), names)
+        self.unserved = tuple(unserved)
+        if given_up or taken or orphans:
+            self._move(given_up, taken + orphans)
+
+    def _move(self, given_up: Collection[str], taken: Collection[str]) -> None:
         if given_up:
             self.tell()  # the newest places, before they are forgotten
         for name in given_up:
@@ -175,11 +228,8 @@ class Fleet:
             if place is not None and place.map_sha256 == self._endpoints[name].session.site_sha256:
                 self._arriving[name] = place
             self._endpoints[name].begin_serving()
-        if given_up or taken:
-            log.info(
-                "fleet: %d robots taken on, %d given up; %d are this node's",
-                len(taken), len(given_up), len(owned),
-            )  # fmt: skip
+        own = sum(robot.serving for robot in self._endpoints.values())
+        log.info("fleet: %d robots taken on, %d given up; %d are this node's", len(taken), len(given_up), own)
 
     def tell(self) -> None:
         """Tell the others that this node is alive, and the places of its robots; not without engines."""
@@ -202,3 +252,10 @@ class Fleet:
                     self._places[name] = LastPlace.from_message(plain)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             self._errors.report(f"{self.prefix}/places", error)  # one place: strangers choose their names
+
+    def _on_status(self, sample: Sample) -> None:
+        robot = sample.key.split("/")[-3]
+        node = NodeIdentity.read(bytes(sample.payload)) if robot in self._endpoints else None
+        if node is not None and node.node != self.node and node.node in self._ranked:
+            with self._lock:
+                self._statuses[robot, node.node] = node.ending

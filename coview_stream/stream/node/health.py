@@ -17,6 +17,7 @@ from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.maps.map_follower import MapFollower
+from coview_stream.stream.node.fleet import Fleet
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.http_server import HttpServer, Reply
@@ -33,12 +34,17 @@ class NodeHealth:
     """Health of a node.
 
     It is *live* as long as its pose clock ticks and none of its threads has ended: otherwise it has to be started
-    again. It is *ready* when a robot's messages would be used now: its engines have opened the map and, if it
-    ``needs_connection``, it is connected. ``follower`` is of the map's sources elsewhere, if any.
+    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, it is connected,
+    if it ``needs_connection``, and no robot of its ``fleet``, if any, is without a node. ``follower`` is of the map's
+    sources elsewhere, if any.
     """
 
-    def __init__(self, node: Node, needs_connection: bool = False, follower: MapFollower | None = None) -> None:
+    def __init__(
+        self, node: Node, needs_connection: bool = False, follower: MapFollower | None = None,
+        fleet: Fleet | None = None,
+    ) -> None:  # fmt: skip
         self._node = node
+        self._fleet = fleet
         self._needs_connection = needs_connection
         self._follower = follower
         self._errors = RateLimitedErrors(log)
@@ -60,6 +66,8 @@ class NodeHealth:
             connection = self._node.transport.connection()
             if not (connection.routers or connection.peers):
                 reasons.append("not connected to any router or peer")
+        if self._fleet is not None and (unserved := self._fleet.unserved):
+            reasons.append(f"no node of the fleet serves {', '.join(unserved[:5])}{', ...' * (len(unserved) > 5)}")
         return reasons
 
     def document(self) -> dict[str, Any]:

@@ -189,7 +189,7 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
     from coview_stream.stream.node.last_place_keeper import LastPlaceKeeper
 
     services: dict[str, Service] = {}
-    follower = None
+    follower, fleet = None, None
     if options.state is not None:
         services["last-pose"] = LastPlaceKeeper(options.state, node.sessions).run
     if options.mirrors and node.reloader is not None:
@@ -197,11 +197,12 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
         follower = MapFollower(options.mirrors, reloader.request, lambda: reloader.outcome)
         services["map source"] = follower.run
     if options.fleet is not None:
-        services["fleet"] = Fleet(
+        fleet = Fleet(
             options.fleet, node.identity.node, node.endpoints, node.transport,
-            lambda: all(engine.ready for engine in node.feeds[0].engines.values()),
-        ).run  # fmt: skip
-    health = NodeHealth(node, bool(options.network.connect), follower)
+            lambda: all(engine.ready for engine in node.feeds[0].engines.values()), node.identity.period,
+        )  # fmt: skip
+        services["fleet"] = fleet.run
+    health = NodeHealth(node, bool(options.network.connect), follower, fleet)
     if (keys := options.node_keys) is not None:
         health.answer(keys)
         services["health"] = lambda stopping: health.run(stopping, keys)

@@ -14,7 +14,9 @@ from coview_stream.errors import TransportError
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.fleet import Fleet, FleetMembers, owner
+from coview_stream.stream.node.health import NodeHealth
 from coview_stream.stream.node.last_place import LastPlace
+from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 NODES = [f"node{k}" for k in range(5)]
@@ -71,6 +73,7 @@ class Member(Site):
 
     def __init__(self, net, name, robots):
         super().__init__(*robots, net=net, shared=True)
+        self.node.reporter.identity = NodeIdentity(name)
         self.node.declare()
         self.ready = True
         self.fleet = Fleet(PREFIX, name, self.node.endpoints, net, ready=lambda: self.ready)
@@ -87,6 +90,7 @@ class Member(Site):
     def tell(*nodes):
         for node in nodes:
             node.fleet.tell()
+            node.node.reporter.publish(time.monotonic())
 
     @property
     def serves(self):
@@ -105,11 +109,9 @@ def test_each_robot_is_served_by_one_node_and_moves_with_its_place():
     assert not a.serves & b.serves
     assert a.serves
     assert b.serves
-    for node in nodes.values():
-        node.node.reporter.publish(time.monotonic())
     for robot in robots:
-        ids = [json.loads(sample.payload)["node"]["id"] for sample in net.samples(f"coview/{robot}/out/status")]
-        assert ids == [(a if robot in a.serves else b).node.identity.node]
+        ids = {json.loads(sample.payload)["node"]["id"] for sample in net.samples(f"coview/{robot}/out/status")}
+        assert ids == {"a" if robot in a.serves else "b"}
 
     mover = min(b.serves)
     net.publish(Sample(f"{PREFIX}/places/b", b"\xff{", "application/json"))
@@ -126,19 +128,40 @@ def test_each_robot_is_served_by_one_node_and_moves_with_its_place():
     np.testing.assert_allclose(hint, T_MAP_ODOM @ pose(3.0) @ pose(2.0), atol=1e-9)
 
 
-def test_ghosts_with_tokens_take_no_robot():
-    net, robots = MemoryTransport(), ROBOTS[:20]
-    nodes = [Member(net, name, robots) for name in ("a", "b")]
+@pytest.mark.parametrize("talk", [False, True])
+def test_ghosts_take_no_robot_and_leave_none_unserved(talk):
+    net, robots = MemoryTransport(), ROBOTS[:8]
+    nodes = [Member(net, name, robots) for name in ("a", "b", "c")]
+    a, b, _ = nodes
     Member.look(*nodes)
-    for ghost in range(20):
-        net.announce(f"{PREFIX}/nodes/ghost{ghost}")
-    Member.look(*nodes)
-    assert nodes[0].serves | nodes[1].serves == set(robots)
-    late = Member(net, "c", robots)
-    for _ in range(50):
-        late.fleet.look()  # others do not wait for ghosts for ever
-    Member.look(*nodes, late)
-    assert set.union(*(node.serves for node in (*nodes, late))) == set(robots)
+    held = []
+
+    def passes(seconds, *nodes):
+        for at in range(round(10 * seconds)):
+            if at % 10 == 0:
+                Member.tell(*nodes)
+                held.append(f"ghost{len(held)}")  # one that nobody has missed yet
+                net.announce(f"{PREFIX}/nodes/{held[-1]}")
+                told = json.dumps({"r1": LastPlace(SHA, T_map_odom=T_MAP_ODOM).to_message()})
+                for ghost in held if talk else ():
+                    net.publish(Sample(f"{PREFIX}/places/{ghost}", told.encode(), "application/json"))
+            for node in nodes:
+                node.fleet.look()
+
+    passes(8.0, *nodes)
+    assert NodeHealth(a.node, fleet=a.fleet).ready_reasons() == []
+    assert sorted(robot for node in nodes for robot in node.serves) == sorted(robots)
+    net.withdraw(f"{PREFIX}/nodes/c")
+    passes(2.0, a, b)
+    reasons = NodeHealth(a.node, fleet=a.fleet).ready_reasons()  # a ghost should serve them
+    assert [reason.startswith("no node of the fleet serves r") for reason in reasons] == [True] * talk
+    passes(2.0, a, b)
+    assert not a.fleet.unserved
+    assert sorted([*a.serves, *b.serves]) == sorted(robots)
+    late = Member(net, "d", robots)
+    passes(5.0, a, b, late)  # it does not wait for ghosts for ever
+    assert late.serves or talk  # ghosts rank first for all
+    assert sorted([*a.serves, *b.serves, *late.serves]) == sorted(robots)
 
 
 def test_node_without_engines_gives_its_robots_up_while_there_are_others():
