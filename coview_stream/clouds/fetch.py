@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import ipaddress
 import math
 import os
 import shutil
+import socket
 import time
 import urllib.error
 import urllib.request
@@ -131,14 +133,30 @@ def download(address: str, target: Path) -> int:
     return size
 
 
+def _nearness(address: str) -> list[int]:
+    """Return for each address of a web server: 0 on the internet, 1 in a private network, 2 on the link, 3 here."""
+    try:
+        found = {info[4][0] for info in socket.getaddrinfo(urlsplit(address).hostname, None)}
+    except OSError:  # known to a proxy, perhaps
+        return [0]
+    out = []
+    for text in found:
+        ip = ipaddress.ip_address(text)
+        ip = getattr(ip, "ipv4_mapped", None) or ip
+        out.append(3 if ip.is_loopback or ip.is_unspecified else 2 if ip.is_link_local else int(not ip.is_global))
+    return out
+
+
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follows a server's word to other web servers, never from https to http."""
+    """Follows a server's word to other web servers, never from https to http, nor nearer to this machine than it is."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
         if not is_web_address(newurl) or (req.type == "https" and not newurl.lower().startswith("https://")):
             raise ValueError(f"{newurl[:80]!r} after {req.type}")
+        if max(_nearness(newurl)) > min(_nearness(req.full_url)):
+            raise ValueError(f"{newurl[:80]!r} is nearer to this machine than the server")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 

@@ -160,11 +160,16 @@ def test_servers_and_files_that_cannot_be_used_are_named(
     [
         ("https://a/x", "https://b/x", True), ("http://a/x", "https://a/x", True), ("http://a/x", "http://b/x", True),
         ("https://a/x", "http://a/x", False), ("http://a/x", "ftp://a/x", False), ("https://a/x", "file:///x", False),
+        ("http://a/x", "http://169.254.169.254/", False), ("http://8.8.8.8/", "http://2852039166/x", False),
+        ("http://a/x", "http://[::ffff:127.0.0.1]/", False), ("http://10.0.0.1/", "http://localhost:80/", False),
+        ("http://8.8.8.8/", "http://10.0.0.1/", False), ("http://10.0.0.1/", "http://[fe80::1]/", False),
+        ("http://127.0.0.1/", "http://localhost:80/", True), ("http://10.0.0.1/", "http://192.168.0.1/", True),
+        ("http://169.254.1.1/", "http://8.8.8.8/", True), ("http://0.0.0.0/", "http://169.254.1.1/", True),
     ],
 )  # fmt: skip
-def test_server_leads_to_web_servers_only_and_never_out_of_https(at: str, to: str, followed: bool) -> None:
+def test_server_leads_to_web_servers_that_are_as_far_and_never_out_of_https(at: str, to: str, followed: bool) -> None:
     request = urllib.request.Request(at)
-    with contextlib.nullcontext() if followed else pytest.raises(ValueError, match="after http"):
+    with contextlib.nullcontext() if followed else pytest.raises(ValueError, match=r"after http|nearer"):
         assert _Redirects().redirect_request(request, None, 302, "Found", {}, to)
 
 
