@@ -29,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the cloud from above")
     parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as given to `locate` (auto)")
-    add_shared(parser, "--gravity", "--mount", "--cloud-topic", "--odometry-topic", "--verify-key", "--progress")
+    add_shared(parser, "--gravity", "--mount", "--cloud-delay", "--cloud-topic", "--odometry-topic")
+    add_shared(parser, "--verify-key", "--progress")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     if args.picture is not None:
         require_library("matplotlib", "matplotlib>=3.8", "--picture")
     given = mount_of(args)
-    lidar_options = lidar_config(args.odometry, args.gravity)
+    lidar_options = lidar_config(args.odometry, args.gravity, delay=args.cloud_delay)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     config = FuseConfig(
         voxel=base_map.config.voxel if args.voxel is None else args.voxel,
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         lidar = None if lidar_options is None else LidarOdometry(lidar_options)
         return open_run(path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, None, given or mount)
 
-    runs = [LocalizedRun(pair, base_map, open_it) for pair in pairs]
+    runs = [LocalizedRun(pair, base_map, open_it, args.cloud_delay or 0.0) for pair in pairs]
     for note in (note for each in runs for note in each.notes):
         print(note, file=sys.stderr)
     with tqdm(unit="frame", disable=not (args.progress or sys.stderr.isatty()), leave=False) as bar:

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|none",
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
-    add_shared(parser, "--mount", "--cloud-topic", "--odometry-topic")
+    add_shared(parser, "--mount", "--cloud-delay", "--cloud-topic", "--odometry-topic")
     parser.add_argument(
         "--wait",
         type=float,
@@ -84,9 +84,12 @@ def run(args: argparse.Namespace) -> int:
     if bare:
         if args.odometry_topic is not None:
             raise ConfigError("--odometry none and --odometry-topic: give one of them")
+        if args.cloud_delay:
+            raise ConfigError("--odometry none and --cloud-delay: clouds alone are late after nothing")
         recorded = open_bare_run(args.run_path, args.cloud_topic, mount)
     else:
         recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, mount=mount)
+        recorded = recorded.with_late_clouds(args.cloud_delay or 0.0)
     for note in recorded.notes:
         print(note, file=sys.stderr)
     transport = open_client(args.connect, args.listen, args.zenoh_config)

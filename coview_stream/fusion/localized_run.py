@@ -82,8 +82,12 @@ class LocalizedRun:
         damaged: indices of frames that could not be read so far.
     """
 
-    def __init__(self, pair: RunPair, base_map: BaseMap, open_it: Callable[[Path, Mount | None], Run]) -> None:
+    def __init__(
+        self, pair: RunPair, base_map: BaseMap, open_it: Callable[[Path, Mount | None], Run], cloud_delay: float = 0.0
+    ) -> None:
         """Read the results, then open the run with ``open_it`` (its path, the mount of ``locate``).
+
+        Where the results do not have the seconds that clouds are stamped later than odometry, ``cloud_delay`` is taken.
 
         Raises:
             InputError: the results are of another map, no frame has a pose, or files cannot be read.
@@ -100,7 +104,10 @@ class LocalizedRun:
         names = ("roll_deg", "pitch_deg", "odometry_turn_deg_per_m", "heading_deg")
         roll, pitch, turn, heading = np.radians([_number(calibration, name) for name in names]).tolist()
         lever = _number(calibration, "lever_x_m"), _number(calibration, "lever_y_m")
-        scale, delay = _number(calibration, "odometry_scale", 1.0) - 1.0, _number(calibration, "clouds_late_s")
+        scale, delay = (
+            _number(calibration, "odometry_scale", 1.0) - 1.0,
+            _number(calibration, "clouds_late_s", cloud_delay),
+        )
         self._calibration = Calibration(
             roll, pitch, scale, turn, heading=heading, lever_x=lever[0], lever_y=lever[1], delay=delay
         )

@@ -15,7 +15,7 @@ from coview_stream.clouds.files import read_cloud
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, Poses
+from coview_stream.geometry.transforms import Points, Pose, Poses, interpolate
 from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.layouts import Layout
 
@@ -121,6 +121,21 @@ class Run:
         source = None if self.source is None else _SelectedClouds(self.source, indices)
         files, stamps, poses = self.frames_paths[index], self.stamps[index], self.poses[index]
         return replace(self, frames_paths=files, stamps=stamps, poses=poses, source=source)
+
+    def with_late_clouds(self, delay: float) -> Run:
+        """Return the run with the times and odometry that its clouds were measured at, ``delay`` seconds before theirs.
+
+        Frames before the first odometry or after the last are left out; RunError if that is all of them.
+        """
+        stamps = self.stamps - delay
+        first, end = np.searchsorted(stamps, self.stamps[0]), np.searchsorted(stamps, self.stamps[-1], "right")
+        if len(self) < 2 or not delay:
+            return self
+        stamps = stamps[first:end]
+        after = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self) - 1)
+        share = (stamps - self.stamps[after - 1]) / (self.stamps[after] - self.stamps[after - 1])
+        poses = interpolate(self.poses[after - 1], self.poses[after], share)
+        return replace(self[int(first) : int(end)], stamps=stamps, poses=poses)
 
     def __repr__(self) -> str:
         """Return path, number of frames, duration and distance in one line."""

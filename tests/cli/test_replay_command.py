@@ -74,6 +74,10 @@ def test_replayed_run_arrives_complete(node, run_folder, capsys):
     assert "16 odometry samples sent" in captured.out
     assert "put p50" in captured.out
     assert captured.err == ""
+    assert node.replay(run_folder, "--rate", "20", "--cloud-delay", "0.5") == 0  # the first is before all odometry
+    until(lambda: len(node.clouds()) == 11)
+    assert sorted(m.stamp_ns for m in node.clouds()[6:]) == [(20 + k) * 10**9 + 5 * 10**8 for k in range(5)]
+    assert {float(m.T_odom_body[0, 3]) % 1.0 for m in node.odometry() if m.stamp_ns % 10**9} >= {0.5}
 
 
 @pytest.mark.slow
@@ -87,6 +91,7 @@ def test_replay_of_clouds_without_odometry(node, run_folder, tmp_path, capsys):
     captured = capsys.readouterr()
     assert "and 0 odometry samples sent" in captured.out
     assert captured.err == f"{bare}: no times.txt; frames are taken for 0.1 s apart\n"
+    assert node.replay(run_folder, "--odometry", "none", "--cloud-delay", "0.1") == 2
     assert node.replay(run_folder, "--rate", "50", "--odometry", "none") == 0
     until(lambda: len(node.clouds()) == 12)
     assert max(m.stamp_ns for m in node.clouds()) == 25 * 10**9

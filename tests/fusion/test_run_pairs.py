@@ -75,8 +75,14 @@ def test_bridged_poses_are_left_out(world_run, world_map, results):
 
 def test_a_trajectory_alone_will_do(world_run, world_map, results):
     with pytest.warns(UserWarning, match="which map"):
-        run = LocalizedRun(parse_pair(f"{world_run}:{results / 'trajectory.tum'}"), world_map, opened)
-    assert len(run) == 5
+        runs = [
+            LocalizedRun(parse_pair(f"{world_run}:{results / 'trajectory.tum'}"), world_map, opened, delay)
+            for delay in (0.0, 0.2)
+        ]
+    assert [len(run) for run in runs] == [5, 5]
+    now, before = (next(frame for frame in run.frames() if frame is not None).T_map_body for run in runs)
+    step = np.linalg.norm(np.diff(runs[0].odometry[:, :3, 3], axis=0), axis=1)[0] / np.diff(runs[0].stamps)[0]
+    np.testing.assert_allclose(np.linalg.norm(now[:3, 3] - before[:3, 3]), 0.2 * step, rtol=0.2)
 
 
 def test_results_of_another_map_are_refused(world_run, world_file, results):

@@ -242,6 +242,17 @@ def test_slice_of_a_run_is_a_run(run: Path) -> None:
         opened[9:9]
 
 
+@pytest.mark.parametrize("delay", [0.05, -0.15])
+def test_clouds_that_are_late_have_earlier_odometry(run: Path, delay: float) -> None:
+    opened = open_run(run)
+    assert opened.with_late_clouds(0.0) is opened
+    moved = opened.with_late_clouds(delay)
+    kept = [k for k, stamp in enumerate(STAMPS - delay) if STAMPS[0] <= stamp <= STAMPS[-1]]
+    np.testing.assert_allclose(moved.stamps, STAMPS[kept] - delay, atol=1e-6)
+    np.testing.assert_allclose(moved.poses[:, 0, 3], 20.0 * (moved.stamps - STAMPS[0]), atol=1e-4)
+    np.testing.assert_array_equal(moved[0].points, opened[kept[0]].points)
+
+
 def test_runs_and_frames_say_what_they_are_in_one_line(run: Path) -> None:
     opened = open_run(run)
     assert repr(opened).startswith(f"Run({str(run)!r}: {len(opened)} frames, ")
