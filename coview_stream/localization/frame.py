@@ -18,9 +18,7 @@ from coview_stream.localization.calibration.frame_motion import FrameMotion, Var
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.witness.first_motions import Conventions
 
-# sigmas of roll and pitch of a registered place
-_LEADER_TILT = math.radians(1.0)  # that leads the search, if it is the right one
-_PLACE_TILT = math.radians(0.5)  # that is accepted
+_PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame that is registered at the right place
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,7 @@ class FramePreparation:
         if probability is None:
             self.estimator.measure_attitude(T_map_cloud, T_odom_body, _PLACE_TILT**2)
         else:
-            self.estimator.suppose_attitude(T_map_cloud, T_odom_body, _LEADER_TILT**2, probability)
+            self.estimator.suppose_attitude(T_map_cloud, T_odom_body, _PLACE_TILT**2, probability)
         return T_map_cloud @ inverse(T_odom_body @ self.calibration.T_body_cloud)
 
     def _voxels(self, cloud: Points, T: Pose) -> Points:

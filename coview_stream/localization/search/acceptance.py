@@ -63,7 +63,8 @@ class SearchResult:
         travelled: metres that odometry had driven at the keyframe.
         epoch: of the request.
         rivals: all places that the keyframe was scored at.
-        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded; None without any place.
+        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded, level by the newest frame
+            alone; None without any place.
         T_odom_body: (4, 4) of the keyframe.
         calibration: has levelled the keyframe's clouds.
         considered: the most probable places, for people to look at; None without any place.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
+from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, yaw_of
 from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
@@ -18,12 +19,35 @@ from coview_stream.localization.search.acceptance import Considered, SearchResul
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
-from coview_stream.localization.search.refinement import find_modes, register_place
+from coview_stream.localization.search.refinement import find_modes, levelled_by_frame, register_place
 from coview_stream.localization.search.request import EarlierKeyframe, Epoch, RequestSpec, SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # poses of a guess that are tried at a keyframe
+
+
+_LEVEL = math.radians(0.5)
+"""Radians by which a scan may lean and still be read as level: 0.15 m, the field's tolerance of ground, at 17 m."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading of a keyframe, level or leaning, and the places by it.
+
+    Attributes:
+        request: the keyframe, turned about the body.
+        scan: of it.
+        scored: the places.
+        leader: the first one, registered; None if that failed.
+        turn: (4, 4) turned odometry frame <- odometry frame.
+    """
+
+    request: SearchRequest
+    scan: ObservedScan
+    scored: Scored
+    leader: Hypothesis | None
+    turn: Pose = field(default_factory=lambda: np.eye(4))
 
 
 class GlobalSearch:
@@ -113,20 +137,56 @@ class GlobalSearch:
         guessed = self._guessed(request, scan)
         voted, ranks = [*voted, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
-        scored = self._scorer.score([*voted, *hints], ranks, len(hints), scan)  # against chance, all keyframes
+        hypotheses, first = [*voted, *hints], not self._scorer.scans
+        scored = self._scorer.score(hypotheses, ranks, len(hints), scan)  # against chance, all keyframes
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         self._note_hints(scored, hints, request)
+        reading, scans = Reading(request, scan, scored, leader), self._scorer.scans
+        if first and leader is not None and scored.error >= self.config.acceptance.risk:
+            reading = self._leaning(reading, leader, hypotheses, ranks, len(hints)) or reading
+            scans = [reading.scan]
+        request, scan, scored, leader = reading.request, reading.scan, reading.scored, reading.leader
         undecided = 0.0
         if leader is not None and scored.error < self.config.acceptance.risk:
             place = scored.places[0]
             modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
             leader, undecided = modes.best, modes.undecided
         if leader is not None and scored.error < 0.5:  # a stated error that is not acted on has to be true as well
-            scored = scored.doubted(find_moved_part(self.base_map.field, self._scorer.scans, leader.T_map_odom))
+            scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
+        if leader is not None:
+            level = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
+            result = replace(result, leader=level @ reading.turn)
         if result.accepted is not None:
             self.clear()
         return replace(result, considered=Considered.of(scored, request, self.base_map.origin))
+
+    def _leaning(
+        self, upright: Reading, leader: Hypothesis, hypotheses: list[Hypothesis], ranks: list[int], hints: int
+    ) -> Reading | None:
+        """Read the scan as one of a sensor that leans as the leader has it; None where that tells nothing else.
+
+        A sensor leans alike at all places: all are scored anew, among chance places of the same lean. The lean was
+        chosen to fit, so its reading counts by its prior probability.
+        """
+        request, T_odom_body = upright.request, upright.request.T_odom_body
+        seen = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
+        R = rot_z(-yaw_of(seen)) @ seen[:3, :3]
+        lean, sigma = tilt_of(seen), math.hypot(request.calibration.sigma_tilt, _LEVEL)
+        if lean < _LEVEL:
+            return None
+        prior = 2.0 * math.log(_LEVEL / sigma) - 0.5 * (lean / sigma) ** 2
+        turned = request.turned(R)
+        scan = self._observed(turned)
+        scorer = PlaceScorer(self.base_map)
+        scorer.starts = self._scorer.starts
+        scored = scorer.score(hypotheses, ranks, hints, scan, prior)
+        found = self._register(scored, scan, turned)
+        if found is None or not same_place(found.T_map_odom, leader.T_map_odom, turned, BASIN_DISTANCE, BASIN_ANGLE):
+            return None
+        about_body = T_odom_body[:3, 3]
+        turn = pose_from(R, about_body - R @ about_body)
+        return Reading(turned, scan, scored.together_with(upright.scored), found, turn)
 
     def _begin(self, request: SearchRequest) -> None:
         """Begin anew with a request, or go on with its earlier keyframes: then it is no other start."""

@@ -13,14 +13,26 @@ import numpy as np
 
 from coview_kernels import Move, Prior
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import LocalizerConfig
+from coview_stream.config import LocalizerConfig, RegistrationConfig
+from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ALERT_METRES
-from coview_stream.geometry.transforms import Pose, boxminus, pose_from, rot_z, tilt_of, transform, yaw_of
+from coview_stream.geometry.transforms import (
+    Pose,
+    boxminus,
+    exp_so3,
+    inverse,
+    log_so3,
+    pose_from,
+    rot_z,
+    tilt_of,
+    transform,
+    yaw_of,
+)
 from coview_stream.localization.evidence.background import observe_with_background
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.observation import ObservedScan
-from coview_stream.localization.registration.clouds import LocalMaps
+from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import gravity_information, register
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
@@ -75,6 +87,27 @@ def register_place(
         return None
     T = registration.T_map_source
     return replace(place, T_map_odom=T, registration=registration, evidence=scan.evidence(base_map.field, T))
+
+
+def levelled_by_frame(leader: Pose, request: SearchRequest, config: RegistrationConfig, local_maps: LocalMaps) -> Pose:
+    """Return a ``T_map_odom`` (4, 4) with roll and pitch of the newest frame, registered alone; as it is if that fails.
+
+    The frames of several keyframes stand where odometry has them, so together they show odometry's gravity: of a lean
+    of the sensor only a part is left.
+    """
+    T_odom_body = request.T_odom_body
+    frame = prepare_scan(transform(T_odom_body, request.cloud), T_odom_body[:3, 3], config)
+    body = leader @ T_odom_body
+    target = local_maps.around(body[:3, 3])
+    if target is None or len(frame.points) < MIN_PAIRS:
+        return leader
+    upright = Prior(pose_from(rot_z(yaw_of(leader)), leader[:3, 3]), gravity_information(config.gravity_sigma))
+    registration = register(frame, leader, target, config, config.track, upright, T_odom_body[:3, 3])
+    if registration is None:
+        return leader
+    turned = log_so3((registration.T_map_source @ T_odom_body)[:3, :3] @ body[:3, :3].T)
+    turned[2] = 0.0
+    return pose_from(exp_so3(turned) @ body[:3, :3], body[:3, 3]) @ inverse(T_odom_body)
 
 
 def find_modes(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, rotation_angle
+from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, pose_from, rotation_angle, transform
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
@@ -95,6 +95,12 @@ class SearchRequest:
     def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
+
+    def turned(self, R: Floats) -> SearchRequest:
+        """Return the request with its clouds to register turned about the body by R (3, 3), axes of odometry."""
+        T = pose_from(R, self.position - R @ self.position)
+        T_body = pose_from(self.T_odom_body[:3, :3].T @ R @ self.T_odom_body[:3, :3], np.zeros(3))
+        return replace(self, submap=transform(T, self.submap), cloud=transform(T_body, self.cloud))
 
     @classmethod
     def of(

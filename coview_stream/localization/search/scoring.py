@@ -92,6 +92,13 @@ class Scored:
         share = probability[probability > 0.0] / max(float(probability.sum()), 1e-300)
         return round(float(np.exp(-(share * np.log(share)).sum())))
 
+    def together_with(self, other: Scored) -> Scored:
+        """Return these places with the errors by both readings of the scan, which have the same first place."""
+        none = [max(each.none, 1e-300) for each in (self, other)]
+        first = [each.places[0].probability / part for each, part in zip((self, other), none, strict=True)]
+        rest = self.error / none[0] + other.error / none[1] - 1.0  # "none" once
+        return replace(self, error=rest / (rest + sum(first)), none=1.0 / (rest + sum(first)))
+
     def doubted(self, moved: MovedPart) -> Scored:
         """Add the error by a moved part: either part may be the unmoved one."""
         return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)
@@ -180,7 +187,9 @@ class PlaceScorer:
         self._scatter = [np.full(4, np.nan)] * len(scans)
         self._followed = replace(_Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
 
-    def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan) -> Scored:
+    def score(
+        self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
+    ) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the followed places.
 
         Of hypotheses within 2 m and 5 degrees of each other only the best counts.
@@ -190,6 +199,7 @@ class PlaceScorer:
             votes: ranks of the hypotheses in their votes, from 0; any number for a hint.
             hints: number of pose hints.
             scan: of the keyframe.
+            prior: log-probability that the scan is to be read like this, beside "at none of the places".
         """
         followed, voted = self._followed, len(hypotheses) - hints
         count = len(followed.hypotheses)
@@ -207,7 +217,7 @@ class PlaceScorer:
         self._scans.append(scan)
         self._followed = followed = followed[order]
         self._thin_out()
-        chances = posterior(ratios[order], followed.votes, len(first), self.starts)
+        chances = posterior(ratios[order] + prior, followed.votes, len(first), self.starts)
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)

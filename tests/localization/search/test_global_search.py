@@ -14,8 +14,8 @@ from se3 import exp_se3
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
 from coview_stream.config import AcceptanceConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of
-from coview_stream.localization.calibration.calibration import RawScan
+from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, tilt_of
+from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.clouds import LocalMaps, voxelized
@@ -97,6 +97,34 @@ def test_evidence_of_the_right_place_adds_up_over_keyframes(never_sure, world_dr
     results = [never_sure.update(request) for request in run_of(world_drive, 5)]
     assert all(result.evidence.state is State.AMBIGUOUS for result in results)
     assert results[-1].evidence.by_chance < results[0].evidence.by_chance
+
+
+def leaning(world_drive, degrees=4.0):
+    """The drive with a sensor that leans in roll."""
+    R = exp_so3(np.radians([degrees, 0.0, 0.0])).astype(np.float32)
+    return replace(world_drive, clouds=[cloud @ R for cloud in world_drive.clouds])
+
+
+def lean_of(result):
+    """Degrees by which the sensor leans at the leader."""
+    return np.degrees(tilt_of(result.T_map_cloud))
+
+
+def test_sensor_that_leans_is_found_at_its_first_keyframe_by_its_prior(never_sure, world_drive):
+    request = next(run_of(leaning(world_drive), 1))
+    drawn = Calibration(sigma_tilt=np.radians(0.2))  # such a lean is improbable then
+    known = replace(request, calibration=drawn, epoch=Epoch(1))
+    leans, improbable = never_sure.update(request), never_sure.update(known)
+    assert lean_of(leans) == pytest.approx(4.0, abs=0.5)
+    assert off(leans.leader) < 0.3
+    assert leans.evidence.evidence.ground > 0.8
+    assert leans.considered.none < 1e-6 * improbable.considered.none
+
+
+def test_lean_is_measured_by_the_newest_frame_alone(never_sure, world_drive):
+    """Frames along the way stand where odometry has them: together they show a part of the lean."""
+    results = [never_sure.update(request) for request in run_of(leaning(world_drive), 6)]
+    assert [lean_of(result) for result in results[2:]] == pytest.approx([4.0] * 4, abs=0.6)
 
 
 @pytest.fixture(scope="module")

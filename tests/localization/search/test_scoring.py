@@ -186,3 +186,18 @@ def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_driv
     for k in range(16):
         own = scan_of(world_drive, k % 6)
         assert is_right(scored(scorer, some_places(own), own).places[0], own)
+
+
+def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_drive):
+    """The odds of places against "none" add up; "none" is one and the same."""
+    scan = scan_of(world_drive, 0)
+    places = some_places(scan, 10)
+    upright, leaning = (
+        PlaceScorer(world_map).score(places, range(len(places)), 0, scan, prior) for prior in (0.0, -4.0)
+    )
+    assert leaning.places[0].ratio == upright.places[0].ratio
+    assert leaning.none == pytest.approx(upright.none * np.exp(4.0), rel=0.05)
+    both = leaning.together_with(upright)
+    odds = sum(each.places[0].probability / each.none for each in (upright, leaning))
+    rest = sum(each.error / each.none for each in (upright, leaning)) - 1.0
+    assert both.error == pytest.approx(rest / (rest + odds))
