@@ -78,7 +78,7 @@ class FrameTree:
             if np.abs(T - before[1]).max() > _SAME:
                 self._moved.add(child)
             above = self.above(self.lidar)
-            if len(above) == 1 or child in above:  # all while nothing is known of the lidar's
+            if child in above or self.above(child)[-1] != above[-1]:  # a static one may join them later
                 self._samples.setdefault(child, []).append((stamp_ns, T))
 
     def body(self) -> str:

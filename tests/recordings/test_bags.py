@@ -283,6 +283,18 @@ def test_odometry_is_read_from_transforms_where_no_topic_has_it(tmp_path):
     np.testing.assert_allclose(both.poses, run.poses)
 
 
+def test_odometry_from_before_the_static_transform_that_joins_it_to_the_lidar_is_kept():
+    tree, on = FrameTree(), ros2_outputs.encode_transform
+    tree.lidar = "lidar"
+    tree.add(on(np.eye(4), 0, "plate", "lidar"), static=True)
+    for ns in (1, 2, 3):
+        tree.add(on(pose_from(np.eye(3), [ns, 0.0, 0.0]), ns, "odom", "base_link"), static=False)
+        tree.add(on(pose_from(rot_z(ns), [0.0, 0.0, 0.0]), ns, "plate", "shutter"), static=False)
+    tree.add(on(np.eye(4), 4, "base_link", "plate"), static=True)
+    assert [ns for ns, _ in tree.odometry()[2]] == [1, 2, 3]
+    assert "shutter" not in tree._samples
+
+
 def test_recording_whose_transforms_do_not_move_offers_lidar_odometry(tmp_path):
     with pytest.raises(RunError, match=r"in /tf above the lidar \(base_link <- plate <- livox_frame\); make.*kiss-icp"):
         open_run(mounted_bag(tmp_path / "bag", odom=False))

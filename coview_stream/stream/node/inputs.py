@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coview_stream.config.mount import Mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import EncodingError, MessageError
@@ -208,12 +209,18 @@ class Inputs:
         self._frames = FrameSync(config, self.odometry, counters)
         self._missing = MissingFrames()
         self._newest = {"clouds": NewestStamp(), "odometry": NewestStamp()}
+        self._mount: tuple[Mount | None] | None = None  # that the transport told with the newest cloud
 
     def decode_cloud(self, sample: Sample) -> CloudMessage:
         """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
         message = decode_cloud(sample, self.codecs[0], self.keys.hint, self.config.max_payload)
         message = message.limited(self.config.max_points)
         return replace(message, points=(sample.mount or self.config.mount).to_body(message.points))
+
+    def note_mount(self, mount: Mount | None) -> Break | None:
+        """Note the mount that the transport told with a cloud; return the break if it is another than before."""
+        before, self._mount = self._mount, (mount,)
+        return None if before in (None, (mount,)) else Break("the lidar's pose on the body is another than before")
 
     def decode_odometry(self, sample: Sample) -> OdometryMessage:
         """Return an odometry sample; MessageError: it cannot be read."""
@@ -269,7 +276,7 @@ class Inputs:
     def continue_from(self, other: Inputs) -> None:
         """Go on with the odometry of the robot's session on another map."""
         self.odometry.continue_from(other.odometry)
-        self._newest = other._newest
+        self._newest, self._mount = other._newest, other._mount
 
     # ---- lidar odometry: none here
 

@@ -75,6 +75,7 @@ class Session:
                 self.inputs.count_undecodable(error, sample.key)
         else:
             with self.lock:
+                self._proceed(self.inputs.note_mount(sample.mount), now)
                 self._proceed(self.inputs.add_cloud(message, now), now)
 
     def on_odometry(self, sample: Sample, now: float) -> None:

@@ -66,12 +66,13 @@ class _Robot:
 
     def check_cloud(self, sample: Sample) -> Sample:
         """Return a cloud with its mount, of /tf_static, or refused for its frame."""
-        self.newest_ns, frame, body = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload), self.body_frame
+        self.newest_ns, frame = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload)
+        self.frames.lidar = frame
+        body = self.body_frame or self.frames.body()  # odometry may name no body
         if self.check_frames and frame and self.odometry_ns is None:
             return _refused(sample, "clouds before the first odometry, which names the body's frame, are not used")
         if not (self.check_frames and frame and body) or frame == body:
             return sample
-        self.frames.lidar = frame
         if (T_body_lidar := self.frames.mount(body)) is not None:
             return replace(sample, mount=Mount().moved(T_body_lidar))
         why = "/tf_static does not join them" if "tf" in self.outputs else f"/tf_static is not read, {_NO_TF}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import re
+from dataclasses import replace
 
 import pytest
 from fake_robot import (
@@ -12,6 +13,7 @@ from fake_robot import (
     KEYS,
     START_NS,
     Robot,
+    cloud,
     counted,
     doubted,
     ns,
@@ -23,6 +25,7 @@ from fake_robot import (
     unknown,
 )
 
+from coview_stream.config.mount import Mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.state import TRANSITIONS, Event, State
@@ -31,6 +34,22 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.node.robot_state import StateHistory
 from coview_stream.stream.node.status import status
 from coview_stream.stream.transport.transport import Connection
+
+
+def test_clouds_with_another_mount_than_before_begin_anew(robot):
+    seen = [
+        replace(cloud(0.1 * k), mount=mount) for k, mount in enumerate((None, None, Mount(yaw=0.3), Mount(yaw=0.3)))
+    ]
+    robot.localized(-0.1)
+    states = []
+    for k, sample in enumerate(seen):
+        robot.moved(0.1 * k)
+        robot.session.on_cloud(sample, robot.now)
+        states.append(reason(robot) if state(robot) is State.LOST else state(robot))
+        robot.answered()
+    assert states[2] == "the lidar's pose on the body is another than before"
+    assert {states[k] for k in (0, 1, 3)} == {State.TRACKING}
+    assert robot.counters.losses == 1
 
 
 def test_restart_search_before_a_fix_is_not_a_loss(robot):

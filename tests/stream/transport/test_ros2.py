@@ -26,7 +26,7 @@ from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
 from coview_stream.geometry.transforms import transform as transform_points
 from coview_stream.messages import encode_pose, ros2, ros2_outputs
-from coview_stream.messages.types import Encoded
+from coview_stream.messages.types import CloudMessage, Encoded, Sample
 from coview_stream.stream.transport import ros2_transport
 from coview_stream.stream.transport.keys import matches, robot_keys
 from coview_stream.stream.transport.rmw import dds_type, publisher_token, type_hash
@@ -152,6 +152,15 @@ def transforms(ros, monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_msgs", package)
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", messages)
     return PolygonStamped
+
+
+def test_body_that_odometry_does_not_name_is_that_of_tf_static():
+    robot, T_body_lidar = ros2_transport._Robot(KEYS, "", True), pose_from(rot_z(0.3), [0.2, 0.0, 0.5])
+    seen = Sample(KEYS.cloud, ros2.encode_cloud(CloudMessage(ns(0.0), POINTS), "velodyne").payload)
+    robot.odometry_ns = 0
+    assert robot.check_cloud(seen).mount is None  # taken for one
+    robot.frames.add(ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne"), static=True)
+    np.testing.assert_allclose(robot.check_cloud(seen).mount.T_body_sensor, T_body_lidar, atol=1e-9)
 
 
 @pytest.mark.slow
