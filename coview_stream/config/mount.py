@@ -13,6 +13,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
 MAX_LEVER = 100.0  # metres from the body's origin to the sensor; farther is another unit
+_UPRIGHT = math.sin(math.radians(0.05))  # cosine of a pitch of 90 degrees, as an option has it
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,11 @@ class Mount:
         """Return the mount of this lidar if its clouds in the body frame have to be moved by a pose (4, 4) as well."""
         T = T_body_cloud @ self.T_body_sensor
         roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
+        yaw = math.atan2(T[1, 0], T[0, 0])
+        if math.cos(pitch) < _UPRIGHT:  # roll and yaw are about one axis
+            roll, yaw = 0.0, math.atan2(-T[0, 1], T[1, 1])
         x, y, z = T[:3, 3].tolist()
-        return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), x, y, z, self.drawn)
+        return Mount(roll, pitch, yaw, x, y, z, self.drawn)
 
     def to_json(self) -> dict[str, float]:
         """Plain data, with the unit in each name."""

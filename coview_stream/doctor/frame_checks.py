@@ -23,7 +23,6 @@ from coview_stream.geometry.transforms import Points, Pose, pose_from, rot_z, tr
 from coview_stream.localization.witness.conventions import (
     AS_SENT_WORDS,
     AXES,
-    AXIS_NAMES,
     BOTH_CAMERA,
     FEET,
     HEADING,
@@ -117,7 +116,7 @@ def frame_findings(
         yield Finding("warn", "ground", "none is seen below the sensor", remedy, robot)
         return
     yield _ground_finding(ground, robot, given)
-    yield _motion_finding(seen, robot)
+    yield _motion_finding(seen, fit(pairs, MIRRORED), robot)
 
 
 def _ground(frames: Sequence[SeenFrame]) -> _Ground | None:
@@ -191,7 +190,8 @@ def _explanation(
     if ground is not None and seen is not None:
         R = rot_z(-seen.yaw) @ turning(ground.up, UP)
         if seen.spread < HEADING and abs(seen.scale - 1.0) < SCALE and (ground.axis or abs(seen.yaw) > HEADING):
-            consider(turned_clouds(ground.axis, seen.yaw), _mount_finding(ground.axis, R, robot, given))
+            axes = turned_clouds(ground.axis, seen.yaw)
+            consider(axes, _mount_finding(ground.axis, axes, R, robot, given))
         if unit != 1.0:
             consider(MILLIMETRES)
         for reading in (
@@ -249,14 +249,15 @@ def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, lis
         yield reading, [replace(f, points=transform(M, f.points)) for f, M in zip(frames, levelled, strict=True)]
 
 
-def _mount_finding(axis: int, R: Floats, robot: str | None, given: Mount | None) -> Finding:
+def _mount_finding(axis: int, axes: Reading, R: Floats, robot: str | None, given: Mount | None) -> Finding:
     yaw = Mount().turned(R).yaw
     turned = f"turned by {math.degrees(yaw):.0f} degrees"
     if not axis:
         found = f"the lidar is {turned} against the motion of the body"
+    elif axis == 1:
+        found = "the lidar is upside down" + f", {turned} about the vertical" * (abs(yaw) > HEADING)
     else:
-        found = "the lidar is upside down" if axis == 1 else f"the lidar's {AXIS_NAMES[axis]} axis points up, not its z"
-        found += f", {turned} about the vertical" if abs(yaw) > HEADING else ""
+        found = f"the lidar's {axes.found.partition(': ')[2]}"
     mount = _turned_in_place(replace(given or Mount(), drawn=False), R)
     if given is not None and given != Mount():
         found = f"by --mount={given.option} {found}"
@@ -309,13 +310,15 @@ def _surely(seen: Fit) -> str:
     return f"wrong {one_in(1.0 / (1.0 + math.exp(min(abs(seen.odds), 100.0))))}"
 
 
-def _motion_finding(seen: Fit | None, robot: str | None) -> Finding:
+def _motion_finding(seen: Fit | None, mirrored: Fit, robot: str | None) -> Finding:
     if seen is None or abs(seen.odds) < SURE:
         found = "too few frames show clearly how the robot moved to compare it with odometry"
         return Finding("ok", "motion", found, "drive ten metres past walls, poles or trunks and ask again", robot)
     steps = f"{seen.pairs} steps of some metres, {_surely(seen)}"
     if seen.odds > 0.0:
-        return Finding("ok", "motion", f"odometry follows the lidar's to {seen.misfit:.2f} m ({steps})", robot=robot)
+        straight = mirrored.odds > seen.odds - SURE
+        remedy = "a drive this straight does not tell whether y points left: ask again after a curve" * straight
+        return Finding("ok", "motion", f"odometry follows the lidar's to {seen.misfit:.2f} m ({steps})", remedy, robot)
     found = (
         f"odometry differs from the lidar's by {seen.misfit:.2f} m ({steps}; heading in the body "
         f"{math.degrees(seen.yaw):.1f} degrees, distances times {seen.scale:.2f})"

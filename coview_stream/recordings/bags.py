@@ -391,6 +391,11 @@ def _in_order(path: Path, survey: _Survey) -> tuple[Ints, Ints, Bools, Bools]:
     order = np.argsort(stamps[steady], kind="stable")
     in_order = stamps[steady][order]
     fresh = np.diff(in_order, prepend=in_order[0] - SAME_NS - 1) > SAME_NS
+    if len(fresh) > 1 and not fresh[1:].any():
+        raise RunError(
+            f"{path}: all {len(fresh)} clouds are stamped alike, {_span(in_order)}; stamp their headers at the sensor, "
+            "in seconds and nanoseconds"
+        )
     return in_order, arrivals[steady][order], fresh, steady
 
 
@@ -403,7 +408,8 @@ def _pair(reader: BagReader, topic: _Topic, survey: _Survey, track: Track, mount
     if not chosen.any():
         raise RunError(
             f"{path}: not one of {len(steady)} clouds has odometry at its stamp: clouds are stamped "
-            f"{_span(stamps)}, odometry {_span(track.stamps)}; are their clocks the same, and their headers stamped?"
+            f"{_span(stamps)}, odometry {_span(track.stamps)}{_times(stamps, track.stamps)}; "
+            "are their clocks the same, and their headers stamped in seconds and nanoseconds?"
         )
     reasons = (
         (int((fresh & ~known).sum()), "without odometry around their stamps"),
@@ -422,4 +428,13 @@ def _pair(reader: BagReader, topic: _Topic, survey: _Survey, track: Track, mount
 
 
 def _span(stamps: Ints) -> str:
-    return f"{_NS * stamps.min():.3f} to {_NS * stamps.max():.3f} s"
+    return f"{_NS * stamps.min():.13g} to {_NS * stamps.max():.13g} s"
+
+
+def _times(stamps: Ints, others: Ints) -> str:
+    """Return how many times as large stamps are as others, in words, where one is written in a wrong unit."""
+    for factor in (1e3, 1e6, 1e9):
+        for small, large, noun in ((others, stamps, "clouds'"), (stamps, others, "odometry's")):
+            if factor * small.max() >= large.min() and large.max() >= factor * small.min():
+                return f": {noun} are {factor:,.0f} times as large"
+    return ""

@@ -158,8 +158,8 @@ class Run:
         cloud = read_cloud(path) if self.source is None else self.source.read(index, correction)
         if len(self) > 1 and cloud.origin.any():
             raise CloudError(
-                f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
-                "write frames relative to the sensor, in metres"
+                f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame: millimetres, or in a "
+                "map's frame; write frames relative to the sensor, in metres"
             )
         points = cloud.points
         if self.mount is not None and self.source is None:

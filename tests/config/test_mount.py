@@ -77,7 +77,8 @@ def test_correction_is_said_as_an_option_that_has_it():
     found = parse_mount(mount.turned(R).option)
     assert np.allclose(found.T_body_sensor[:3, :3], R @ mount.T_body_sensor[:3, :3], atol=2e-3)
     assert np.allclose(found.T_body_sensor[:3, 3], R @ mount.T_body_sensor[:3, 3], atol=6e-3)
-    assert Mount().turned(Mount(pitch=math.radians(2.9)).T_body_sensor[:3, :3]).option == "0,2.9,0,0,0,0"
+    for same in ("0,2.9,0,0,0,0", "0,90,0,0.1,0,0.4", "0,-90,30,0,0,0"):
+        assert Mount().moved(parse_mount(same).T_body_sensor).option == same
 
 
 @pytest.mark.parametrize("wrong", [{"roll": 7.0}, {"yaw": math.nan}, {"x": 1000.0}, {"z": math.inf}])

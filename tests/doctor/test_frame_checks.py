@@ -73,7 +73,7 @@ FAULTS = {
     "upside down": (clouds(exp_so3([np.pi, 0.0, 0.0])), "upside down"),
     "yawed": (clouds(rot_z(np.pi / 2)), "against the motion of the body"),
     "camera axes": (camera, "camera"),
-    "camera clouds": (clouds(R_camera_body), "axis points up"),
+    "camera clouds": (clouds(R_camera_body), "points up"),
     "static": (odometry(lambda P: np.eye(4)), "stands still, but the lidar moves"),
     "inverse": (odometry(inverse), "inverse"),
     "transposed": (odometry(RIVALS["transposed"]), "transposed"),
@@ -99,6 +99,13 @@ def frames(scene):
 @pytest.mark.slow
 def test_unspoilt_drive_is_ok(frames):
     assert [(f.what, f.verdict) for f in frame_findings(frames)] == [("ground", "ok"), ("motion", "ok")]
+
+
+@pytest.mark.slow
+def test_a_straight_drive_is_said_not_to_show_a_mirror(frames):
+    mirrored = [SeenFrame(f.stamp, f.points * np.float32([1, -1, 1]), f.T_odom_body) for f in frames[:7]]
+    motion = next(f for f in frame_findings(mirrored) if f.what == "motion")
+    assert "whether y points left" in motion.remedy
 
 
 # this drive is nearly straight: there an inverse is told as a lidar that is turned on the body
@@ -159,7 +166,7 @@ def test_run_of_which_no_frame_can_be_read_is_not_ok(world_drive, tmp_path):
     """Millimetres: beyond what a body frame holds."""
     drive = replace(world_drive, clouds=[1000.0 * cloud + 5000.0 for cloud in world_drive.clouds])
     run = open_run(small_world.write_run(tmp_path / "run", drive, 3))
-    with pytest.raises(CloudError, match=r"in metres"):
+    with pytest.raises(CloudError, match=r"millimetres.*; write frames.*in metres"):
         seen_frames(run)
 
 

@@ -260,8 +260,8 @@ class Conventions:
         wrong = float(np.logaddexp.reduce([odds for odds, reading in weighed if reading is not AS_SENT]))
         self.finding = None
         if wrong - float(np.logaddexp(right, unrelated)) > SURE:
-            also = f"; or else {other.found}" if best - second < SURE and other is not AS_SENT else ""
-            self.finding = f"{reading.found}{also}: {reading.remedy}"
+            rivals = [reading, other] if best - second < SURE and other is not AS_SENT else [reading]
+            self.finding = "; or else ".join(f"{each.found}: {each.remedy}" for each in rivals)
 
     def _readings(self, sent: bool) -> Iterator[tuple[float, Reading]]:
         """Yield readings to compare, with their log priors; ``sent``: unit and vertical are as they should be."""

@@ -53,6 +53,15 @@ def test_a_mirror_is_named_in_a_bend(drive):
 
 
 @pytest.mark.slow
+def test_each_of_two_readings_has_its_remedy(drive):
+    found = judged(drive, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), frames=4).finding
+    first, second = found.split("; or else ")
+    assert "x and y of one are swapped: send both" in first
+    assert "y points forward: send them" in second
+    assert "--mount" in second
+
+
+@pytest.mark.slow
 def test_a_finding_goes_when_the_sender_is_mended(drive):
     conventions = judged(drive, SENT["y points forward"], frames=6)
     assert conventions.finding
