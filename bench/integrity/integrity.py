@@ -1,14 +1,17 @@
 """Share of false first fixes, over families of sites that nothing was fitted on, with exact bounds.
 
-A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. The
-results of a site stay in ``--work``, so an interrupted benchmark resumes. Runs share sites, at most eight of them one
-map, but never map and drive; beside the share of false runs stands the share of sites with a false run. Bounds are
-Clopper-Pearson's, at 95 %, and hold for these families and this simulator. Stated errors of all searched keyframes are
-noted, and whether the most probable place was right: how often they hold.
+A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. Half
+of the runs are on real airborne surveys (:mod:`bench.integrity.surveys`) where ``COVIEW_DATA`` has any. The results of
+a site stay in ``--work`` until the code changes: the benchmark goes on where it ended, ``--minutes`` bounds one call,
+and any number of calls may share the folder at once. Runs share sites, at most eight of them one map, but never map
+and drive; beside the share of false runs stands the share of sites with a false run. Bounds are Clopper-Pearson's, at
+95 %, and hold for these families, surveys and this simulator. Stated errors of all searched keyframes are noted, and
+whether the most probable place was right: how often they hold.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -22,6 +25,7 @@ from bench.harness.files import fingerprint, folder
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan
 from bench.integrity.run import Result, everywhere
+from bench.integrity.surveys import files
 from coview_stream.errors import InputError
 
 OUTCOMES = ("right", "false", "none")  # of a run that counts; a failed run, or one without a street, does not
@@ -78,12 +82,14 @@ def percent(share: float, digits: int = 2) -> str:
 
 def classes(results: Sequence[Result]) -> dict[str, Tally]:
     """Count all results, and those of each class."""
-    parts = {"all": results} | {
+    parts = {"all": list(results)} | {
         name: [run for run in results if run["class"] == name] for name in ("near copies", "outside", "ordinary")
     }
     # with buildings alone in view nothing shows that all of them have moved
-    but = [run for run in results if run["family"] != "shifted"]
+    but = [run for run in results if not run["family"].endswith("shifted")]
     parts |= {"all but shifted buildings": but} if len(but) < len(results) else {}
+    real = {name: [run for run in runs if run.get("group") == "surveys"] for name, runs in parts.items()}
+    parts |= {f"real surveys: {name}": runs for name, runs in real.items()}
     return {name: tally for name, runs in parts.items() if (tally := Tally.of(runs)).runs}
 
 
@@ -115,31 +121,32 @@ def family_table(results: Sequence[Result]) -> str:
 
 
 def reliability_table(results: Sequence[Result]) -> str:
-    """Lay out stated against found errors of searches.
+    """Lay out stated against found errors of searches, apart for ordinary, near-copy and shifted sites.
 
     A search counts once for each limit, at its first keyframe with a stated error below it, accepted or not. Where no
     place of the map is right, the share of searches that ever state an error below a limit should be below it (Ville).
     Metres are to a stated error below the limit of the right place.
     """
     counted = [run for run in results if run["outcome"] in OUTCOMES and run["searched"]]
-    lost = [run for run in counted if run["class"] == "outside" or run["family"] == "mirrored"]
+    apart: dict[str, list[Result]] = {name: [] for name in ("ordinary", "near copies", "shifted", "no place is right")}
+    for run in counted:
+        lost = run["class"] == "outside" or run["family"] == "mirrored"
+        shift = "shifted" if run["family"].endswith("shifted") else run["class"]
+        apart["no place is right" if lost else shift].append(run)
     lines = []
-    for limit in STATED:
-        first = [next((at for at in run["searched"] if at[1] < limit), None) for run in counted]
-        found = [at for at in first if at is not None]
-        wrong = sum(not at[2] for at in found)
-        metres = [at[0] for at in found if at[2]]
-        ever = sum(any(at[1] < limit for at in run["searched"]) for run in lost)
-        lines.append([
-            f"< {limit:g}", str(len(found)), f"{np.mean([at[1] for at in found]):.1e}" if found else NOTHING,
-            str(wrong), between(wrong, len(found)), f"{ever} of {len(lost)}", between(ever, len(lost)),
-            f"{np.median(metres):.1f}, {np.quantile(metres, 0.9):.1f}" if metres else NOTHING,
-        ])  # fmt: skip
-    head = (
-        "stated error", "first times", "mean stated", "wrong", "95 %", "no place is right", "95 %",
-        "right: median, 90 % m",
-    )  # fmt: skip
-    return table(head, lines)
+    for part, runs in apart.items():
+        for limit in STATED:
+            first = [next((at for at in run["searched"] if at[1] < limit), None) for run in runs]
+            found = [at for at in first if at is not None]
+            wrong = sum(not at[2] for at in found)
+            of = len(runs) if part == "no place is right" else len(found)
+            metres = [at[0] for at in found if at[2]]
+            lines.append([
+                part, f"< {limit:g}", f"{np.mean([at[1] for at in found]):.1e}" if found else NOTHING,
+                f"{wrong} of {of}", f"{wrong / of:.1e}" if of else NOTHING, between(wrong, of),
+                f"{np.median(metres):.1f}, {np.quantile(metres, 0.9):.1f}" if metres else NOTHING,
+            ])  # fmt: skip
+    return table(("runs", "stated error", "mean stated", "wrong", "found", "95 %", "right: median, 90 % m"), lines)
 
 
 def between(events: int, runs: int) -> str:
@@ -148,7 +155,7 @@ def between(events: int, runs: int) -> str:
     return f"{low:.1g} to {high:.1g}" if runs else NOTHING
 
 
-RUNS, QUICK = 1080, 60  # runs planned, and with ``--quick``
+RUNS, QUICK = 3000, 24  # runs planned, and with ``--quick``
 MOST = {"all": 0.003, "near copies": 0.0075, "outside": 0.01}  # shares of false fixes that bounds have to be below
 LEAST_FOUND, MEDIAN_METRES = 0.97, 10.0  # of ordinary runs
 
@@ -157,21 +164,36 @@ def options(parser: ArgumentParser) -> None:
     """Add the runs and where they are made."""
     parser.add_argument("--count", type=int, metavar="N", help=f"runs planned ({RUNS}; {QUICK} with --quick)")
     parser.add_argument("--families", metavar="A,B", help="parts of families' names: only these of the runs planned")
+    parser.add_argument("--minutes", type=float, default=math.inf, metavar="M", help="begin no map after so long")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (all cores)")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Make the missing runs, then yield the counts and their verdicts."""
     code = f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
-    sites = chosen(plan("reported", asked.count or (QUICK if asked.quick else RUNS)), asked.families)
-    total, begin, results = sum(map(len, sites)), time.monotonic(), list[Result]()
-    for result in everywhere(sites, folder() / "integrity", code, asked.jobs):
+    sites = chosen(planned(asked.count or (QUICK if asked.quick else RUNS)), asked.families)
+    total, begin, results, made = sum(map(len, sites)), time.monotonic(), list[Result](), 0
+    for result, new in everywhere(sites, folder() / "integrity", code, asked.jobs, begin + 60 * asked.minutes):
         results.append(result)
-        left = (time.monotonic() - begin) / len(results) * (total - len(results)) / 60
+        made += new
+        left = (time.monotonic() - begin) / made * (total - len(results)) / 60 if made else math.nan
         outcome = f"{result['outcome']} {result.get('reason', '')}"
-        print(f"{len(results)}/{total} {left:4.0f} min left: {result['key']}: {outcome}", file=sys.stderr, flush=True)
+        if new:
+            about = f"{len(results)}/{total} {left:4.0f} min left: {result['key']}: {outcome}"
+            print(about, file=sys.stderr, flush=True)
+    if len(results) < total:
+        yield informs("integrity/runs that are missing yet", total - len(results), "")
     yield from verdicts(results)
     yield informs("integrity/runs", len(results), "", {"results": results})
+
+
+def planned(count: int) -> list[Site]:
+    """Return the sites of ``count`` runs: simulated ones and, where there are any, real surveys in turn, half each."""
+    if not files():
+        return plan("reported", count)
+    real, simulated = plan("surveys", count // 2), plan("reported", count - count // 2)
+    both = [(k / len(sites), site) for sites in (real, simulated) for k, site in enumerate(sites)]
+    return [site for _, site in sorted(both, key=lambda entry: entry[0])]
 
 
 def chosen(sites: Sequence[Site], families: str | None) -> list[Site]:
@@ -192,15 +214,18 @@ def verdicts(results: Sequence[Result]) -> Iterator[Row]:
         enough = most is not None and upper(0, t.runs) <= most
         target = f"0, below {percent(most or 1.0)}" if enough else "0"
         yield judged(f"integrity/false first fixes, {part}", text, target, t.false == 0, t.false)
-    ordinary = Tally.of(result for result in results if result["class"] == "ordinary")
+    simulated = (result for result in results if result["class"] == "ordinary" and result["group"] != "surveys")
+    ordinary = Tally.of(simulated)
     if ordinary.runs:
         text = f"{ordinary.right} of {ordinary.runs}: {percent(ordinary.found, 1)}"
         holds = ordinary.found >= LEAST_FOUND
-        yield judged("integrity/found, ordinary", text, f">= {percent(LEAST_FOUND, 0)}", holds, ordinary.found)
+        yield judged(
+            "integrity/found, ordinary and simulated", text, f">= {percent(LEAST_FOUND, 0)}", holds, ordinary.found
+        )
         median = ordinary.within(0.5)
         text = f"{median:.1f} m, 90 % within {ordinary.within(0.9):.1f} m"
         holds = median <= MEDIAN_METRES
-        yield judged("integrity/median first fix, ordinary", text, f"<= {MEDIAN_METRES:g} m", holds, median)
+        yield judged("integrity/median first fix, of these", text, f"<= {MEDIAN_METRES:g} m", holds, median)
     if failed := [result["key"] for result in results if result["outcome"] == "failed"]:
         yield judged("integrity/runs that failed", f"{len(failed)}: {failed[0]}", "0", False, len(failed))
 

@@ -5,18 +5,18 @@ A site is drawn and mapped once and serves several runs, each with its own drive
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from typing import Literal
 
 import numpy as np
 
-Group = Literal["calibration", "reported"]
+Group = Literal["calibration", "reported", "surveys"]
 Class = Literal["ordinary", "outside", "near copies"]
 
 LIDARS = ("vlp16", "mid360", "os64")
-FIRST_SEED = {"calibration": 31_000, "reported": 215_000}
+FIRST_SEED = {"calibration": 31_000, "reported": 215_000, "surveys": 315_000}
 STATED = (1e-1, 1e-2, 1e-3, 1e-4)
 """Stated errors; the first keyframe of a run below each counts, accepted or not."""
 
@@ -57,6 +57,11 @@ FAMILIES: dict[str, Class] = {
     "scaled": "near copies",  # the map 3-5 % too large or small: right under the same scaling
     "tilted": "near copies",  # the map tilted by 2-4 degrees: right where it fits
     "edge": "near copies",  # 10-40 m from the map's border, inside or outside
+    "survey": "ordinary",  # the map is one half of a real survey, the world the other half
+    "survey elsewhere": "outside",  # another square of the same survey, or another survey: every fix is false
+    "survey shifted": "near copies",  # all that is solid 4 m off: right by ground and trees
+    "survey gap": "near copies",  # 40 m around the drive are not on the map, the rest of its rows of houses is
+    "survey twice": "near copies",  # a block of 80 m around the drive is on the map twice
 }  # fmt: skip
 """Class of each family of runs."""
 
@@ -94,18 +99,36 @@ Site = tuple[Run, ...]
 def plan(group: Group, runs: int) -> list[Site]:
     """Return the sites of the first ``runs`` runs, in the proportions of all."""
     out: list[Site] = []
-    kinds, altered, copies = STREETS[group], ALTERED[group], COPIES[group]
-    for k in count():  # streets and near copies in turn
-        seed = FIRST_SEED[group] + 2 * k
-        for site in (
-            _street(group, kinds[k % len(kinds)], seed, altered[k % len(altered)], k // len(altered)),
-            _copy(group, copies[k % len(copies)], seed + 1, k // len(copies)),
-        ):
+    for k in count():
+        for site in _surveys(k) if group == "surveys" else _simulated(group, k):
             out.append(site[:runs])
             runs -= len(out[-1])
             if not runs:
                 return out
     raise AssertionError("count() ended")
+
+
+def _surveys(k: int) -> Iterator[Site]:
+    """Three maps of real surveys: as it is, with a gap, and with a block twice."""
+    seed = FIRST_SEED["surveys"] + 3 * k
+    for kind, families in (
+        ("survey", ("survey", "survey", "survey elsewhere", "survey elsewhere", "survey elsewhere", "survey shifted")),
+        ("gap", ("survey gap", "survey gap")),
+        ("twice", ("survey twice", "survey twice")),
+    ):
+        sensor = _choices(seed)[1]
+        yield tuple(
+            Run("surveys", family, kind, seed, n, sensor(n), driven="survey" * (family == "survey elsewhere"))
+            for n, family in enumerate(families)
+        )
+        seed += 1
+
+
+def _simulated(group: Group, k: int) -> Iterator[Site]:
+    """Streets and near copies in turn."""
+    kinds, altered, copies, seed = STREETS[group], ALTERED[group], COPIES[group], FIRST_SEED[group] + 2 * k
+    yield _street(group, kinds[k % len(kinds)], seed, altered[k % len(altered)], k // len(altered))
+    yield _copy(group, copies[k % len(copies)], seed + 1, k // len(copies))
 
 
 def _street(group: Group, kind: str, seed: int, altered: tuple[str, ...], turn: int) -> Site:

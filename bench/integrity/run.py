@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
+import math
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.harness.files import remembered, thread_settings
+from bench.integrity import surveys
 from bench.integrity.kinds import built, draw, surveyed
 from bench.integrity.plan import FAMILIES, Run, Site
 from bench.integrity.sites import beside_border, lane, rebuilt, shifted
@@ -27,6 +31,7 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.odometry import drive as poses_along
+from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster
 
 Result = dict[str, Any]
@@ -91,10 +96,8 @@ class Drive:
 
 def drive_of(run: Run) -> Drive | None:
     """Return the drive of a run from anywhere on its route, in either direction; None where there is no such street."""
-    kind, seed = (run.driven, run.drive_seed) if run.driven else (run.kind, run.seed)
-    scene = draw(kind, seed, run.changed)
-    if run.rebuilt:
-        scene = rebuilt(scene, run.drive_seed, run.rebuilt)
+    if (scene := _scene(run)) is None:
+        return None
 
     def rng(stream: int) -> np.random.Generator:
         return np.random.default_rng([run.drive_seed, stream])
@@ -102,8 +105,9 @@ def drive_of(run: Run) -> Drive | None:
     draws = rng(_ALTERATION)
     sign, heading, share = draws.choice([-1.0, 1.0]), draws.uniform(0.0, 2 * np.pi), draws.random()
     world = altered(run.family, sign, share, heading)
-    if run.family == "shifted":
-        scene = shifted(scene, SHIFT * np.array([np.cos(heading), np.sin(heading)]))
+    if run.family.endswith("shifted"):
+        move = surveys.moved if run.group == "surveys" else shifted
+        scene = move(scene, SHIFT * np.array([np.cos(heading), np.sin(heading)]))
     route: Floats | None = scene.route
     if run.family == "edge":
         route = beside_border(scene, run.drive_seed, run.beyond)
@@ -121,6 +125,16 @@ def drive_of(run: Run) -> Drive | None:
         return world.cloud(lidar.scan(casters[0], poses[k], k, noise))
 
     return Drive(poses, odometry, None if run.driven or run.family == "mirrored" else poses, frame)
+
+
+def _scene(run: Run) -> Scene | None:
+    """Return the scene of a run's drive, now; None of a survey where there is no room to drive."""
+    if run.group == "surveys":
+        seed = run.drive_seed if run.driven else run.seed
+        return surveys.world(seed, run.drive_seed if run.kind == "survey" else seed, run.seed if run.driven else None)
+    kind, seed = (run.driven, run.drive_seed) if run.driven else (run.kind, run.seed)
+    scene = draw(kind, seed, run.changed)
+    return rebuilt(scene, run.drive_seed, run.rebuilt) if run.rebuilt else scene
 
 
 class Searched(NamedTuple):
@@ -189,22 +203,33 @@ def judged(T_map_body: Pose, truth: Pose | None) -> Result:
     return {"outcome": "right" if metres < NEAR_METRES and degrees < NEAR_DEGREES else "false"}
 
 
-def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int) -> Iterator[Result]:
-    """Yield results as they come, of ``jobs`` processes with one thread each; those of a site stay ``below``."""
+def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: float) -> Iterator[tuple[Result, bool]]:
+    """Yield results as they come, each with whether it was made now; those of a site stay ``below``.
+
+    ``jobs`` processes with one thread each begin no further site after ``until`` (``time.monotonic``), nor one that
+    another call has begun.
+    """
     os.environ.update(thread_settings(1))  # processes that start from now on inherit it
+    below.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(max(1, min(jobs, len(sites))), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(on_site, site, below, code) for site in sites]
+        waiting = [pool.submit(on_site, site, below, code, until) for site in sites]
         try:
             for done in as_completed(waiting):
-                yield from done.result()
+                results, new = done.result()
+                yield from ((result, new) for result in results)
         finally:
             pool.shutdown(cancel_futures=True)
 
 
-def on_site(site: Site, below: Path, code: str) -> list[Result]:
-    """Make all runs on one map unless they are there; runs of a site with a ``failed`` one are made again next time."""
+def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tuple[list[Result], bool]:
+    """Make all runs on one map unless they are there; return them, and whether they were made now.
+
+    Runs of a site with a ``failed`` one are made again next time. None is returned of a site that another process
+    makes, or that was to begin after ``until``.
+    """
     file = below / f"{site[0].kind}-{site[0].seed}.json"
     about = [{"key": run.key, "class": FAMILIES[run.family], **asdict(run)} for run in site]
+    new = []
 
     def one(run: Run, robot: Robot) -> Result:
         try:
@@ -214,16 +239,23 @@ def on_site(site: Site, below: Path, code: str) -> list[Result]:
             return _failed(error)
 
     def make() -> dict[str, Any]:
+        if time.monotonic() > until:
+            raise TimeoutError
+        new.append(site)
         robot = Robot(map_of(site[0]))
         return {"runs": [run | one(case, robot) for run, case in zip(about, site, strict=True)]}
 
-    try:
-        results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]
-    except Exception as error:  # the other sites go on
-        return [run | _failed(error) for run in about]
-    if any(result["outcome"] == "failed" for result in results):
-        file.unlink()
-    return results
+    with file.with_suffix(".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]
+        except (BlockingIOError, TimeoutError):
+            return [], False
+        except Exception as error:  # the other sites go on
+            return [run | _failed(error) for run in about], True
+        if any(result["outcome"] == "failed" for result in results):
+            file.unlink()
+    return results, bool(new)
 
 
 def _failed(error: Exception) -> Result:
@@ -232,4 +264,6 @@ def _failed(error: Exception) -> Result:
 
 def map_of(run: Run) -> BaseMap:
     """Build the map that a run is made on; changes come later."""
+    if run.group == "surveys":
+        return built(surveys.surveyed(run.kind, run.seed))
     return built(surveyed(draw(run.kind, run.seed, 0.0), run.seed))

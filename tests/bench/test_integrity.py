@@ -1,3 +1,4 @@
+import fcntl
 import math
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ from bench.harness.rows import upper
 from bench.integrity import run
 from bench.integrity.integrity import Tally, chosen, classes, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
-from bench.integrity.plan import FAMILIES, Run, plan
+from bench.integrity.plan import FAMILIES, STATED, Run, plan
 from bench.integrity.run import altered, drive_of, judged
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
@@ -91,15 +92,19 @@ def test_reliability_counts_each_run_once_where_it_first_states_an_error():
     sure = search((0.2, True), (0.04, True), (0.02, False))
     runs = [result(str(k), "right", searched=sure) for k in range(9)]
     runs.append(result("x", "none", searched=search((0.08, False), (5e-3, True))))
+    runs.append(result("s", "none", family="survey shifted", searched=search((5e-3, False))))
     runs.append(result("y", "none", family="mirrored", searched=search((0.9, False), (5e-5, False))))
+    runs.append(result("w", "none", **{"class": "outside"}, searched=search((0.9, False))))
     runs.append(result("z", "failed", searched=search((0.01, False))))
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in reliability_table(runs).splitlines()[2:]]
-    found = {limit: cells for limit, *cells in lines}
-    assert {name: (row[0], row[2], row[4], row[6]) for name, row in found.items()} == {
-        "< 0.1": ("11", "2", "1 of 1", "2.0, 2.0"), "< 0.01": ("2", "1", "1 of 1", "2.0, 2.0"),
-        "< 0.001": ("1", "1", "1 of 1", "-"), "< 0.0001": ("1", "1", "1 of 1", "-"),
+    found = {(part, limit): cells for part, limit, *cells in lines}
+    assert {key[1]: (cells[1], cells[4]) for key, cells in found.items() if key[0] == "ordinary"} == {
+        "< 0.1": ("1 of 10", "2.0, 2.0"), "< 0.01": ("0 of 1", "2.0, 2.0"), "< 0.001": ("0 of 0", "-"),
+        "< 0.0001": ("0 of 0", "-"),
     }  # fmt: skip
-    assert (found["< 0.1"][1], found["< 0.01"][3]) == ("4.0e-02", "0.01 to 1")
+    assert found["ordinary", "< 0.1"][0] == "4.4e-02"
+    assert [found["shifted", f"< {limit:g}"][1] for limit in STATED] == ["1 of 1", "1 of 1", "0 of 0", "0 of 0"]
+    assert {found["no place is right", f"< {limit:g}"][1] for limit in STATED} == {"1 of 2"}
 
 
 def every(group, count=1080):
@@ -118,7 +123,8 @@ def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_rep
     assert len({(run.kind, run.seed, run.drive_seed, run.driven) for run in runs}) == 1080
     assert min(classes.count("ordinary"), classes.count("outside")) >= 300
     assert classes.count("near copies") >= 400
-    assert {run.family for run in runs} | {run.family for run in every("calibration")} == set(FAMILIES)
+    real = every("surveys", 30)
+    assert {run.family for run in (*runs, *real, *every("calibration"))} == set(FAMILIES)
     assert {run.family for run in every("reported", 60)} == {run.family for run in runs}
 
 
@@ -161,10 +167,25 @@ def test_a_site_without_a_map_costs_its_runs_and_is_made_again(tmp_path, monkeyp
     monkeypatch.setattr(run, "map_of", lambda case: calls.append(case) or 1 / 0)
     site = plan("reported", 2)[0]
     for _ in range(2):
-        results = run.on_site(site, tmp_path, "a")
+        results, new = run.on_site(site, tmp_path, "a")
+        assert new
         assert [each["reason"].partition(":")[0] for each in results] == ["ZeroDivisionError"] * 2
         assert Tally.of(results).runs == 0
     assert calls == [site[0]] * 2
+
+
+def test_a_site_is_made_once_by_processes_that_share_a_folder_and_not_after_the_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "map_of", lambda case: None)
+    monkeypatch.setattr(run, "Robot", lambda base: None)
+    monkeypatch.setattr(run, "drive_of", lambda case: None)
+    site = plan("surveys", 2)[0]
+    assert run.on_site(site, tmp_path, "a", until=0.0) == ([], False)
+    with (tmp_path / f"{site[0].kind}-{site[0].seed}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert run.on_site(site, tmp_path, "a") == ([], False)
+    results, new = run.on_site(site, tmp_path, "a")
+    assert ([each["outcome"] for each in results], new) == (["no way"] * 2, True)
+    assert run.on_site(site, tmp_path, "a", until=0.0) == (results, False)
 
 
 def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
