@@ -42,9 +42,7 @@ class Benchmark(NamedTuple):
 _BOTH, _ANY = (1, 2), (None,)
 
 BENCHMARKS = {
-    "kernels": Benchmark("speed.kernels", "each kernel beside its NumPy twin", _BOTH),
-    "libraries": Benchmark("speed.libraries", "quadrants beside Taichi; prepared launches", (1,)),
-    "match": Benchmark("speed.match", "one keyframe against all stations at all shifts", _BOTH),
+    "libraries": Benchmark("speed.libraries", "quadrants beside Taichi and NumPy; prepared launches", (1,)),
     "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH),
     "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY),
     "search": Benchmark("speed.search", "a step of the whole search"),

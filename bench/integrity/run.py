@@ -245,7 +245,7 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
         robot = Robot(map_of(site[0]))
         return {"runs": [run | one(case, robot) for run, case in zip(about, site, strict=True)]}
 
-    with file.with_suffix(".lock").open("w") as lock:
+    with file.with_suffix(".busy").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]

@@ -107,29 +107,37 @@ def test_only_tables_that_were_run_change_the_page():
 def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(monkeypatch, tmp_path, capsys):
     code, ran, good = ["1"], [], {"a": True, "b": False}
     page = tmp_path / "page.md"
-    page.write_text("# Mine\n" + results.block("old", "old", "gone", "2026-01-01", "abc1234"))
+    old = (("a", "gone"), ("a, quick", "gone"), ("by hand", "kept"))
+    parts = [results.block(name, "old", text, "2026-01-01", "abc1234") for name, text in old]
+    page.write_text("# Mine\n" + "".join(parts))
     monkeypatch.setattr(results, "COMMANDS", {"a": "a", "b": "b"})
     monkeypatch.setattr(results, "fingerprint", lambda *parts: code[0])
-    monkeypatch.setattr(results, "measured", lambda name: ran.append(name) or f"of {name}" * good[name])
+    monkeypatch.setattr(results, "SIDE_BY_SIDE", {"b"})
+    monkeypatch.setattr(results, "measured", lambda name, threads: ran.append(name) or f"of {name}" * good[name])
 
     def release() -> int:
         return results.main(["--work", str(tmp_path / "work"), "--page", str(page)], release=True)
 
     assert release() == 1
-    assert "code 1: 1 of 2 tables; missing: b" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "code 1: 1 of 2 tables; missing: b" in out
+    assert "code 1: 2 of 2 tables to make, about 0.1 h" in err
     assert "gone" in page.read_text()
     good["b"] = True
     assert release() == 0
-    assert ran == ["a", "b", "b"]
+    assert ran == ["b", "a", "b"]
     assert page.read_text().startswith("# Mine\n\n<!-- results: a -->")
     assert "gone" not in page.read_text()
+    assert page.read_text().endswith(parts[-1])
+    assert ", code 1, 0.0 min\n\nof a\n" in page.read_text()
+    assert "1 of 2 tables to make, about 0.0 h" in capsys.readouterr().err
     code[0] = "2"
     assert release() == 0
-    assert ran[3:] == ["a", "b"]
-    monkeypatch.setattr(results, "measured", lambda name: code.insert(0, "3") or "other")
+    assert ran[3:] == ["b", "a"]
+    monkeypatch.setattr(results, "measured", lambda name, threads: code.insert(0, "3") or "other")
     code[0] = "4"
     assert release() == 2
-    assert "the code changed while a ran" in capsys.readouterr().err
+    assert "the code changed meanwhile" in capsys.readouterr().err
 
 
 def test_every_benchmark_loads():

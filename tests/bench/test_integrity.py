@@ -180,7 +180,7 @@ def test_a_site_is_made_once_by_processes_that_share_a_folder_and_not_after_the_
     monkeypatch.setattr(run, "drive_of", lambda case: None)
     site = plan("surveys", 2)[0]
     assert run.on_site(site, tmp_path, "a", until=0.0) == ([], False)
-    with (tmp_path / f"{site[0].kind}-{site[0].seed}.lock").open("w") as lock:
+    with (tmp_path / f"{site[0].kind}-{site[0].seed}.busy").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert run.on_site(site, tmp_path, "a") == ([], False)
     results, new = run.on_site(site, tmp_path, "a")
