@@ -103,7 +103,8 @@ class BaseMap:
             preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
             config: replaces preset and options.
             progress: show a bar on stderr, or a line for each stage where that is no terminal.
-            crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; of metres.
+            crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; or "feet",
+                "us-feet". Feet are converted to metres.
             options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.
 
         Raises:

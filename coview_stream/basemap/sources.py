@@ -22,6 +22,7 @@ from coview_stream.clouds.reference_system import (
     short_name,
     unchecked_system,
 )
+from coview_stream.clouds.survey_unit import SurveyUnit, unit_of_system
 from coview_stream.errors import CloudError, ConfigError, MapError, warn
 from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
@@ -37,25 +38,48 @@ class Source:
     Attributes:
         path: the file; of an array its name, for messages.
         rows: (N, 3) float32 or float64 coordinates of an array, metres; None of a file.
-        crs: reference system of an array, or of a file that states none.
+        crs: reference system of an array, or of a file that states none; of metres.
+        unit: of such coordinates, if it is not the metre.
     """
 
     path: Path
     rows: Reals | None = None
     crs: str | None = None
+    unit: SurveyUnit | None = None
 
     def head(self) -> CloudHead:
         """Read the file's head, without the points; CloudError if it cannot be used."""
         head = CloudHead(self.path) if self.rows is not None else read_head(self.path)
-        return replace(head, crs=head.crs or self.crs)
+        if self.crs is None or head.crs is not None or head.unit is not None:
+            return head
+        if self.unit is None or head.low is None or head.high is None:
+            return replace(head, crs=self.crs, unit=self.unit)
+        low, high = self.unit.to_metres(head.low), self.unit.to_metres(head.high)
+        return replace(head, crs=self.crs, unit=self.unit, low=low, high=high)
+
+    def unit_to_convert(self) -> SurveyUnit | None:
+        """Return the unit from which its points have to be converted: a file's own is, as it is read.
+
+        Raises:
+            CloudError: an E57 file, whose metres are in its standard.
+        """
+        if self.unit is None or self.head().unit is not self.unit:
+            return None
+        if self.path.suffix.lower() == ".e57":
+            raise CloudError(f"{self.path}: E57 is in metres, not in {self.unit.name}; give a crs of metres")
+        return self.unit
 
     def read(self) -> Cloud:
         """Return the points; CloudError if there are none, or if no map can be made in their reference system."""
+        unit = self.unit_to_convert()
         if self.rows is None:
             cloud = read_cloud(self.path)
+            if unit is not None:
+                points = unit.to_metres(cloud.points).astype(np.float32)
+                return replace(cloud, points=points, origin=unit.to_metres(cloud.origin), crs=self.crs)
         else:
             builder = CloudBuilder()
-            builder.add(self.rows)
+            builder.add(self.rows if unit is None else unit.to_metres(self.rows))
             cloud = builder.finish(str(self.path))
         if self.crs is None or cloud.crs is not None:
             return cloud
@@ -83,7 +107,9 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     """
     if not isinstance(crs, str | None):
         raise ConfigError(f"crs is {crs!r}; give text such as 'EPSG:28992', or WKT")
-    if crs is not None and (flaw := flaw_of_name(crs)) is not None:
+    unit = unit_of_system(crs)
+    crs = crs if unit is None else unit.crs
+    if unit is None and crs is not None and (flaw := flaw_of_name(crs)) is not None:
         raise ConfigError(f"crs {crs[:60]!r} {flaw}")
     if given is None or isinstance(given, bytes | int | float):
         raise CloudError(f"sources is a {type(given).__name__}; give cloud files, or an array (N, 3) of metres")
@@ -94,7 +120,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     sources: list[Source] = []
     for number, item in enumerate(several, 1):
         if isinstance(item, str | os.PathLike):
-            sources += [Source(path, None, crs) for path in expand_cloud_paths([item])]
+            sources += [Source(path, None, crs, unit) for path in expand_cloud_paths([item])]
         else:
             name = "array" if arrays == 1 else f"array {number}"
             array = np.asarray(item) if hasattr(item, "__array__") else None  # pandas and tensors have it, too
@@ -102,7 +128,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
                 flaw = f"is a {type(item).__name__}" if array is None else f"has shape {array.shape}"
                 raise CloudError(f"{name} {flaw}; give a cloud file, or an array (N, 3) of metres")
             kind: Any = np.float32 if array.dtype == np.float32 else np.float64
-            sources.append(Source(Path(name), to_array(array[:, :3], kind, name), crs))
+            sources.append(Source(Path(name), to_array(array[:, :3], kind, name), crs, unit))
     places = [source.path.resolve() for source in sources if source.rows is None]
     for place in places:
         if places.count(place) > 1:
@@ -112,7 +138,11 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 
 
 def warn_of_other_systems(sources: Sequence[Source], heads: Sequence[CloudHead]) -> None:
-    """Warn that the system given for files is not that of files which state their own."""
+    """Warn that coordinates are converted, and that the system given for files is not that of files which have one."""
+    converted = [(head.path, head.unit.name) for head in heads if head.unit is not None]
+    if converted:
+        more = f" and {len(converted) - 1} more" if len(converted) > 1 else ""
+        warn(f"{converted[0][0]}{more}: in {converted[0][1]}; the map and its poses are in metres")
     others = [h for s, h in zip(sources, heads, strict=True) if s.crs is not None and not same_system(s.crs, h.crs)]
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""

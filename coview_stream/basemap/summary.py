@@ -79,7 +79,8 @@ class MapSummary:
     def __str__(self) -> str:
         """Return one line; the size in feet too where no reference system states the unit."""
         area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
-        feet = f" ({self.width * FOOT:.0f} x {self.depth * FOOT:.0f} m if in feet)" if self.crs == UNKNOWN else ""
+        width, depth = self.width * FOOT, self.depth * FOOT
+        feet = f" ({width:.0f} x {depth:.0f} m if in feet: --crs feet)" if self.crs == UNKNOWN else ""
         return (
             f"{self.width:.0f} x {self.depth:.0f} m{feet} with points on {area}, {self.density:.3g} points/m2 kept, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "

@@ -77,7 +77,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="store features for learned re-localization, 35 MB per km2 (they are)",
     )
-    parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
+    parser.add_argument(
+        "--crs",
+        metavar="EPSG:N",
+        help="reference system of clouds that state none; feet or us-feet if only that is known",
+    )
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
     tiles = parser.add_argument_group("directories of tiles")
     tiles.add_argument(

@@ -13,6 +13,7 @@ from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import check_format
 from coview_stream.clouds.las import read_header, system_of
 from coview_stream.clouds.reference_system import same_system, short_name
+from coview_stream.clouds.survey_unit import SurveyUnit
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Bools, Floats
 
@@ -31,6 +32,7 @@ class CloudHead:
         path: of the file.
         crs: reference system, as :attr:`Cloud.crs`.
         points: their number; 0 if the format does not state it.
+        unit: of the file, if its points are converted to metres.
         low, high: (3,) float64 corners of its extent, metres; None if the format does not state them.
     """
 
@@ -39,6 +41,7 @@ class CloudHead:
     low: Floats | None = None
     high: Floats | None = None
     points: int = 0
+    unit: SurveyUnit | None = None
 
 
 def read_head(path: str | os.PathLike[str]) -> CloudHead:
@@ -53,9 +56,10 @@ def read_head(path: str | os.PathLike[str]) -> CloudHead:
     header = read_header(path)
     low, high = header.mins, header.maxs
     stated = header.point_count > 0 and bool(np.isfinite([low, high]).all())
-    return CloudHead(
-        path, system_of(path, header), low if stated else None, high if stated else None, int(header.point_count)
-    )
+    crs, unit = system_of(path, header)
+    if unit is not None:
+        low, high = unit.to_metres(low), unit.to_metres(high)
+    return CloudHead(path, crs, low if stated else None, high if stated else None, int(header.point_count), unit)
 
 
 def extent_in_words(cloud: Cloud) -> str:

@@ -20,6 +20,7 @@ from coview_stream.clouds.e57 import require_pye57
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
 from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text, suffix_of
+from coview_stream.clouds.survey_unit import InMetres, SurveyUnit
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Reals
 
@@ -147,13 +148,14 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
         raise CloudError(f"{path}: does not fit into memory; split it into tiles") from error
 
 
-def stream_cloud(path: Path, builder: CloudBuilder) -> str | None:
+def stream_cloud(path: Path, builder: CloudBuilder, unit: SurveyUnit | None = None) -> str | None:
     """Pass a file's points to a builder, raw, float64 metres; return its reference system, if stated.
 
-    LAS, LAZ and E57 come in chunks of a million points; other formats are read whole first. CloudError as of
-    :func:`read_cloud`, but not for a file without points.
+    ``unit`` is that of a file that states none. LAS, LAZ and E57 come in chunks of a million points; other formats are
+    read whole first. CloudError as of :func:`read_cloud`, but not for a file without points.
     """
     kind = check_format(path)
+    builder = builder if unit is None else InMetres(builder, unit)
     if kind in _WHOLE_READERS:
         cloud = read_cloud(path)
         builder.add(cloud.map_points(), cloud.classification, cloud.dropped)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.cloud import CloudBuilder
 from coview_stream.clouds.reference_system import flaw_of_system, stated_system, unchecked_system
+from coview_stream.clouds.survey_unit import InMetres, SurveyUnit, unit_of_system
 from coview_stream.errors import CloudError, require_library, warn
 from coview_stream.geometry.arrays import Floats
 
@@ -62,21 +63,24 @@ def read_header(path: Path) -> Any:
 
 
 def decode(path: Path, builder: CloudBuilder) -> None:
-    """Read a file chunk by chunk in this process into a builder, with its reference system.
+    """Read a file chunk by chunk in this process into a builder, in metres, with its reference system.
 
-    Withheld points and the classes of noise are dropped and counted. CloudError if it is damaged or not in metres.
+    Withheld points and the classes of noise are dropped and counted. CloudError if it is damaged or not in a plane.
     """
     with _reader(path) as reader:
-        builder.crs = system_of(path, reader.header)
+        builder.crs, unit = system_of(path, reader.header)
+        builder = builder if unit is None else InMetres(builder, unit)
         for raw, classes, dropped in _chunks(path, reader):
             builder.add(raw, classes, dropped)
 
 
-def system_of(path: Path, header: Any) -> str | None:
-    """Return the reference system that a header states, WKT or ``EPSG:code``; None if it states none.
+def system_of(path: Path, header: Any) -> tuple[str | None, SurveyUnit | None]:
+    """Return the reference system that a header states, WKT or ``EPSG:code``, and the unit; None if it states none.
+
+    The system of a file in feet is returned in metres, and its unit; a unit of None is the metre.
 
     Raises:
-        CloudError: no map can be made in that system (feet, degrees, lengths that differ from those on the ground).
+        CloudError: no map can be made in that system (degrees, lengths that differ from those on the ground).
     """
     records = [*header.vlrs, *(header.evlrs or ())]
     wkt = ""
@@ -93,12 +97,15 @@ def system_of(path: Path, header: Any) -> str | None:
                 if key.tiff_tag_location == 0:  # the value itself; others point into records of doubles or text
                     keys.setdefault(key.id, key.value_offset)
     text = stated_system(wkt, keys)
-    flaw = flaw_of_system(text, keys, header.mins, header.maxs)
+    low, high, unit = header.mins, header.maxs, unit_of_system(text, keys)
+    if unit is not None:
+        text, keys, low, high = unit.crs, {}, unit.to_metres(low), unit.to_metres(high)
+    flaw = flaw_of_system(text, keys, low, high)
     if flaw is not None:
         raise CloudError(f"{path}: {flaw}")
     if unchecked_system(text):
         warn(f"{path}: says {text}, whose units were not looked up; pip install 'pyproj>=3.6'")
-    return text
+    return text, unit
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from coview_stream.errors import InputError, printable, require_library
 from coview_stream.geometry.arrays import Floats
 
 _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
-_LINEAR_UNIT, _VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
+LINEAR_UNIT, VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
 _CODES = range(1024, 32767)  # of EPSG; 32767 is a system described by other keys
 _METRE = 9001
 FOOT = 0.3048  # metres
@@ -37,7 +37,7 @@ def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
     if horizontal is None:
         return None
     name, vertical = f"EPSG:{horizontal}", keys.get(_VERTICAL, 0)
-    return f"{name}+{vertical}" if vertical in _CODES and _parse(f"EPSG:{vertical}") else name
+    return f"{name}+{vertical}" if vertical in _CODES and parse_system(f"EPSG:{vertical}") else name
 
 
 def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high: Floats) -> str | None:
@@ -49,13 +49,13 @@ def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high:
         low: (3,) lower corner of the coordinates.
         high: (3,) upper corner.
     """
-    flaw, system, text = None, _parse(text), text or ""
+    flaw, system, text = None, parse_system(text), text or ""
     geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
-    units = {key: _UNITS.get(keys.get(key, _METRE)) for key in (_LINEAR_UNIT, _VERTICAL_UNIT)}
-    if units[_LINEAR_UNIT]:
-        flaw = f"coordinates are in {units[_LINEAR_UNIT]}"
-    elif units[_VERTICAL_UNIT]:
-        flaw = f"heights are in {units[_VERTICAL_UNIT]}"
+    units = {key: _UNITS.get(keys.get(key, _METRE)) for key in (LINEAR_UNIT, VERTICAL_UNIT)}
+    if units[LINEAR_UNIT]:
+        flaw = f"coordinates are in {units[LINEAR_UNIT]}"
+    elif units[VERTICAL_UNIT]:
+        flaw = f"heights are in {units[VERTICAL_UNIT]}"
     elif re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE):
         flaw = "coordinates are in feet"
     elif geographic and _like_degrees(low, high):
@@ -64,7 +64,10 @@ def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high:
         flaw = _flaw(system, 0.5 * (low + high))
     if flaw is None:
         return None
-    return f"{flaw} according to its reference system; reproject it to {_metric_system(system, low, high)}"
+    remedy = f"reproject it to {_metric_system(system, low, high)}"
+    if "feet" in flaw and importlib.util.find_spec("pyproj") is None:
+        remedy = "pip install 'pyproj>=3.6', by which they are converted"
+    return f"{flaw} according to its reference system; {remedy}"
 
 
 def unchecked_system(text: str | None) -> bool:
@@ -76,7 +79,7 @@ def flaw_of_name(text: str) -> str | None:
     """Return why a system named by a person does not fit metric coordinates; None if it does, or without pyproj."""
     if importlib.util.find_spec("pyproj") is None:
         return None
-    system = _parse(text)
+    system = parse_system(text)
     if system is None:
         return "is no reference system; give EPSG:code or WKT"
     if system.is_geographic:
@@ -88,10 +91,10 @@ def same_system(one: str | None, other: str | None) -> bool:
     """Return whether two systems may be the same: one may be unknown, or state no heights."""
     if one is None or other is None or one == other:
         return True
-    first, second = _parse(one), _parse(other)
+    first, second = parse_system(one), parse_system(other)
     if first is None or second is None:
         return False
-    for a, b in zip(_parts(first), _parts(second), strict=False):
+    for a, b in zip(parts_of_system(first), parts_of_system(second), strict=False):
         code = a.to_epsg()
         if not a.equals(b, ignore_axis_order=True) and (code is None or code != b.to_epsg()):
             return False
@@ -102,7 +105,7 @@ def short_name(text: str | None) -> str:
     """Return a system's name in a few words."""
     if text is None:
         return UNKNOWN
-    system = _parse(text)
+    system = parse_system(text)
     if system is not None:
         code = system.to_epsg()
         return f"EPSG:{code} {system.name}" if code else str(system.name)
@@ -112,8 +115,8 @@ def short_name(text: str | None) -> str:
 
 def epsg_of(text: str | None) -> int | None:
     """Return the EPSG number of a system's horizontal part; None if it has none, or without pyproj."""
-    system = None if text is None else _parse(text)
-    code = None if system is None else _parts(system)[0].to_epsg()
+    system = None if text is None else parse_system(text)
+    code = None if system is None else parts_of_system(system)[0].to_epsg()
     return None if code is None else int(code)
 
 
@@ -121,7 +124,7 @@ def _like_degrees(low: Floats, high: Floats) -> bool:
     return bool(np.abs([low[:2], high[:2]]).max() <= 360.0)
 
 
-def _parse(text: str | None) -> Any:
+def parse_system(text: str | None) -> Any:
     """Return a pyproj.CRS; None without pyproj, or for an unknown text, since its points may be good."""
     if not text or importlib.util.find_spec("pyproj") is None:
         return None
@@ -133,14 +136,14 @@ def _parse(text: str | None) -> Any:
         return None
 
 
-def _parts(system: Any) -> list[Any]:
+def parts_of_system(system: Any) -> list[Any]:
     """Return the horizontal part of a system and, if it has one, the vertical."""
     whole = system.source_crs if system.is_bound and system.source_crs is not None else system
     return [part.source_crs if part.is_bound else part for part in (whole.sub_crs_list or [whole])]
 
 
 def _flaw(system: Any, centre: Floats) -> str | None:
-    parts = _parts(system)
+    parts = parts_of_system(system)
     if parts[0].is_geocentric:
         return "coordinates are geocentric (z does not point up)"
     if parts[0].is_geographic:
@@ -179,10 +182,12 @@ def _metric_system(system: Any, low: Floats, high: Floats) -> str:
     """Name a metric system for the place, if possible."""
     how = "a metric system, for example with `pdal translate -f filters.reprojection`"
     centre = 0.5 * (low + high)
-    if system is None or _parts(system)[0].is_geocentric:
+    if system is None or parts_of_system(system)[0].is_geocentric:
         return how
-    geographic = _parts(system)[0].is_geographic
-    place = (float(centre[0]), float(centre[1])) if geographic else _longitude_latitude(_parts(system)[0], centre)
+    horizontal = parts_of_system(system)[0]
+    place = (
+        (float(centre[0]), float(centre[1])) if horizontal.is_geographic else _longitude_latitude(horizontal, centre)
+    )
     if place is None or not -80 <= place[1] <= 84:
         return how
     zone = int((place[0] + 180.0) // 6.0) % 60 + 1

@@ -209,7 +209,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
         _, state, converted = (0.0, state, "") if in_metres is None else searched(in_metres)
         if state is State.TRACKING:
             found = f"the map is in feet: none on it {text}; found {converted} once it is converted"
-            return Finding("FAIL", "place", found, "multiply the survey's coordinates by 0.3048, and build it again")
+            return Finding("FAIL", "place", found, "build it again with --crs feet, or us-feet")
     remedy = (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres"
         f"{untried}, and has the site not changed? `coview-stream help reasons`"

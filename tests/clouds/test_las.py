@@ -49,12 +49,7 @@ def test_points_and_system_by_its_keys_are_read(tmp_path, points, version, point
 
 
 @pytest.mark.parametrize(
-    ("wkt", "unit"),
-    [
-        (PROJECTED.format(unit="US survey foot"), "feet"),
-        ('GEOGCS["WGS 84",UNIT["degree",0.017]]', "degrees"),
-        (PROJECTED.format(unit="metre"), None),
-    ],
+    ("wkt", "unit"), [('GEOGCS["WGS 84",UNIT["degree",0.017]]', "degrees"), (PROJECTED.format(unit="metre"), None)]
 )
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_system_in_text_must_be_in_metres(tmp_path, suffix, wkt, unit):
@@ -67,10 +62,7 @@ def test_system_in_text_must_be_in_metres(tmp_path, suffix, wkt, unit):
         read_cloud(path)
 
 
-@pytest.mark.parametrize(
-    ("keys", "says"),
-    [({"k1024": 1, "k3072": 2277}, "feet"), ({"k2048": 4326}, "degrees"), ({"k3072": 25832, "k4099": 9002}, "heights")],
-)
+@pytest.mark.parametrize(("keys", "says"), [({"k3072": 25832, "k3076": 9002}, "feet"), ({"k2048": 4326}, "degrees")])
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_system_by_its_keys_must_be_in_metres(tmp_path, keys, says, suffix):
     pytest.importorskip("pyproj", reason="pyproj is not there; pip install pyproj")

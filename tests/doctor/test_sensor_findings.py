@@ -80,7 +80,7 @@ def test_map_in_feet_is_named(in_feet):
     finding = place_finding(*in_feet, LocalizerConfig(), lambda *done: told.append(done))
     assert finding.verdict == "FAIL"
     assert re.match(r"the map is in feet: none on it after \d+ m: .*; found after .*wrong .*1 in", finding.found)
-    assert "0.3048" in finding.remedy
+    assert "--crs feet" in finding.remedy
     total = len(in_feet[0])
     assert told[: total + 1] == [*((k, total) for k in range(1, total + 1)), (1, total)]
 

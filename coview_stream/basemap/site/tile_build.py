@@ -50,6 +50,7 @@ class Parts:
         crs: stated by the source.
         points: usable points of the source.
         tiles: number of points by column and row.
+        metres: of a unit of x, y and z, where the given one is not the metre.
     """
 
     folder: Path
@@ -58,6 +59,7 @@ class Parts:
     crs: str | None
     points: int
     tiles: dict[Key, int]
+    metres: tuple[float, ...] = ()
 
     def file(self, key: Key) -> Path:
         """Return the file of a tile."""
@@ -78,7 +80,7 @@ def extent_of(source: Source) -> tuple[Floats, Floats]:
             np.minimum(low, usable.min(axis=0, initial=np.inf), out=low)
             np.maximum(high, usable.max(axis=0, initial=-np.inf), out=high)
 
-    stream_cloud(source.path, Extent())
+    stream_cloud(source.path, Extent(), source.unit_to_convert())
     if not np.isfinite(low).all():
         raise CloudError(f"{source.path}: holds zero points; export the cloud again")
     return low, high
@@ -93,21 +95,24 @@ def partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
     source, name, grid, folder = job
     done = folder.with_suffix(".json")
     stat = source.path.stat()
+    unit = source.unit_to_convert()
+    metres = () if unit is None else unit.metres
     state = [str(source.path.resolve()), stat.st_size, stat.st_mtime_ns, list(grid.origin), grid.tile, source.crs]
+    state += metres
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # not there, or not complete
         facts = json.loads(done.read_bytes())
         tiles = {(column, row): count for column, row, count in facts["tiles"]}
-        parts = Parts(folder, name, facts["sha256"], facts["crs"], facts["points"], tiles)
+        parts = Parts(folder, name, facts["sha256"], facts["crs"], facts["points"], tiles, metres)
         if facts["state"] == state and all(parts.file(k).stat().st_size == 12 * n for k, n in tiles.items()):
             return parts
     shutil.rmtree(folder, ignore_errors=True)
     done.unlink(missing_ok=True)
     folder.mkdir(parents=True)
     writer = _Writer(grid, folder)
-    crs = stream_cloud(source.path, writer) or source.crs
+    crs = stream_cloud(source.path, writer, unit) or source.crs
     if not writer.counts:
         raise CloudError(f"{source.path}: holds no points that can be used; export the cloud again")
-    parts = Parts(folder, name, source.sha256(), crs, sum(writer.counts.values()), writer.counts)
+    parts = Parts(folder, name, source.sha256(), crs, sum(writer.counts.values()), writer.counts, metres)
     facts = {
         "state": state, "sha256": parts.sha256, "crs": crs, "points": parts.points,
         "tiles": [[*key, count] for key, count in sorted(writer.counts.items())],
@@ -161,7 +166,7 @@ class ThinJob:
     @property
     def digest(self) -> str:
         """Hash of all inputs."""
-        points = [[part.sha256, part.crs, part.tiles[self.key]] for part in self.parts]
+        points = [[part.sha256, part.crs, part.tiles[self.key], *part.metres] for part in self.parts]
         return _hash([_settings(self.grid), self.key, points])
 
     @property
