@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NoReturn
 
@@ -158,7 +159,10 @@ class Localizer(SavedState):
             self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
         return self.fix()
 
-    def add_frame(self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
+    def add_frame(
+        self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False,
+        on_doubt: Callable[[], None] = lambda: None,
+    ) -> SearchRequest | None:  # fmt: skip
         """:meth:`step` without the search: its arguments, and its errors.
 
         Args:
@@ -166,13 +170,14 @@ class Localizer(SavedState):
             T_odom_body: see there.
             stamp: see there.
             defer: the caller is behind: while tracking, register every third metre where that is enough.
+            on_doubt: called if the frame contradicts the place, some tenths of a second before it is known why.
 
         Returns:
             The search request, if any: give it to a :class:`GlobalSearch`, in any thread or process, and its result to
             :meth:`apply_search_result` between two frames. Frames go on meanwhile. ``AsyncLocalizer`` does all of it.
         """
         frame, request = self._predict(cloud, T_odom_body, stamp)
-        match = self._match_to_map(frame, defer) if self.state.has_place else None
+        match = self._match_to_map(frame, defer, on_doubt) if self.state.has_place else None
         if match is not None:
             self._update(match)
         return request
@@ -343,7 +348,9 @@ class Localizer(SavedState):
         self._evidence = KeyframeEvidence(stamp, self.state, request.reason, cause=request.cause)
         return frame, None
 
-    def _match_to_map(self, frame: PreparedFrame, defer: bool = False) -> MapMatch | None:
+    def _match_to_map(
+        self, frame: PreparedFrame, defer: bool = False, on_doubt: Callable[[], None] = lambda: None
+    ) -> MapMatch | None:
         """Register the newest scans after a metre, a second, or when something looks wrong."""
         if self._frames.conventions.doubtful:
             return None
@@ -353,7 +360,7 @@ class Localizer(SavedState):
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
         newest_only |= self._witness.between_registrations(self._tracker)
         if due or waited or newest_only:
-            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
+            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only, on_doubt)
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 

@@ -305,7 +305,7 @@ class Mailbox:
         with self.changed:
             if self._fix is None or (self._lost is not None and not self._fix.state.has_place):
                 return State.SEARCHING if self._lost is None else State.LOST
-            outdated = self._fix.state is State.TRACKING and self._unseen > _MAX_UNSEEN
+            outdated = self._fix.state is State.TRACKING and (self._unseen > _MAX_UNSEEN or self.queue.in_doubt)
             return State.DOUBTED if outdated else self._fix.state
 
     @property
@@ -336,6 +336,8 @@ class Mailbox:
             return fix.carried(newest.stamp, newest.T_odom_body, driven, turned)
         if state is not fix.state:
             reason = f"no frame of the last {unseen:.1f} s has been worked on"
+            if unseen <= _MAX_UNSEEN:
+                reason = "a frame speaks against the place, and others are tried"
             return Fix(newest.stamp, state, evidence=KeyframeEvidence(at.stamp, state, reason), calibration=calibration)
         return replace(fix, stamp=newest.stamp)
 
@@ -378,6 +380,11 @@ class Mailbox:
         if fix.T_map_body is not None:
             self._lost = None
             self.hints.verified(fix.T_map_body, self.calibration)
+
+    def note_doubt(self, job: Job) -> None:
+        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        with self.changed:
+            self.queue.note_doubt(job)
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
         """Search again where the tracking engine has forgotten the robot; tell the agent."""

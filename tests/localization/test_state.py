@@ -210,7 +210,11 @@ def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
     localizer = Localizer(world_map)
     assert follow(localizer, world_drive, range(9))[-1].state is State.TRACKING
     drive = carried(world_drive, 8, to)
-    stood = [localizer.step(drive.clouds[to], drive.T_odom_body[to], 4.1 + 0.1 * k) for k in range(5)]
+    doubts = []
+    localizer.add_frame(drive.clouds[to], drive.T_odom_body[to], 4.1, on_doubt=lambda: doubts.append(localizer.state))
+    assert doubts == [State.TRACKING]  # long before it is known where else it is
+    stood = [localizer.fix()]
+    stood += [localizer.step(drive.clouds[to], drive.T_odom_body[to], 4.1 + 0.1 * k) for k in range(1, 5)]
     went = follow(localizer, drive, range(to + 1, 10), 5.0)
     fixes = stood + went
     truths = [drive.T_map_body[to]] * 5 + drive.T_map_body[to + 1 :]

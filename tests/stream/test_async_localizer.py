@@ -87,6 +87,9 @@ def test_fix_is_carried_on_by_odometry_until_it_is_too_old(worked, world_fixes):
         assert fix.protection.metres > last.protection.metres
         last = fix
     assert worked.mailbox.counters.dropped == 6
+    worked.mailbox.note_doubt(worked.mailbox.take_job("track"))  # its frame contradicts the place
+    assert worked.mailbox.fix().state is State.DOUBTED
+    assert worked.mailbox.fix().evidence.reason == "a frame speaks against the place, and others are tried"
     worked.mailbox.add_frame(worked.drive.clouds[9], worked.drive.T_odom_body[9], 6.5)
     doubted = worked.mailbox.fix()
     assert doubted.state is State.DOUBTED

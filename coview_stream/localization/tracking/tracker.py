@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -142,8 +143,9 @@ class Tracker:
         self._restart(self._of_cloud(registration.T_map_source @ T_odom_body), covariance, T_odom_body)
 
     def match_to_map(
-        self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False
-    ) -> MapMatch:
+        self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False,
+        on_doubt: Callable[[], None] = lambda: None,
+    ) -> MapMatch:  # fmt: skip
         """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
         Args:
@@ -152,6 +154,7 @@ class Tracker:
             standing_still: use only frames since the last registration, and trust odometry a little less: repeated
                 views of a standing robot must not add up to certainty.
             newest_only: use the newest frame alone, as the frames are in doubt.
+            on_doubt: called if the place is contradicted, before it is looked for metres around: tenths of a second.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
@@ -173,7 +176,10 @@ class Tracker:
         scan = ObservedScan.of(points, self._calibration.calibration.level(cloud), T_odom_body)
         match = self._matcher.match(scan, belief, target, self.config.registration.track, belief)
         limit, tries = self.config.acceptance.max_innovation, [match]
-        if newest_only or not match.verdict.verified or match.innovation > limit:
+        contradicted = not match.verdict.verified or match.innovation > limit
+        if contradicted:
+            on_doubt()
+        if newest_only or contradicted:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
             match = max(tries, key=lambda attempt: (attempt.verdict.verified, attempt.verdict.ratio))

@@ -38,6 +38,10 @@ class Robot(Protocol):
         """Apply the result of a job at local time ``now``."""
         ...
 
+    def note_doubt(self, job: Job) -> None:
+        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        ...
+
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
         """Note a job without a result; unless it was ``rejected``, its engine has forgotten the robot."""
         ...
@@ -131,8 +135,10 @@ class EngineFeed(Generic[R]):
 
     def work(self, engine: str, robot: R, job: Job) -> None:
         """Do one job; an error is counted and concerns this robot, unless the engine died."""
+        runner = self.engines[engine]
+        runner.on_doubt = partial(robot.note_doubt, job)
         try:
-            result = self.engines[engine].run(job)
+            result = runner.run(job)
         except RejectedError as error:
             robot.handle_failure(job, str(error), rejected=True)
         except FailedError as error:

@@ -42,6 +42,7 @@ odometry."""
 
 _POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
 _PARENT_INTERVAL = 2.0  # seconds between two checks of an idle child whether its parent lives
+_DOUBT = ("doubt", None)  # message during a job
 _REST = 3  # such checks: a robot that is searched for sends a keyframe every few seconds
 
 
@@ -113,7 +114,13 @@ def engine_environment(kind: str) -> dict[str, str]:
 
 
 class EngineRunner(Protocol):
-    """Runs an engine's jobs one at a time."""
+    """Runs an engine's jobs one at a time.
+
+    Attributes:
+        on_doubt: called during a job if its frame contradicts the robot's place.
+    """
+
+    on_doubt: Callable[[], None]
 
     def run(self, job: Job) -> Result:
         """Do one job and wait for it; RejectedError, FailedError or DiedError."""
@@ -172,6 +179,7 @@ class EngineProcess:
         self.job_timeout = job_timeout
         self.open_timeout = open_timeout
         self._opening = map_path, sha256, config, trust
+        self.on_doubt: Callable[[], None] = lambda: None
         self._prestarted = child
         self._closed = False
         self._lock = threading.Lock()
@@ -250,7 +258,9 @@ class EngineProcess:
             raise DiedError(str(error)) from error
         with self._exchange(self.job_timeout) as pipe:
             pipe.send(job)
-            kind, value = pipe.recv()
+            while (answer := pipe.recv()) == _DOUBT:
+                self.on_doubt()
+        kind, value = answer
         return unwrap(kind, value)
 
     @contextmanager
@@ -394,6 +404,7 @@ def work(
         _set_group_nice(0)
         try:
             engine = (open_engine or engines.open_engine)(kind, *opening)
+            engine.on_doubt = partial(pipe.send, _DOUBT)
             pipe.send(("ready", None))
             engine.prepare()
         except CoViewError as error:

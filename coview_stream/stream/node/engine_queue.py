@@ -213,6 +213,7 @@ class EngineQueue:
         self.considered: Considered | None = None  # places of the newest search; None once there is a place
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
+        self._doubting: Job | None = None  # newest job that contradicted the place
         self._frame_done: QueuedFrame | None = None  # the newest one
         self._search_result: SearchResult | None = None
         self._request: SearchRequest | None = None
@@ -327,6 +328,15 @@ class EngineQueue:
             # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
             self._search_result = self._search_result or job.search_result
         return True
+
+    def note_doubt(self, job: Job) -> None:
+        """Note that the frame of a job contradicts the place."""
+        self._doubting = job
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the frame under way contradicts the place."""
+        return self._frame_under_way is not None and self._frame_under_way.job is self._doubting
 
     def put_search_request(self, request: SearchRequest, now: float) -> None:
         """Make a request the next one; a request that waits already is skipped, and its wait goes on."""

@@ -35,10 +35,12 @@ class Engine(ABC):
     Attributes:
         kernels: that its first jobs launch, to be compiled before them.
         later_kernels: that only later jobs launch, to be compiled between jobs.
+        on_doubt: called during a job if its frame contradicts the robot's place.
     """
 
     kernels: tuple[str, ...] = ()
     later_kernels: tuple[str, ...] = ()
+    on_doubt: Callable[[], None] = staticmethod(lambda: None)
 
     @abstractmethod
     def run(self, job: Job) -> Result:
@@ -108,7 +110,7 @@ class TrackEngine(Engine):
         if job.times is not None and job.segment is not None:
             sweep = localizer.calibration.sweep
             points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body, sweep)
-        request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer)
+        request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer, self.on_doubt)
         return FrameResult(localizer.fix(), request, time.perf_counter() - begin, localizer.take_events())
 
     def forget(self, robot: str) -> None:

@@ -243,6 +243,10 @@ class Session:
                 self._proceed(None, now)
                 self._record_state()
 
+    def note_doubt(self, job: Job) -> None:
+        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        self.queue.note_doubt(job)
+
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
         """Count a job without a result; unless it was ``rejected``, its engine has forgotten the robot."""
         with self.lock:
@@ -276,10 +280,11 @@ class Session:
     def pose(self) -> PoseMessage | None:
         """Return the newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING.
 
+        None as well while a frame that contradicts the place is worked on: other places are tried for up to a second.
         Of several maps it is in the frame of the robot's map, whose name is its ``frame_id``.
         """
         with self.lock:
-            pose = self.robot_state.pose(self.inputs.odometry)
+            pose = None if self.queue.in_doubt else self.robot_state.pose(self.inputs.odometry)
         if pose is None or self.parts is None:
             return pose
         part = self.parts.at(pose.T_map_body[:3, 3])

@@ -341,6 +341,7 @@ class Engine:
     def rest(self):
         pass
     def run(self, job):
+        self.on_doubt()
         raise DependencyError("no scipy" + self.prepared)
 work(pipe, "odometry", lambda *args: Engine())
 """
@@ -348,7 +349,8 @@ work(pipe, "odometry", lambda *args: Engine())
 
 @pytest.mark.slow
 def test_library_that_is_missing_is_the_jobs_error(engine):
-    process = engine("odometry", child=Program(LACKING))
+    process, doubts = engine("odometry", child=Program(LACKING)), []
+    process.on_doubt = lambda: doubts.append(process.ready)
 
     def error():
         with pytest.raises(RejectedError, match="no scipy") as caught:
@@ -356,3 +358,5 @@ def test_library_that_is_missing_is_the_jobs_error(engine):
         return str(caught.value)
 
     until(lambda: error() == "no scipy, also later", 20.0)
+    assert doubts
+    assert all(doubts)

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from fake_node import STEP, declared
-from fake_robot import SHA, T_MAP_ODOM, message, ns
+from fake_robot import SHA, T_MAP_ODOM, message, ns, tracking
 from small_world import pose_error
 
 from coview_stream.geometry.transforms import pose_from
@@ -90,3 +90,20 @@ def test_pose_encoding_option():
     site.poses("r1")
     (sent,) = site.net.samples("coview/r1/out/pose")
     assert sent.encoding.startswith("application/cdr;")
+
+
+def test_no_pose_while_a_frame_that_contradicts_the_place_is_worked_on():
+    """A robot that was carried: the engine looks for other places for tenths of a second, odometry goes on."""
+    site, counts = declared("r1"), []
+    site.frame("r1", 0.0)
+
+    def answer(job):
+        for seconds in (0.12, 0.13):
+            site.moves("r1", seconds)
+            counts.append(len(site.poses("r1")))
+            site.track.on_doubt()
+        return tracking(job)
+
+    site.engine.answer = answer
+    site.frame("r1", 0.1)
+    assert counts[0] == counts[1] == len(site.poses("r1")) - 1
