@@ -102,15 +102,14 @@ class Place:
         return pose_from(np.eye(3), self.queries[-1].position)
 
 
-def places(scene: str, count: int) -> list[Place]:
-    """``count`` places, evenly along the run of one of :data:`WORLDS`."""
-    site, run, (_, truth) = opened(WORLDS[scene])
+def places(site: BaseMap, run: Run, truth: Floats, count: int, keyframes: int = KEYFRAMES) -> list[Place]:
+    """``count`` places with so many keyframes each, evenly along a run with true poses (N, 4, 4) on a map."""
     way = driven(run.poses)
-    last = way[-1] - KEYFRAMES * KeyframeConfig().distance
-    return [_place(run, truth, int(k), site) for k in np.searchsorted(way, np.linspace(0.0, last, count))]
+    last = max(0.0, way[-1] - keyframes * KeyframeConfig().distance)
+    return [_place(run, truth, int(k), site, keyframes) for k in np.searchsorted(way, np.linspace(0.0, last, count))]
 
 
-def _place(run: Run, truth: Floats, start: int, site: BaseMap) -> Place:
+def _place(run: Run, truth: Floats, start: int, site: BaseMap, keyframes: int) -> Place:
     buffer, queries = KeyframeBuffer(KeyframeConfig()), []
     for index in range(start, len(run)):
         frame = run.read(index)
@@ -118,9 +117,9 @@ def _place(run: Run, truth: Floats, start: int, site: BaseMap) -> Place:
         keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, buffer.config), T_odom_body), frame.stamp)
         if keyframe is not None:
             queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(site.descriptor_config)))
-        if len(queries) == KEYFRAMES:
+        if len(queries) == keyframes:
             break
     position = queries[-1].position
-    submap = (buffer.recent(KEYFRAMES) - position.astype(np.float32)).astype(np.float32)
+    submap = (buffer.recent(keyframes) - position.astype(np.float32)).astype(np.float32)
     T_submap_body = pose_from(T_odom_body[:3, :3], np.zeros(3))
     return Place(queries, submap, to_local(truth[index], site.origin) @ inverse(T_submap_body))

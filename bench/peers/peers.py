@@ -1,7 +1,8 @@
-"""Other libraries on the same queries: a robot that was switched on eight metres ago.
+"""Other libraries on the same queries, in simulated worlds and real runs: a robot switched on eight metres ago.
 
-A trial ends after ``--limit`` seconds, so a slow peer answers the first queries only, and the shares of both sides are
-of those. Extra ``peers``; a peer that is missing gets a line with the remedy.
+Each is asked twice: with the submap of the five keyframes since then, and with one scan alone. A trial ends after
+``--limit`` seconds, so a slow peer answers the first queries only, and the shares of both sides are of those. Extra
+``peers``; a peer that is missing gets a line with the remedy. ``--data`` has the real runs.
 """
 
 from __future__ import annotations
@@ -23,17 +24,20 @@ import numpy as np
 
 import coview_kernels
 from bench.__main__ import run
-from bench.accuracy import paper
-from bench.harness.files import folder, isolated
+from bench.accuracy.conditions import SETS, RealSet
+from bench.harness.files import add_data, built, folder, isolated, peak_megabytes
 from bench.harness.rows import Row, bounded, failed, informs, listed
-from bench.harness.worlds import WORLDS, Place, map_of, places
+from bench.harness.worlds import KEYFRAMES, WORLDS, Place, map_of, places, prepare
+from bench.speed.registration import SmallGicp
 from coview_stream import BaseMap
+from coview_stream.clouds import read_tum
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CoViewError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.recordings.open_run import open_run
 from coview_stream.sim.casting import open3d
 
 
@@ -73,19 +77,6 @@ class Keyframes:
         return Answer(None, False)
 
 
-class ByPaper:
-    """The first paper's method on the submap as one virtual local scan; it verifies nothing, so it always vouches."""
-
-    def __init__(self, site: BaseMap, way: str) -> None:
-        coview_kernels.warm_up()
-        self._reference, self._count = paper.Reference(site), paper.WAYS[way]
-
-    def answer(self, place: Place) -> Answer:
-        """Take the station of the smallest distance, and refine."""
-        scan = paper.LocalScan.of(place.submap, np.zeros(3), self._reference.config.voxel)
-        return Answer(self._reference.refine(scan, self._reference.match(scan, self._count)[1]), True)
-
-
 class KissMatcher:
     """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
 
@@ -107,6 +98,20 @@ class KissMatcher:
         inliers = int(self._matcher.get_num_final_inliers())
         T = pose_from(np.asarray(found.rotation), np.asarray(found.translation).ravel())
         return Answer(T, bool(found.valid) and inliers >= self.INLIERS)
+
+
+class Refined(KissMatcher):
+    """KISS-Matcher, then small_gicp's GICP from there, as KISS-Matcher's own pipeline for maps does."""
+
+    def __init__(self, site: BaseMap) -> None:
+        super().__init__(site)
+        self._fine = SmallGicp(self._map, "GICP", 0.5, 1.0, threads=1)
+
+    def answer(self, place: Place) -> Answer:
+        """Match, then register."""
+        coarse = super().answer(place)
+        found = self._fine.align(self._fine.prepared(place.submap, 0.5)[0], coarse.T_map_submap)
+        return Answer(np.array(found.T_target_source), coarse.vouched)
 
 
 class MapClosures:
@@ -218,9 +223,9 @@ OURS = "coview_stream"
 
 PEERS = (
     Peer(OURS, Keyframes),
-    Peer("coview_stream, one scan", partial(Keyframes, one_scan=True)),
-    *(Peer(way, partial(ByPaper, way=way)) for way in paper.WAYS),
+    Peer("coview_stream, as one scan", partial(Keyframes, one_scan=True)),
     Peer("KISS-Matcher", KissMatcher),
+    Peer("KISS-Matcher, then small_gicp", Refined),
     Peer("MapClosures", MapClosures),
     Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),
     Peer("Open3D FPFH + FGR", partial(Features, way="fgr")),
@@ -256,12 +261,14 @@ class Trial:
             "false": self.false_accepts(), "ms": milliseconds([self]),
             "metres": float(np.median([a["metres"] for a in self.right()] or [math.nan])),
             "degrees": float(np.median([a["degrees"] for a in self.right()] or [math.nan])),
+            "megabytes": max((a["megabytes"] for a in self.answers), default=math.nan),
         }  # fmt: skip
 
 
 COLUMNS = (
-    ("peer", "peer", None), ("world", "scene", None), ("right < 3 m", "right", None), ("false accepts", "false", 0),
-    ("e_t m", "metres", 3), ("e_r deg", "degrees", 2), ("query ms", "ms", 0),
+    ("peer", "peer", None), ("world", "scene", None), ("right < 3 m", "right", None),
+    ("wrong but vouched for", "false", 0), ("e_t m", "metres", 3), ("e_r deg", "degrees", 2), ("query ms", "ms", 0),
+    ("MB", "megabytes", 0),
 )  # fmt: skip
 
 
@@ -327,26 +334,53 @@ def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
         seconds = time.perf_counter() - begin
         T = answer.T_map_submap
         metres, degrees = (None, None) if T is None else place.errors(T)
-        said = {"seconds": seconds, "vouched": answer.vouched, "metres": metres, "degrees": degrees}
+        said = {
+            "seconds": seconds, "vouched": answer.vouched, "metres": metres, "degrees": degrees,
+            "megabytes": peak_megabytes(),
+        }  # fmt: skip
         yield informs(f"trial/query {k}", seconds, "s", said)
 
 
-def contest(peers: Sequence[Peer], count: int, limit_s: float) -> Iterator[Trial]:
-    """Yield a trial per world and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
+QUERIES = {"": KEYFRAMES, ", one scan": 1}  # suffix of the world's name, and keyframes of a query
+
+
+def ground_of(scene: str, data: Path) -> tuple[Path, Path]:
+    """Return the map of a simulated world or of a real set, and the folder of its ``run`` and truth, made if needed."""
+    if scene in WORLDS:
+        return map_of(folder(), WORLDS[scene]), prepare(folder(), WORLDS[scene])
+    real = RealSet(data / scene)
+    return built(real.survey, folder() / "conditions" / "maps" / f"{scene}.coview"), real.folder
+
+
+def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place]:
+    run, truth = open_run(world / "run"), read_tum(world / "truth.tum")[1]
+    return places(BaseMap.load(site), run, truth, count, keyframes)
+
+
+def contest(peers: Sequence[Peer], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
+    """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
     with tempfile.TemporaryDirectory() as scratch:
-        for scene, config in WORLDS.items():
-            file = Path(scratch) / scene
-            file.write_bytes(pickle.dumps(isolated(places, scene, count)))
-            for peer in peers:
-                print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
-                yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
+        for scene, (site, world) in scenes.items():
+            for suffix, keyframes in QUERIES.items():
+                file = Path(scratch) / f"{scene}{suffix}"
+                file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
+                for peer in peers:
+                    print(f"... {peer.name}, {scene}{suffix}", file=sys.stderr, flush=True)
+                    yield run_trial(peer, f"{scene}{suffix}", count, site, file, limit_s)
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add how many places, and how long."""
+    """Add the worlds, how many places, and how long."""
+    add_data(parser)
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
+    parser.add_argument(
+        "--worlds", nargs="+", metavar="NAME", help=f"of {', '.join((*WORLDS, *SETS))} (all that are there)"
+    )
+    parser.add_argument(
+        "--peers", nargs="+", metavar="NAME", help=f"parts of names of {', '.join(p.name for p in PEERS)}"
+    )
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
-    parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
+    parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world, query and peer (180 s)")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -355,9 +389,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
         signal.alarm(math.ceil(asked.limit))  # ends this process
         yield from _asked(*asked.trial)
         return
-    trials = list(contest(PEERS, 4 if asked.quick else asked.places, asked.limit))
+    there = [*WORLDS, *(name for name in SETS if (asked.data / name).exists())]
+    scenes = {name: ground_of(name, asked.data) for name in asked.worlds or (there[-1:] if asked.quick else there)}
+    peers = [p for p in PEERS if p.name == OURS or any(part in p.name for part in asked.peers or [""])]
+    trials = list(contest(peers, scenes, 4 if asked.quick else asked.places, asked.limit))
     reference = [trial for trial in trials if trial.peer == OURS]
-    for peer in PEERS:
+    for peer in peers:
         theirs = [trial for trial in trials if trial.peer == peer.name]
         details = {"trials": [asdict(trial) for trial in theirs]}
         for row in compared(theirs, reference, ours=peer.name.startswith(OURS)):
@@ -368,6 +405,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """All peers in all worlds; those that did nothing say why below."""
     trials = [Trial(**values) for row in rows for values in row.details.get("trials", ())]
-    trials.sort(key=lambda trial: list(WORLDS).index(trial.scene))
+    scenes = list(dict.fromkeys(trial.scene for trial in trials))
+    trials.sort(key=lambda trial: scenes.index(trial.scene))
     troubles = [f"{trial.peer}, {trial.scene}: {trial.trouble}" for trial in trials if trial.trouble]
     return {"worlds": "\n\n".join([listed(COLUMNS, [trial.figures() for trial in trials]), *troubles])}
