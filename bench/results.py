@@ -72,16 +72,16 @@ QUICK = {
 
 SIDE_BY_SIDE = {
     "accuracy", "dirt", "conditions", "conditions beside the paper", "airborne-like maps", "overlap", "changed ground",
-    "faults", "tracking", "smooth", "covariance", "protection", "forest", "forest_runs", "forest_drives", "changes",
-    "joint", *(f"ablation, {group}" for group in ABLATION),
+    "faults", "tracking", "smooth", "covariance", "protection", "forest", "forest_drives", "changes",
+    *(f"ablation, {group}" for group in ABLATION),
 }  # fmt: skip
 """Tables that run side by side, one on each core: no time in them has a target."""
 
 MINUTES = {
     "integrity": 180, "soak": 61, "accuracy": 30, "dirt": 60, "tracking": 40, "protection": 80, "conditions": 15,
-    "forest": 30, "forest_runs": 30, "forest_drives": 30, "changed ground": 30, "city": 30, "smooth": 20, "stream": 15,
+    "forest": 30, "forest_drives": 30, "changed ground": 30, "city": 30, "smooth": 20, "stream": 15,
     "faults": 15, "overlap": 13, "airborne-like maps": 12, "covariance": 10, "peers": 15, "memory": 10, "lidars": 10,
-    "fleet": 10, "joint": 10, "registration": 10, "throughput": 7,
+    "fleet": 10, "registration": 10, "throughput": 7,
 }  # fmt: skip
 """About how long a table takes on two quiet cores, the others five minutes, until DIR says how long it took here."""
 

@@ -1,4 +1,4 @@
-"""Results on disk that are valid for the code that made them; processes, their threads and memory; stage clocks."""
+"""Results on disk that are valid for the code that made them; processes, their threads and memory."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ import resource
 import subprocess
 import sys
 import tempfile
-import time
 from argparse import ArgumentParser
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from types import CodeType
@@ -120,22 +117,6 @@ def environment(threads: int | None = None) -> dict[str, str]:
     """Return our environment with the import roots of this checkout in front; the machine's threads, or so many."""
     path = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "kernels"), os.environ.get("PYTHONPATH"))))
     return {**os.environ, "PYTHONPATH": path, **(thread_settings(threads) if threads else {})}
-
-
-class Clock:
-    """Seconds by name, added up; ``with clock("name"):`` adds to them."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Add the seconds of the block."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] += time.perf_counter() - begin
 
 
 def built(source: Path, site: Path) -> Path:

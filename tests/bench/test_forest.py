@@ -1,12 +1,8 @@
 """Scores of the forest benchmarks follow from planted answers."""
 
 import numpy as np
-import pytest
-from drives_with_truth import track
 
-from bench.forest import runs
 from bench.forest.forest import METHODS, distinct, false, recall, success
-from coview_stream.geometry.transforms import pose_from
 
 
 def answer(off, **more):
@@ -40,14 +36,3 @@ def test_places_are_ten_metres_apart_and_best_first():
     xy = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 11.0], [50.0, 0.0], [80.0, 0.0]])
     score = np.array([1.0, 0.9, 0.5, 0.8, -np.inf])
     np.testing.assert_array_equal(distinct(xy, score), [[0.0, 0.0], [50.0, 0.0], [0.0, 11.0]])
-
-
-def test_a_run_is_scored_by_two_metres_and_outside_every_pose_is_false():
-    truth = np.array([pose_from(np.eye(3), [10.0 * k, 0, 0]) for k in range(5)])
-    poses = truth.copy()
-    poses[:, 0, 3] += [0.0, 0.3, 0.0, 2.5, 0.4]
-    drive = track(["SEARCHING", "TRACKING", "SEARCHING", "TRACKING", "TRACKING"], poses)
-    row = runs.scored(drive, truth, outside=False)
-    assert (row["first_fix_m"], row["posed"], row["false"]) == (10.0, 60.0, 1)
-    assert row["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
-    assert runs.scored(drive, truth, outside=True)["false"] == 3
