@@ -41,7 +41,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bench.accuracy import paper
-from bench.accuracy.scores import Track, errors, score
+from bench.accuracy.scores import Track, errors, exposed, score
 from bench.harness import worlds
 from bench.harness.files import PYTHON, add_data, built, environment, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed, number
@@ -385,6 +385,7 @@ def verdicts(results: Sequence[dict[str, Any]]) -> Iterator[Row]:
         worst, where = max(first, default=(float("nan"), "none"))
         text = f"{number(worst, 2)} ({where})"
         yield judged(f"conditions/worst first fix, {unit}", text, f"<= {most:g}", bool(worst <= most), worst)
+    yield exposed("conditions", "false poses", sum(result["false_times"] for result in results), results)
     false = sum(result["false_frames"] for result in results)
     yield judged("conditions/false frames", str(false), "0", false == 0, false)
 

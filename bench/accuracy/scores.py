@@ -1,4 +1,4 @@
-"""Scores of a tracked drive: pure functions of the localizer's answers and of the truth."""
+"""Scores of a tracked drive, and its exposure: pure functions of the localizer's answers and of the truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from bench.harness.rows import NOTHING, Row, judged
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.localization.result import Fix
 
@@ -103,6 +105,9 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) ->
     false = known & ~error.right
     return {
         "driven_m": float(driven[-1]),
+        "tracked_m": float(np.diff(driven, prepend=driven[0])[known].sum()),
+        "tracked_s": float(held(track.stamps)[known].sum()),
+        "false_times": int((np.diff(false.astype(int), prepend=0) == 1).sum()),
         "right_percent": 100 * float(error.right.mean()),
         "first_fix_m": float(driven[known.argmax()]) if known.any() else None,
         "rmse_m": rms(error.metres[known]),
@@ -114,6 +119,21 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) ->
         "losses": losses(track.states),
         "recoveries_m": [recovery(error.right, driven, end) for end in events],
     }
+
+
+def exposed(bench: str, event: str, events: int, drives: Sequence[dict[str, Any]]) -> Row:
+    """Return the row that puts events beside the kilometres and hours of the drives with a pose, as :func:`score`."""
+    km, hours = (sum(drive[key] for drive in drives) / unit for key, unit in (("tracked_m", 1e3), ("tracked_s", 3.6e3)))
+    rates = [f"{rate(events, exposure)} per {unit}" for exposure, unit in ((km, "km"), (hours, "hour"))]
+    text = f"{events} in {km:.2f} km and {hours:.2f} h of tracking: {', '.join(rates)}"
+    return judged(f"{bench}/{event}, times", text, "", None, events)
+
+
+def rate(events: int, exposure: float) -> str:
+    """Write events per exposure with their upper Poisson bound, 95 %."""
+    if not exposure:
+        return NOTHING
+    return f"{events / exposure:.2g} (below {float(chi2.ppf(0.95, 2 * (events + 1))) / 2 / exposure:.2g})"
 
 
 def rms(values: Floats) -> float | None:

@@ -22,9 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import fdtri
-from scipy.stats import chi2
 
-from bench.accuracy.scores import Errors, Track, errors
+from bench.accuracy.scores import Errors, Track, errors, exposed, score
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, number, table, upper
 from bench.tracking.drives import follow, start
@@ -128,11 +127,6 @@ def misleading(beyond: list[tuple[float, float]]) -> int:
     return sum(seconds > TO_ALERT[0] or metres > TO_ALERT[1] for seconds, metres in beyond)
 
 
-def rate(events: int, exposure: float) -> str:
-    """Write events per exposure with their upper Poisson bound, 95 %."""
-    return f"{events / exposure:.2g} (below {float(chi2.ppf(0.95, 2 * (events + 1))) / 2 / exposure:.2g})"
-
-
 def level_table(samples: Mapping[str, Sample]) -> str:
     """Lay out, by name of the group: blocks, how many are above their level, the worst, and how wide the levels are."""
     lines = []
@@ -201,18 +195,13 @@ def rows(asked: Namespace) -> Iterator[Row]:
         factors, held = conformal(sample)
         text = ", ".join(f"{factor:.2f}" for factor in factors)
         yield judged(f"protection/factors that {name} drives need at {held:.2g}: {', '.join(PARTS)}", text, "", None)
-    of, hours = len(sample.error), sum(drive["driven_s"] for drive in drives) / 3600
-    kilometres = sum(drive["driven_m"] for drive in drives) / 1000
+    of = len(sample.error)
     for hits, unit in zip(sample.above(PRODUCT), PARTS, strict=True):
         text, holds = f"{hits} of {of}: below {100 * upper(hits, of):.2f} %", hits <= RISK * of
         yield judged(f"protection/error > level, {unit}", text, f"<= {100 * RISK:g} %", holds, hits / max(of, 1))
     count = sum(drive["misleading"] for drive in drives)
-    text = f"{count} in {kilometres:.1f} km, {hours:.2f} h"
-    yield judged("protection/hazardously misleading", text, "0", not count, count)
-    for unit, exposure in (("km", kilometres), ("hour", hours)):
-        yield judged(
-            f"protection/hazardously misleading, per {unit}", rate(count, exposure), "", None, count / exposure
-        )
+    yield judged("protection/hazardously misleading", str(count), "0", not count, count)
+    yield exposed("protection", "hazardously misleading", count, drives)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
@@ -232,7 +221,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
 def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
     """Return the sample of a plain drive, as lists, with errors and covariances; kept until the code changes."""
     bench = fingerprint(*(f"bench/{part}.py" for part in ("tracking/drives", "tracking/worlds", "accuracy/scores")))
-    spec = {"code": fingerprint(*_MEASURED), "bench": bench, "world": repr(world), "variant": variant, "parts": 4}
+    spec = {"code": fingerprint(*_MEASURED), "bench": bench, "world": repr(world), "variant": variant, "parts": 5}
 
     def work() -> dict[str, Any]:
         recorded = open_world(below, world)
@@ -243,8 +232,7 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
         return {
             "kind": world.kind,
             "variant": variant,
-            "driven_m": float(drive.driven[-1]),
-            "driven_s": float(track.stamps[-1] - track.stamps[0]),
+            **score(track, drive.truth, drive.driven, ()),
             "misleading": misleading(beyond_alert_limit(track, error, drive.driven)),
             "sample": Sample.of(track, error, chosen).to_json(),
             "twist": error.twist[chosen].tolist(),

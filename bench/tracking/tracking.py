@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from bench.accuracy.scores import Errors, Track, errors, score
+from bench.accuracy.scores import Errors, Track, errors, exposed, score
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import NOTHING, Row, informs, judged, listed, number, table
 from bench.tracking.drives import SEEDS, Scenario, follow, scenarios, start
@@ -211,6 +211,7 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
             yield judged(f"tracking/rmse of plain drives, {unit}", said, f"<= {most}", mean <= most, mean)
     false, seconds = (sum(figures[key] for figures in drives) for key in ("false_frames", "false_s"))
     yield judged("tracking/false frames", f"{false} ({seconds:.1f} s)", "0", false == 0, false)
+    yield exposed("tracking", "false poses", sum(figures["false_times"] for figures in drives), drives)
     count = sum(figures["misleading"] for figures in drives)
     beyond = [time for figures in drives for time in figures["beyond"]]
     longest, furthest = np.max([(0.0, 0.0), *beyond], axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drives_with_truth import track, way
 
-from bench.accuracy.scores import errors, losses, recovery, score
+from bench.accuracy.scores import errors, exposed, losses, rate, recovery, score
 from bench.harness.rows import Row
 from bench.tracking import protection, smoothing, tracking
 from bench.tracking.covariance import BAND, figures, judge
@@ -82,6 +82,7 @@ def test_false_seconds_last_until_the_next_frame_and_no_longer_than_half_a_secon
     assert (figures["false_frames"], figures["losses"]) == (3, 1)
     assert figures["false_s"] == pytest.approx(0.2 + 0.5 + 0.15)  # the last one lasts a median gap
     assert figures["right_percent"] == pytest.approx(20.0)
+    assert (figures["false_times"], figures["tracked_m"], figures["tracked_s"]) == (2, 3.0, pytest.approx(0.95))
     silent = score(track(["SEARCHING"] * 3 + ["SKIPPED"]), np.tile(np.eye(4), (4, 1, 1)), np.arange(4.0), [])
     assert (silent["rmse_m"], silent["first_fix_m"], silent["max_m"]) == (None, None, None)
 
@@ -103,13 +104,13 @@ def test_a_fix_ends_with_a_search_but_not_with_a_doubt():
 
 
 def missed_by(rows, parts):
-    return {row.name.partition("/")[2] for row in tracking.verdicts(rows, parts) if not row.holds}
+    return {row.name.partition("/")[2] for row in tracking.verdicts(rows, parts) if row.holds is False}
 
 
 def row(**changes):
     out = {
         "plain": True, "rmse_m": 0.05, "rmse_deg": 0.05, "false_frames": 0, "false_s": 0.0, "recoveries_m": [],
-        "misleading": 0, "beyond": [],
+        "misleading": 0, "beyond": [], "false_times": 0, "tracked_m": 500.0, "tracked_s": 100.0,
     }  # fmt: skip
     return out | changes
 
@@ -179,8 +180,12 @@ def test_few_blocks_hold_for_no_less_than_their_number():
 
 
 def test_rate_has_its_poisson_bound():
-    assert protection.rate(0, 10.0) == "0 (below 0.3)"
-    assert protection.rate(3, 2.0) == "1.5 (below 3.9)"
+    assert rate(0, 10.0) == "0 (below 0.3)"
+    assert rate(3, 2.0) == "1.5 (below 3.9)"
+    assert exposed("x", "false", 0, [row(), row(tracked_m=0.0, tracked_s=0.0)]).text == (
+        "0 in 0.50 km and 0.03 h of tracking: 0 (below 6) per km, 0 (below 1.1e+02) per hour"
+    )
+    assert exposed("x", "false", 0, []).text.endswith("tracking: - per km, - per hour")
 
 
 def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time():
