@@ -131,7 +131,8 @@ def capture_cloud(
     if message is None:
         return captured
     finite = message.points[np.isfinite(message.points).all(axis=1)]
-    distances = np.linalg.norm(finite, axis=1)
+    distances = np.linalg.norm(finite.astype(np.float64), axis=1)  # bytes of another format are any size
+    doubles = captured.codec in ("xyz", "xyzi") and _are_doubles(sample.payload, message.points)
     sweep = None
     if message.times is not None and np.isfinite(message.times).any():
         sweep = float(np.nanmin(message.times)), float(np.nanmax(message.times))
@@ -141,8 +142,8 @@ def capture_cloud(
         points=len(distances),
         distance=float(np.median(distances)) if len(distances) else float("nan"),
         sweep=sweep,
-        doubles=captured.codec in ("xyz", "xyzi") and _are_doubles(sample.payload, message.points),
-        cloud=np.array(finite[:: -(-len(finite) // _MAX_KEPT) or 1], dtype=np.float32),
+        doubles=doubles,
+        cloud=None if doubles else np.array(finite[:: -(-len(finite) // _MAX_KEPT) or 1], dtype=np.float32),
     )
 
 

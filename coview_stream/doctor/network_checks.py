@@ -53,12 +53,12 @@ class Candidate:
 
 
 def discover(
-    transport: Transport, wait: Callable[[float], object] = time.sleep, robots: Iterable[str] = ()
+    transport: Transport, wait: Callable[[float], object] = time.sleep, names: Iterable[str] = ()
 ) -> list[Candidate]:
     """Return the clouds and odometry on the network, sorted.
 
     Listens for two seconds to the keys of all robots (all their clouds come here meanwhile), and to any key with the
-    name of one of ``robots``, whose messages are judged by their content; then asks for tokens.
+    name of a robot or a base among ``names``, whose messages are judged by their content; then asks for tokens.
     """
     candidates: set[Candidate] = set()
     seen: set[str] = set()
@@ -76,8 +76,8 @@ def discover(
 
     for key in _KEYS:
         transport.subscribe(key, add_sample, "newest")
-    for robot in robots:
-        transport.subscribe(f"**/{robot}/**", add_sample, "newest")
+    for name in names:
+        transport.subscribe(f"**/{name}/**", add_sample, "newest")
     wait(_LISTEN)
     for expression in _TOKENS:
         for token in transport.tokens(expression):
@@ -246,7 +246,8 @@ def robots_findings(
     """Listen to all robots at once and judge each; without any, or if one is silent, look for others."""
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
-    candidates = discover(transport, wait, [k.robot for k in keys]) if silent or not keys else []
+    names = [*(k.robot for k in keys), *{k.alive.partition(f"/{k.robot}/")[0] for k in keys}]
+    candidates = discover(transport, wait, names) if silent or not keys else []
     # robots of any base whose node holds a liveliness token
     tokens = transport.tokens("**/alive") if candidates else ()
     served = {token.split("/")[-2] for token in tokens if "/" in token}

@@ -89,12 +89,13 @@ def test_silent_robot_is_told_keys_of_other_robots():
     assert "does the robot publish" in found[1].remedy
 
 
-def test_silent_robot_is_told_any_key_with_its_name_that_has_data():
-    elsewhere = [Sample("coview/r1/lidar", cloud(0.0).payload), Sample("coview/r1/odom", odometry(0.0).payload)]
-    own = Sample("coview/r1/out/pose", odometry(0.0).payload)
+@pytest.mark.parametrize("at", ["coview/r1", "coview/rover", "my/r1"])
+def test_silent_robot_is_told_any_key_with_its_name_or_base_that_has_data(at):
+    elsewhere = [Sample(f"{at}/lidar", cloud(0.0).payload), Sample(f"{at}/odom", odometry(0.0).payload)]
+    own = Sample(f"{at}/out/pose", odometry(0.0).payload)
     found = findings(MemoryTransport(), [(3.5, sample) for sample in (*elsewhere, own)])
-    assert found[0].remedy == "clouds come on coview/r1/lidar: try --cloud-key coview/r1/lidar"
-    assert found[1].remedy.startswith("odometry comes on coview/r1/odom: try --odometry-key coview/r1/odom. If")
+    assert found[0].remedy == f"clouds come on {at}/lidar: try --cloud-key {at}/lidar"
+    assert found[1].remedy.startswith(f"odometry comes on {at}/odom: try --odometry-key {at}/odom. If")
 
 
 def test_robots_on_the_network_are_listed_without_robot_option():

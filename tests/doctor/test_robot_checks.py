@@ -8,6 +8,7 @@ from captured_robot import KEYS, SWEEP, capture, cloud, ns, odometry, steps, usu
 from scipy.spatial.transform import Rotation
 
 from coview_stream import __version__
+from coview_stream.doctor.capture import capture_cloud
 from coview_stream.doctor.robot_checks import cloud_findings, cross_findings, node_finding, odometry_findings
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.messages.types import Sample
@@ -41,7 +42,10 @@ def test_healthy_robot_is_ok():
     assert "moved 6.0 m" in findings[2].found
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_rows_of_float64_are_named():
+    assert capture_cloud(Sample(KEYS.cloud, SWEEP.astype("<f8").tobytes(), "", bytes(8)), 0.0, "xyz").cloud is None
+
     def sent(kind):
         payload, encoding = SWEEP.astype(kind).tobytes(), "application/octet-stream;layout=xyz"
         stamps = [ns(0.1 * k).to_bytes(8, "little") for k in range(10)]
@@ -136,6 +140,8 @@ def test_cloud_rate_too_low_or_too_high_is_reported(period, part):
         ([-0.1 * k for k in range(30)], "FAIL", "29 go backwards"),
         ([0.2 * k for k in range(30)], "warn", "run 2 times as fast"),
         ([1e-4 * k for k in range(30)], "FAIL", "run 0.001 times as fast"),  # microseconds for nanoseconds
+        ([k // 10 for k in range(30)], "FAIL", "27 stand still: all are whole seconds"),
+        ([1e-9 * (k // 10) for k in range(30)], "FAIL", "run 6.9e-10 times as fast"),  # seconds for nanoseconds
     ],
 )
 def test_stamp_checks(stamps, verdict, part):
