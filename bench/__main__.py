@@ -62,6 +62,7 @@ BENCHMARKS = {
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
     "faults": Benchmark("faults.run", "sensors that lie: false frames, the last pose, the cause being named"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
+    "challenge": Benchmark("integrity.challenge", "near copies for other programs, and a scorer of TUM files"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors"),
     "forest_drives": Benchmark("forest.drives", "400 m and 2 km in forests: odometry, GNSS, the map alone, ours"),
     "changes": Benchmark("fusion.changes", "precision and recall of fuse --changes"),

@@ -264,6 +264,11 @@ def _failed(error: Exception) -> Result:
 
 def map_of(run: Run) -> BaseMap:
     """Build the map that a run is made on; changes come later."""
+    return built(cloud_of(run))
+
+
+def cloud_of(run: Run) -> Floats:
+    """Return the survey (N, 3) that a run's map is made of, metres."""
     if run.group == "surveys":
-        return built(surveys.surveyed(run.kind, run.seed))
-    return built(surveyed(draw(run.kind, run.seed, 0.0), run.seed))
+        return surveys.surveyed(run.kind, run.seed)
+    return surveyed(draw(run.kind, run.seed, 0.0), run.seed)

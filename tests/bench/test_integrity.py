@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from bench.harness.rows import upper
-from bench.integrity import run
+from bench.integrity import challenge, run
 from bench.integrity.integrity import Tally, chosen, classes, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, STATED, Run, plan
 from bench.integrity.run import altered, drive_of, judged
+from coview_stream.clouds import write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 
@@ -194,3 +195,20 @@ def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
     assert chosen(sites, None) == sites
     with pytest.raises(InputError, match="--families nowhere"):
         chosen(sites, "nowhere")
+
+
+def test_an_answer_to_the_challenge_is_its_first_line(tmp_path):
+    truth, answer, nowhere = (tmp_path / f"{name}.tum" for name in ("truth", "answer", "nowhere"))
+    poses = np.array([pose_from(np.eye(3), [2.0 * k, 0.0, 0.0]) for k in range(5)])
+    write_tum(truth, np.arange(5.0), poses)
+    write_tum(nowhere, [], [])
+    assert challenge.score(answer, truth)["outcome"] == "none"
+    write_tum(answer, [], [])
+    assert challenge.score(answer, truth)["outcome"] == "none"
+    write_tum(answer, [2.0, 3.0], poses[[3, 0]])  # 2 m off; the second line would be false
+    assert challenge.score(answer, truth) == {"outcome": "right", "metres": 4.0}
+    assert challenge.score(answer, nowhere)["outcome"] == "false"
+    write_tum(answer, [2.0], poses[[4]])
+    assert challenge.score(answer, truth)["outcome"] == "false"
+    write_tum(answer, [20.0], poses[[4]])  # of no frame
+    assert challenge.score(answer, truth)["outcome"] == "false"

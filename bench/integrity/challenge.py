@@ -1,0 +1,134 @@
+"""A challenge for other programs: first fixes among near copies, scored by TUM files alone.
+
+Worlds are those of ``integrity``: seeds, and edits of public surveys where ``COVIEW_DATA`` has any. ``--make`` writes
+``--count`` runs into ``--work DIR``: ``challenge/NAME/map.laz`` (metres) and a run beside it (``run/frames/*.pcd`` in
+the body's frame, deskewed, ``run/odometry.tum``). ``challenge/truth/NAME.tum`` has the only right pose of each frame,
+map <- body, and is empty where none is right.
+
+An answer is ``ANSWERS/NAME.tum``: its first line is the program's first fix, the others are not read; no file or an
+empty one is no fix. Without ``--answers`` ours are taken, as ``coview-stream build`` and ``locate`` make them. A fix is
+right within 3 m and 5 degrees.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.harness.files import PYTHON, built, environment, folder
+from bench.harness.rows import Row, informs, judged, table
+from bench.integrity.integrity import Tally, percent, planned
+from bench.integrity.plan import FAMILIES, Run
+from bench.integrity.run import Result, cloud_of, drive_of
+from bench.integrity.run import judged as outcome
+from coview_stream.clouds import read_tum, write_cloud, write_tum
+from coview_stream.report.evaluation import MAX_STAMP_GAP
+
+COUNT, QUICK = 100, 4  # runs
+
+
+def name_of(run: Run) -> str:
+    """Return the name of a run's files."""
+    return f"{run.kind}-{run.seed}-{run.number}"
+
+
+def make(run: Run, below: Path) -> bool:
+    """Write the map, the run and the truth unless they are there; return whether the run exists."""
+    out, truth = below / name_of(run), below / "truth" / f"{name_of(run)}.tum"
+    if truth.is_file():
+        return True
+    if (drive := drive_of(run)) is None:
+        return False
+    for path in (truth.parent, out / "run" / "frames"):
+        path.mkdir(parents=True, exist_ok=True)
+    write_cloud(out / "map.laz", cloud_of(run))
+    for k in range(len(drive)):
+        write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", drive.frame(k))
+    write_tum(out / "run" / "odometry.tum", drive.stamps, drive.odometry)
+    write_tum(truth, *((drive.stamps, drive.truth) if drive.truth is not None else (np.zeros(0), np.zeros((0, 4, 4)))))
+    return True
+
+
+def score(answer: Path, truth: Path) -> dict[str, Any]:
+    """Return ``outcome`` (right, false or none) and the seconds of an answer's first pose."""
+    stamps, poses = (
+        read_tum(answer) if answer.is_file() and answer.stat().st_size else (np.zeros(0), np.zeros((0, 4, 4)))
+    )
+    if not len(stamps):
+        return {"outcome": "none", "state": "SEARCHING", "metres": np.nan}
+    known, right = read_tum(truth) if truth.stat().st_size else (np.zeros(0), np.zeros((0, 4, 4)))
+    at = int(np.abs(known - stamps[0]).argmin()) if len(known) else -1
+    near = at >= 0 and abs(known[at] - stamps[0]) < MAX_STAMP_GAP
+    metres = float(np.linalg.norm(np.diff(right[: at + 1, :3, 3], axis=0), axis=1).sum()) if near else np.nan
+    return {**outcome(poses[0], right[at] if near else None), "metres": metres}
+
+
+def locate(run: Run, below: Path, answers: Path) -> None:
+    """Answer with the commands of the product unless that is done."""
+    out, world = answers / name_of(run), below / name_of(run)
+    if not out.with_suffix(".tum").is_file():
+        site = built(world / "map.laz", world / "site.coview")
+        words = (
+            *PYTHON,
+            "-m",
+            "coview_stream",
+            "locate",
+            str(site),
+            str(world / "run"),
+            "-o",
+            str(out),
+            "--no-pictures",
+        )
+        subprocess.run(words, env=environment(1), capture_output=True)  # exit code 1: no pose
+        found = out / "trajectory.tum"
+        out.with_suffix(".tum").write_text(found.read_text() if found.is_file() else "")
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the runs, and whose answers are scored."""
+    parser.add_argument("--count", type=int, metavar="N", help=f"runs ({COUNT}; {QUICK} with --quick)")
+    parser.add_argument("--make", action="store_true", help="write worlds and truth; score nothing")
+    parser.add_argument("--answers", type=Path, metavar="ANSWERS", help="folder of NAME.tum (ours)")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Make the worlds, then score the answers."""
+    below = folder() / "challenge"
+    runs = [
+        run for site in planned(asked.count or (QUICK if asked.quick else COUNT)) for run in site if make(run, below)
+    ]
+    yield informs("challenge/runs", len(runs), "")
+    if asked.make:
+        return
+    results = list[Result]()
+    for run in runs:
+        if not asked.answers:
+            locate(run, below, below / "ours")
+        scored = score(
+            (asked.answers or below / "ours") / f"{name_of(run)}.tum", below / "truth" / f"{name_of(run)}.tum"
+        )
+        results.append(
+            {"class": FAMILIES[run.family], "family": run.family, "kind": run.kind, "seed": run.seed, **scored}
+        )
+    every = Tally.of(results)
+    text = f"{every.false} of {every.runs}: below {percent(every.bound)}"
+    yield judged("challenge/false first fixes", text, "0", not every.false, every.false)
+    yield informs("challenge/by family", len(results), "", {"results": results})
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Count by class and family."""
+    results = next((row.details["results"] for row in rows if "results" in row.details), [])
+    lines = []
+    for key, names in (("class", dict.fromkeys(FAMILIES.values())), ("family", FAMILIES)):
+        for name in names:
+            t = Tally.of(result for result in results if result[key] == name)
+            if t.runs:
+                none = t.ambiguous + t.searching
+                lines.append([name, *map(str, (t.runs, t.right, t.false, none)), percent(t.bound, 1)])
+    return {"": table(("runs", "number", "right", "false", "none", "false, below (95 %)"), lines)} if lines else {}
