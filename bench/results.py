@@ -51,8 +51,7 @@ COMMANDS = {
     "overlap": "conditions --overlaps 5 20 35 50 65 85 "
     "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
     "lidars": "stream lidars",
-    "forest_drives": "forest_drives dense-forest long-forest closed-forest --plots docs/images",
-    "forest_times": "forest_drives times",
+    "forest_drives": "forest_drives --plots docs/images",
     "fuzz": "fuzz --seconds 60",
     "soak": "soak --minutes 60",
 }
@@ -147,7 +146,6 @@ def main(arguments: Sequence[str], *, release: bool = False) -> int:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(COMMANDS))
     parser.add_argument("--quick", action="store_true", help="smaller sizes, in tables of their own")
     parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE.relative_to(ROOT)})")
-    parser.add_argument("--machine", default=f"{os.cpu_count()} shared cores", help="in neutral words")
     asked = parser.parse_args(arguments)
     missing = []
     try:
@@ -179,7 +177,7 @@ def _part(name: str, asked: Namespace, threads: int | None = None) -> str:
     print(f"=== {command}: {took:.1f} min", file=sys.stderr, flush=True)
     title = f"{name}, quick" if asked.quick else name
     busy = load > BUSY and threads is None
-    machine = f"{asked.machine}, load {load:.0f} from other work" if busy else asked.machine
+    machine = f"{os.cpu_count()} shared cores{f', load {load:.0f} from other work' * busy}"
     version = f"{commit()}, code {_code()}, {took:.1f} min"
     return text and block(title, command, text, time.strftime("%Y-%m-%d"), version, machine)
 

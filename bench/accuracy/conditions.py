@@ -430,7 +430,5 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
         run | {"success": bool(run["posed"]) and not run["false_frames"], "e_t": run["rmse_m"], "e_r": run["rmse_deg"]}
         for run in runs
     ]
-    rules = (
-        "ours: every frame within 1 m and 5 degrees, rms of them; the paper's: its one pose within 3 m and 5 degrees"
-    )
+    rules = "ours: every frame within 1 m and 5 degrees, rms; the paper's: its one pose within 3 m and 5 degrees"
     return {"": text, f"beside the paper ({rules})": paper.compared(ours)}

@@ -1,39 +1,32 @@
 """Long drives in forests: the second paper's tables. Odometry, GNSS and odometry, the map alone, graph off, and ours.
 
 400 m through 900 stems per hectare, 2 km through 450, and 400 m under a closed canopy; a tenth of the trees is gone
-since the survey. NAME picks one, or ``times``; ``--plots`` draws all errors as boxes, and the tracks in their colour.
-``times`` takes the product's parts on the first drive, in processor time, which other work hardly changes; give it one
-thread. Errors of a variant are of all its poses, of ours from the first fix on. GNSS is simulated
-(:mod:`bench.forest.variants`).
+since the survey. NAME picks one; ``--plots`` draws all errors as boxes, and the tracks in their colour. Errors of a
+variant are of all its poses, of ours from the first fix on. GNSS is simulated (:mod:`bench.forest.variants`).
 """
 
 from __future__ import annotations
 
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import numpy as np
 
 from bench.accuracy.scores import Errors, Track, errors, losses, rms
-from bench.forest.variants import VARIANTS, by_lidar, lidar_odometry
+from bench.forest.variants import VARIANTS, by_lidar
 from bench.forest.worlds import say, weights
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, listed
 from bench.tracking.drives import Drive, start
 from bench.tracking.worlds import Recorded, World, map_of, open_world
-from coview_stream import BaseMap, Localizer
+from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.tracking.pose_graph import PoseGraph
-from coview_stream.localization.tracking.tracker import Tracker
 from coview_stream.report.plots import ACCENT, STATE_COLOURS, TRUTH, draw_base_map, figure
 
 WORLDS = (
@@ -44,8 +37,6 @@ WORLDS = (
 _MADE_BY = ("bench/forest/variants.py", "bench/tracking/drives.py")
 _EVERY = 2  # of the frames: five a second
 _QUICK = 60.0  # metres of the first
-_TIMES = "times"
-_TIMED_METRES, _AGAIN = 60.0, 8.0  # that are driven for the times, and after which the robot is searched anew
 
 _POINTS, _BESIDE = 8_000, 25.0  # of a map behind a track, and metres of it that are shown beside
 _FARTHEST = 98  # percentile of the errors at which the colours end
@@ -62,14 +53,6 @@ THEIRS: tuple[tuple[str, Stats, Stats], ...] = (
     ),
 )
 """Their Table I, Forest II, 2 km: metres and degrees. Another forest, another robot; real."""
-
-THEIR_SECONDS = {
-    "odometry": (0.055, 0.012),
-    "registration": (0.288, 0.063),
-    "graph": (0.038, 0.024),
-    "re-localization": (0.418, 0.189),
-}
-"""Their Table II: mean and standard deviation, on an i7-10875H; re-localization on an RTX 5000."""
 
 _KEYS = ("rmse", "median", "mean", "std", "max")
 
@@ -146,62 +129,6 @@ def config_for(odometry: str) -> LocalizerConfig:
     return LocalizerConfig(sensor_leans=odometry == "wheels")
 
 
-class Stopwatch:
-    """Processor seconds of the product's parts by call; the graph's are added up, and left out of a registration's."""
-
-    def __init__(self) -> None:
-        self.taken: dict[str, list[float]] = {name: [] for name in THEIR_SECONDS}
-        self.graph = 0.0
-
-    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function with its time taken."""
-
-        def run(*args: Any, **named: Any) -> Any:
-            begin, before = time.process_time(), self.graph
-            out = call(*args, **named)
-            seconds = time.process_time() - begin - (self.graph - before)
-            if part == "graph":
-                self.graph += seconds
-            else:
-                self.taken[part].append(seconds)
-            return out
-
-        return run
-
-
-def times(world: World) -> dict[str, list[float]]:
-    """Seconds of each part of the product, by name: a frame's odometry, a keyframe's registration and graph, a search.
-
-    Registration is with its verification, from the odometry of wheels, as in the drives. The robot is searched anew, by
-    features and descriptors, every 8 m.
-    """
-    recorded, site, watch = open_world(folder(), world), BaseMap.load(map_of(folder(), world)), Stopwatch()
-    drive = start(recorded.truth, world.drift, world.seed)
-    odometry, localizer = lidar_odometry(recorded.truth), Localizer(site)
-    localizer.prepare()
-    step, since = watch.timed("odometry", odometry.step), 0.0
-    with ExitStack() as stack:
-        for owner, name, part in (
-            (PoseGraph, "move", "graph"), (PoseGraph, "correct", "graph"), (Tracker, "match_to_map", "registration"),
-            (GlobalSearch, "update", "re-localization"),
-        ):  # fmt: skip
-            stack.enter_context(patch.object(owner, name, watch.timed(part, getattr(owner, name))))
-        estimate = property(watch.timed("graph", vars(PoseGraph)["estimate"].fget))
-        stack.enter_context(patch.object(PoseGraph, "estimate", estimate))
-        for index, stamp in enumerate(drive.until(_TIMED_METRES).stamps):
-            cloud, count, watch.graph = recorded.read(index), len(watch.taken["registration"]), 0.0
-            step(cloud, None, float(stamp))
-            fix = localizer.step(cloud, drive.odometry[index], float(stamp))
-            if len(watch.taken["registration"]) > count:
-                watch.taken["graph"].append(watch.graph)
-            if fix.T_map_body is not None and drive.driven[index] - since >= _AGAIN:
-                if not since:  # the first search, and what each kernel compiles, do not count
-                    watch.taken = {name: [] for name in watch.taken}
-                since = float(drive.driven[index])
-                localizer.relocalize()
-    return watch.taken
-
-
 def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
     """Draw a row of two panels for each drive, metres and degrees: a box per variant, whiskers at 1 and 99 %."""
     options = {"figsize": (9.0, 0.6 + 2.4 * len(drives)), "nrows": len(drives), "ncols": 2}
@@ -248,7 +175,7 @@ def draw_tracks(drives: Mapping[str, tuple[BaseMap, Floats, Errors]], path: Path
 
 def options(parser: ArgumentParser) -> None:
     """Add the drives, the variants and the pictures."""
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(w.kind for w in WORLDS)}, {_TIMES} (all)")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(w.kind for w in WORLDS)} (all)")
     names = list(VARIANTS)
     parser.add_argument(
         "--variants", nargs="+", default=names, choices=names, metavar="V", help=f"some of {', '.join(names)}"
@@ -259,16 +186,14 @@ def options(parser: ArgumentParser) -> None:
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield a row per drive and variant, then the times."""
-    known = [*(world.kind for world in WORLDS), _TIMES]
+    """Yield a row per drive and variant."""
+    known = [world.kind for world in WORLDS]
     if unknown := set(asked.names) - set(known):
         raise InputError(f"no drive {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     chosen = set(asked.names or known)
     worlds = [world for world in WORLDS if world.kind in chosen]
-    first = WORLDS[0]
     if asked.quick:
-        first = first._replace(length=_QUICK, size=200.0, seed=6000)
-        worlds = [first] if worlds else []
+        worlds = [worlds[0]._replace(length=_QUICK, size=200.0, seed=6000)]
     results: dict[str, dict[str, Result]] = {}
     for world in worlds:
         found = results.setdefault(world.kind, {})
@@ -288,12 +213,6 @@ def rows(asked: Namespace) -> Iterator[Row]:
         }
         if tracks:
             draw_tracks(tracks, asked.plots / "forest_tracks.png")
-    if _TIMES in chosen:
-        for part, seconds in times(first).items():
-            taken = statistics(1e3 * np.array(seconds))
-            mean = taken["mean"]
-            details = {"part": part, "n": len(seconds), **taken}
-            yield informs(f"forest_drives/times, {part}: mean", np.nan if mean is None else mean, "ms", details)
 
 
 COLUMNS = (
@@ -301,24 +220,12 @@ COLUMNS = (
     *((f"{key} m", f"{key}_m", 3) for key in _KEYS), *((f"{key} deg", f"{key}_deg", 2) for key in _KEYS),
     ("> 1 m or 5 deg", "false", 0), ("lost", "lost", 0),
 )  # fmt: skip
-_TIMED = (
-    ("part", "part", None), ("n", "n", 0), ("mean ms", "mean", 1), ("std ms", "std", 1), ("median ms", "median", 1),
-    ("max ms", "max", 1), ("theirs, mean ms", "their_mean", 0), ("theirs, std ms", "their_std", 0),
-)  # fmt: skip
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Errors of all variants beside the paper's own, and times beside the paper's own."""
-    drives = [row.details for row in rows if "variant" in row.details]
-    parts = [row.details for row in rows if "part" in row.details]
-    out = {}
-    if drives:
-        out[""] = listed(COLUMNS, [*drives, *(_theirs(*each) for each in THEIRS)])
-    if parts:
-        for part in parts:
-            part["their_mean"], part["their_std"] = (1e3 * value for value in THEIR_SECONDS[part["part"]])
-        out[_TIMES] = listed(_TIMED, parts)
-    return out
+    """Errors of all variants beside the paper's own."""
+    drives = [row.details for row in rows]
+    return {"": listed(COLUMNS, [*drives, *(_theirs(*each) for each in THEIRS)])}
 
 
 def _theirs(name: str, metres: Stats, degrees: Stats) -> dict[str, Any]:

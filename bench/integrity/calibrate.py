@@ -10,7 +10,6 @@ an error below e: the prior odds being even, it should stay below e. The one fac
 from __future__ import annotations
 
 import pickle
-import time
 from argparse import ArgumentParser
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,8 +36,7 @@ def record(out: Path, site: Site) -> None:
         file = out / "rec" / f"{run.kind}-{run.seed}-{run.number}.pkl"
         if file.is_file():
             continue
-        begin, drive = time.perf_counter(), drive_of(run)
-        if drive is None:  # there is no such street
+        if (drive := drive_of(run)) is None:  # there is no such street
             continue
         base = base or map_of(run)
         base.save(out / "worlds" / f"{run.kind}-{run.seed}.coview")
@@ -46,7 +44,6 @@ def record(out: Path, site: Site) -> None:
         frames = ((drive.frame(k), drive.odometry[k], float(stamp)) for k, stamp in enumerate(drive.stamps))
         requests = [request for frame in frames if (request := localizer.add_frame(*frame)) is not None]
         file.write_bytes(pickle.dumps({"site": f"{run.kind}-{run.seed}", "requests": requests[:RECORDED]}))
-        print(f"{file} {time.perf_counter() - begin:.1f} s", flush=True)
 
 
 def smallest_errors(site: Path, drives: list[dict[str, Any]]) -> Iterator[float]:

@@ -2,8 +2,8 @@
 
 Worlds are those of ``integrity``: seeds, and edits of public surveys where ``COVIEW_DATA`` has any. ``--make`` writes
 ``--count`` runs into ``--work DIR``: ``challenge/NAME/map.laz`` (metres) and a run beside it (``run/frames/*.pcd`` in
-the body's frame, deskewed, ``run/odometry.tum``). ``challenge/truth/NAME.tum`` has the only right pose of each frame,
-map <- body, and is empty where none is right.
+the body's frame, deskewed, ``run/odometry.tum``). ``truth.tum`` there has the only right pose of each frame, map <-
+body, and is empty where none is right.
 
 An answer is ``ANSWERS/NAME.tum``: its first line is the program's first fix, the others are not read; no file or an
 empty one is no fix. Without ``--answers`` ours are taken, as ``coview-stream build`` and ``locate`` make them. A fix is
@@ -39,13 +39,12 @@ def name_of(run: Run) -> str:
 
 def make(run: Run, below: Path) -> bool:
     """Write the map, the run and the truth unless they are there; return whether the run exists."""
-    out, truth = below / name_of(run), below / "truth" / f"{name_of(run)}.tum"
-    if truth.is_file():
+    out = below / name_of(run)
+    if (truth := out / "truth.tum").is_file():
         return True
     if (drive := drive_of(run)) is None:
         return False
-    for path in (truth.parent, out / "run" / "frames"):
-        path.mkdir(parents=True, exist_ok=True)
+    (out / "run" / "frames").mkdir(parents=True, exist_ok=True)
     write_cloud(out / "map.laz", cloud_of(run))
     for k in range(len(drive)):
         write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", drive.frame(k))
@@ -105,16 +104,13 @@ def rows(asked: Namespace) -> Iterator[Row]:
     yield informs("challenge/runs", len(runs), "")
     if asked.make:
         return
-    results = list[Result]()
+    results, answers = list[Result](), asked.answers or below / "ours"
     for run in runs:
         if not asked.answers:
-            locate(run, below, below / "ours")
-        scored = score(
-            (asked.answers or below / "ours") / f"{name_of(run)}.tum", below / "truth" / f"{name_of(run)}.tum"
-        )
-        results.append(
-            {"class": FAMILIES[run.family], "family": run.family, "kind": run.kind, "seed": run.seed, **scored}
-        )
+            locate(run, below, answers)
+        scored = score(answers / f"{name_of(run)}.tum", below / name_of(run) / "truth.tum")
+        about = {"class": FAMILIES[run.family], "family": run.family, "kind": run.kind, "seed": run.seed}
+        results.append(about | scored)
     every = Tally.of(results)
     text = f"{every.false} of {every.runs}: below {percent(every.bound)}"
     yield judged("challenge/false first fixes", text, "0", not every.false, every.false)

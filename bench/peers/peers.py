@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -57,20 +57,17 @@ class Method(Protocol):
 
 
 class Keyframes:
-    """The search over the keyframes of a drive; with ``one_scan`` all points of the drive as if they were one scan."""
+    """The search over the keyframes of a drive."""
 
-    def __init__(self, site: BaseMap, one_scan: bool = False) -> None:
+    def __init__(self, site: BaseMap) -> None:
         coview_kernels.warm_up()
         config = LocalizerConfig()
-        self._one_scan = one_scan
         self._search = GlobalSearch(site, config, LocalMaps(site, config.registration.source_range))
 
     def answer(self, place: Place) -> Answer:
         """Search until a keyframe's verdict accepts a place."""
         self._search.clear()
-        newest = place.queries[-1]
-        whole = replace(newest, submap=place.submap + newest.position.astype(np.float32))
-        for query in [whole] if self._one_scan else place.queries:
+        for query in place.queries:
             accepted = self._search.update(query).accepted
             if accepted is not None:
                 return Answer(accepted.T_map_odom @ place.T_odom_submap, True)
@@ -212,24 +209,17 @@ class Features:
 NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
 
-class Peer(NamedTuple):
-    """A method with its name, and how it is made for a map."""
-
-    name: str
-    make: Callable[[BaseMap], Method]
-
-
 OURS = "coview_stream"
 
-PEERS = (
-    Peer(OURS, Keyframes),
-    Peer("coview_stream, as one scan", partial(Keyframes, one_scan=True)),
-    Peer("KISS-Matcher", KissMatcher),
-    Peer("KISS-Matcher, then small_gicp", Refined),
-    Peer("MapClosures", MapClosures),
-    Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),
-    Peer("Open3D FPFH + FGR", partial(Features, way="fgr")),
-)
+PEERS: dict[str, Callable[[BaseMap], Method]] = {
+    OURS: Keyframes,
+    "KISS-Matcher": KissMatcher,
+    "KISS-Matcher, then small_gicp": Refined,
+    "MapClosures": MapClosures,
+    "Open3D FPFH + RANSAC": partial(Features, way="ransac"),
+    "Open3D FPFH + FGR": partial(Features, way="fgr"),
+}
+"""Methods by name, and how each is made for a map."""
 
 
 @dataclass
@@ -309,11 +299,11 @@ def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) ->
     yield informs(f"{name}, its false accepts", false, "")
 
 
-def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: Path, limit_s: float) -> Trial:
+def run_trial(peer: str, scene: str, count: int, map_file: Path, places_file: Path, limit_s: float) -> Trial:
     """Let a peer answer, in a process of its own; its answers before a crash or the limit count."""
-    trial, limit = Trial(peer.name, scene, count), ["--limit", str(limit_s)]
+    trial, limit = Trial(peer, scene, count), ["--limit", str(limit_s)]
     try:
-        for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file), *limit], None):
+        for row in run("peers", ["--trial", peer, str(map_file), str(places_file), *limit], None):
             if row.holds is False:
                 trial.trouble = row.name.removeprefix("peers: ")
             else:
@@ -325,9 +315,8 @@ def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: P
 
 def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
     """Yield the seconds of a query with its answer."""
-    peer = next(peer for peer in PEERS if peer.name == name)
     found, site = pickle.loads(Path(places_file).read_bytes()), BaseMap.load(Path(map_file))
-    method = peer.make(site)
+    method = PEERS[name](site)
     for k, place in enumerate(found):
         begin = time.perf_counter()
         answer = method.answer(place)
@@ -357,7 +346,7 @@ def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place
     return places(BaseMap.load(site), run, truth, count, keyframes)
 
 
-def contest(peers: Sequence[Peer], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
+def contest(peers: Sequence[str], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
     with tempfile.TemporaryDirectory() as scratch:
         for scene, (site, world) in scenes.items():
@@ -365,7 +354,7 @@ def contest(peers: Sequence[Peer], scenes: dict[str, tuple[Path, Path]], count: 
                 file = Path(scratch) / f"{scene}{suffix}"
                 file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
                 for peer in peers:
-                    print(f"... {peer.name}, {scene}{suffix}", file=sys.stderr, flush=True)
+                    print(f"... {peer}, {scene}{suffix}", file=sys.stderr, flush=True)
                     yield run_trial(peer, f"{scene}{suffix}", count, site, file, limit_s)
 
 
@@ -376,9 +365,7 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--worlds", nargs="+", metavar="NAME", help=f"of {', '.join((*WORLDS, *SETS))} (all that are there)"
     )
-    parser.add_argument(
-        "--peers", nargs="+", metavar="NAME", help=f"parts of names of {', '.join(p.name for p in PEERS)}"
-    )
+    parser.add_argument("--peers", nargs="+", metavar="NAME", help=f"parts of names of {', '.join(PEERS)}")
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world, query and peer (180 s)")
 
@@ -391,13 +378,13 @@ def rows(asked: Namespace) -> Iterator[Row]:
         return
     there = [*WORLDS, *(name for name in SETS if (asked.data / name).exists())]
     scenes = {name: ground_of(name, asked.data) for name in asked.worlds or (there[-1:] if asked.quick else there)}
-    peers = [p for p in PEERS if p.name == OURS or any(part in p.name for part in asked.peers or [""])]
+    peers = [name for name in PEERS if name == OURS or any(part in name for part in asked.peers or [""])]
     trials = list(contest(peers, scenes, 4 if asked.quick else asked.places, asked.limit))
     reference = [trial for trial in trials if trial.peer == OURS]
     for peer in peers:
-        theirs = [trial for trial in trials if trial.peer == peer.name]
+        theirs = [trial for trial in trials if trial.peer == peer]
         details = {"trials": [asdict(trial) for trial in theirs]}
-        for row in compared(theirs, reference, ours=peer.name.startswith(OURS)):
+        for row in compared(theirs, reference, ours=peer == OURS):
             yield replace(row, details=details)
             details = {}
 
@@ -405,7 +392,5 @@ def rows(asked: Namespace) -> Iterator[Row]:
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """All peers in all worlds; those that did nothing say why below."""
     trials = [Trial(**values) for row in rows for values in row.details.get("trials", ())]
-    scenes = list(dict.fromkeys(trial.scene for trial in trials))
-    trials.sort(key=lambda trial: scenes.index(trial.scene))
     troubles = [f"{trial.peer}, {trial.scene}: {trial.trouble}" for trial in trials if trial.trouble]
     return {"worlds": "\n\n".join([listed(COLUMNS, [trial.figures() for trial in trials]), *troubles])}

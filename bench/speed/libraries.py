@@ -93,10 +93,6 @@ def measured(side: str) -> None:
     started = time.process_time()
     ck.warm_up()
     found = {"import and start, s": started - begin, "all kernels loaded, s": time.process_time() - started}
-    lines = (line.split() for line in Path("/proc/self/smaps_rollup").read_text().splitlines()[1:])
-    kilobytes = {line[0]: float(line[1]) for line in lines}
-    found["resident, MB"] = kilobytes["Rss:"] / 1024
-    found["of which written to, MB"] = kilobytes["Private_Dirty:"] / 1024
     few = np.random.default_rng(1).normal(0.0, 20.0, (50, 3)).astype(np.float32)
     street, scan = street_and_scan()
     walls = street[:, 2] > 0.2
