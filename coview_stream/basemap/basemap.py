@@ -264,6 +264,10 @@ class BaseMap:
         arrays = self.arrays
         return tiles.crop(self.points, arrays["normals"], arrays["tile_index"], self.config.tile, centre, radius)
 
+    def points_near(self, centre: Floats, radius: float) -> Points:
+        """Return the points of :meth:`crop` alone."""
+        return tiles.points_near(self.points, self.arrays["tile_index"], self.config.tile, centre, radius)[0]
+
     @cached_property
     def field(self) -> kernels.FieldMap:
         """Likelihood field, relative to :attr:`origin`; made here if the file has none. MapError if it is invalid."""
@@ -336,8 +340,9 @@ def station_descriptors(base_map: BaseMap, station: int) -> dict[Channel, npt.ND
     from coview_stream.basemap.stations import describe_storeys
 
     here = base_map.stations[station]
-    near = np.flatnonzero((np.abs(base_map.stations[:, :2] - here[:2]) <= block).all(axis=1))
-    points, _ = base_map.crop(here.astype(np.float64), config.radius + 3.0 * block)
+    near = np.flatnonzero(np.abs(base_map.stations[:, 0] - here[0]) <= block)
+    near = near[np.abs(base_map.stations[near, 1] - here[1]) <= block]
+    points = base_map.points_near(here.astype(np.float64), config.radius + 3.0 * block)
     wanted = np.flatnonzero(near == station)
     described = describe_storeys(points, base_map.stations[near], block, config, None, wanted)
     return {name: values[0] for name, values in described.items()}

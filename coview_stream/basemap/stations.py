@@ -30,6 +30,7 @@ Described = dict[Channel, npt.NDArray[np.float16]]
 """(M, R, S) of each channel."""
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 _PORTION = 512  # stations at a time: 7 MB of bins
+_DENSE = 64  # voxels of a raster for each point, up to which a table of all is faster than a sort of the points
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
 _MAX_STOREYS = 1024  # a kilometre from the lowest indoor station to the highest
@@ -293,16 +294,22 @@ def rasterise(
 
     The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of points depend on the scan pattern.
     """
-    column, row = np.floor((points[:, :2] - corner) / cell).astype(np.int64).T
+    column, row = (np.floor((points[:, k] - corner[k]) / cell).astype(np.int64) for k in (0, 1))
     level = np.floor(points[:, 2] / voxel).astype(np.int64)
     far = (points if extent is None else extent)[:, :2].max(axis=0)
     width, height = (np.floor((far - corner) / cell).astype(int) + 1 + margin).tolist()
     flat = row * width + column
-    # one sort by (cell, level) gives the voxels; the last point of a sorted cell is not its highest, hence maximum
     level -= level.min(initial=np.iinfo(level.dtype).max)  # there may be no point
-    _, first = np.unique(flat * (int(level.max(initial=0)) + 1) + level, return_index=True)
-    size = height * width
-    count = np.bincount(flat[first], minlength=size)
+    size, levels = height * width, int(level.max(initial=0)) + 1
+    number = flat * levels + level
+    if means or size * levels > _DENSE * len(points):
+        # one sort by (cell, level) gives the voxels
+        first = np.unique(number, return_index=True)[1]
+        count = np.bincount(flat[first], minlength=size)
+    else:
+        occupied = np.zeros((size, levels), dtype=bool)
+        occupied.ravel()[number] = True
+        count = occupied.sum(axis=1)
     top = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0

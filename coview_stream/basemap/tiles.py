@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 Key = tuple[int, int]
@@ -52,15 +52,21 @@ def crop(
     points: npt.NDArray[Any], normals: npt.NDArray[Any], index: Ints, tile: float, centre: Floats, radius: float
 ) -> tuple[Points, Points]:
     """Return points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""
+    near, stretches, inside = points_near(points, index, tile, centre, radius)
+    packed = np.concatenate([np.empty((0, 3), np.int8), *(normals[stretch] for stretch in stretches)])
+    return near, unit_normals(packed.compress(inside, axis=0))
+
+
+def points_near(
+    points: npt.NDArray[Any], index: Ints, tile: float, centre: Floats, radius: float
+) -> tuple[Points, list[slice], Bools]:
+    """Return the points of :func:`crop`, the stretches of its tiles, and which of their points these are."""
     stretches = [slice(int(begin), int(end)) for begin, end in spans(index, tile, centre, radius)]
-    if not stretches:
-        return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.float32)
-    near_points = np.concatenate([points[stretch] for stretch in stretches])
-    dx, dy = near_points[:, 0] - np.float64(centre[0]), near_points[:, 1] - np.float64(centre[1])
+    near = np.concatenate([np.empty((0, 3), np.float32), *(points[stretch] for stretch in stretches)])
+    dx, dy = near[:, 0] - np.float64(centre[0]), near[:, 1] - np.float64(centre[1])
     inside = dx * dx + dy * dy < radius * radius
     # compress: a boolean index of rows takes five times as long
-    packed = np.concatenate([normals[stretch] for stretch in stretches]).compress(inside, axis=0)
-    return near_points.compress(inside, axis=0), unit_normals(packed)
+    return near.compress(inside, axis=0), stretches, inside
 
 
 def cut_points(arrays: Mapping[str, npt.NDArray[Any]], tile: float, cut: kernels.Cut) -> kernels.Crop | None:

@@ -21,11 +21,12 @@ from coview_stream.errors import MapError
 BLOCK = 2.0
 
 
-def test_raster_cells_hold_max_height_and_voxel_count():
+@pytest.mark.parametrize("means", [False, True])
+def test_raster_cells_hold_max_height_and_voxel_count(means):
     points = np.array(
         [[0.1, 0.1, 1.0], [0.2, 0.2, 1.1], [0.3, 0.1, 4.0], [0.9, 0.1, -2.0], [0.1, 1.6, 0.3]], np.float32
     )
-    raster = rasterise(points, np.array([0.0, 0.0]), cell=0.5, voxel=0.5, margin=1)
+    raster = rasterise(points, np.array([0.0, 0.0]), cell=0.5, voxel=0.5, margin=1, means=means)
     assert raster.top.shape == (5, 3)
     # row along y, column along x; 1.0 and 1.1 share a voxel
     assert raster.count.tolist() == [[2, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]]

@@ -18,7 +18,7 @@ from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.progress import Progress
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.descriptors.coview import EYE
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Ints
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, norms, pose_from, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
@@ -136,16 +136,24 @@ def ambiguity(
 def sample(base_map: BaseMap, count: int) -> Indices:
     """Return no more than ``count`` stations, evenly spread: one per cell of the finest possible grid."""
     stations = base_map.stations.astype(np.float64)
-    cell = base_map.config.block
+    block = cell = base_map.config.block
     stations -= stations.min(axis=0) - 0.5 * cell
-    while True:
-        index = np.floor(stations / (cell, cell, max(cell, _STOREY))).astype(np.int64)
-        middle = (index[:, :2] + 0.5) * cell
-        order = np.argsort(np.linalg.norm(stations[:, :2] - middle, axis=1), kind="stable")
-        first = np.unique(index[order], axis=0, return_index=True)[1]
-        if len(first) <= count:
-            return np.sort(order[first])
+    levels = int(np.unique(_numbers(stations[:, :2], (block, block)), return_counts=True)[1].max(initial=1))
+    while len(stations) > count * levels * (cell / block + 2.0) ** 2:  # more cells even if all of them are full
         cell *= 1.05
+    while True:
+        number = _numbers(stations, (cell, cell, max(cell, _STOREY)))
+        if len(np.unique(number)) <= count:
+            middle = (np.floor(stations[:, :2] / cell) + 0.5) * cell
+            order = np.argsort(np.linalg.norm(stations[:, :2] - middle, axis=1), kind="stable")
+            return np.sort(order[np.unique(number[order], return_index=True)[1]])
+        cell *= 1.05
+
+
+def _numbers(positions: Floats, cell: tuple[float, ...]) -> Ints:
+    """Return the number (N,) of the cell of positions (N, D) that are not below zero."""
+    index = np.floor(positions / cell).astype(np.int64)
+    return np.asarray(np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0, initial=0) + 1)))
 
 
 def _counted(items: Indices, progress: Progress | None) -> Iterator[int]:
@@ -301,7 +309,7 @@ def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: Registr
         changed: share of the patches, in [0, 1].
         config: how scans are thinned.
     """
-    near = base_map.crop(eye, _RANGE + _MOVED[1])[0]
+    near = base_map.points_near(eye, _RANGE + _MOVED[1])
     visible = _in_view(_rearranged(near, changed) - eye.astype(np.float32))
     if not len(visible):
         return None
@@ -315,38 +323,37 @@ def _rearranged(points: Points, changed: float) -> Points:
     """Shift the points of the changed patches, the same in all scans."""
     if changed <= 0.0:
         return points
-    x, y = np.floor(points[:, :2] * np.float32(1.0 / _CHANGE_PATCH)).astype(np.int64).T
-    draw, shift = _draws()
-    patch = (x % _TABLE) * _TABLE + y % _TABLE
+    x, y = (np.floor(axis * np.float32(1.0 / _CHANGE_PATCH)).astype(np.int32) % _TABLE for axis in points[:, :2].T)
     moved = np.array(points)
-    moved[:, :2] += shift[patch] * (draw[patch] < changed)[:, None]
+    moved[:, :2] += _shifts(changed).take(x * _TABLE + y, axis=0)
     return moved
 
 
 @lru_cache(maxsize=1)
-def _draws() -> tuple[Floats32, Floats32]:
-    """Return random numbers (P,) in [0, 1) and shifts (P, 2), metres, by patch."""
+def _shifts(changed: float) -> Floats32:
+    """Return random shifts (P, 2), metres, of a share of the patches; 0 of the others."""
     rng = np.random.default_rng(20240)
     draw, turn = rng.random(_TABLE**2), rng.uniform(0.0, 2.0 * np.pi, _TABLE**2)
     distance = rng.uniform(*_MOVED, _TABLE**2)
     shift = np.column_stack([distance * np.cos(turn), distance * np.sin(turn)])
-    return draw.astype(np.float32), shift.astype(np.float32)
+    return shift.astype(np.float32) * (draw.astype(np.float32) < changed)[:, None]
 
 
 def _in_view(points: Points) -> Points:
     """Return the visible ones of points (N, 3) relative to the sensor."""
     flat = np.hypot(points[:, 0], points[:, 1])
-    steep = np.abs(points[:, 2]) < flat * np.float32(np.tan(_BEAM * max(_UP, _DOWN)))
-    points = points[steep & (flat < _RANGE)]
+    ahead: Bools = (np.abs(points[:, 2]) < flat * np.float32(np.tan(_BEAM * max(_UP, _DOWN)))) & (flat < _RANGE)
+    points, flat = points.compress(ahead, axis=0), flat.compress(ahead)
     ranges = norms(points).astype(np.float32)
-    row = np.floor(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])) / _BEAM).astype(np.int64) + _DOWN
-    column = np.floor(np.arctan2(points[:, 1], points[:, 0]) / _BEAM).astype(np.int64) % _COLUMNS
+    row = np.floor(np.arctan2(points[:, 2], flat) / _BEAM).astype(np.int32) + _DOWN
+    column = np.floor(np.arctan2(points[:, 1], points[:, 0]) / _BEAM).astype(np.int32) % _COLUMNS
     inside: Bools = (ranges > _NEAREST) & (row >= 0) & (row < _UP + _DOWN)
-    points, ranges, cell = points[inside], ranges[inside], (row * _COLUMNS + column)[inside]
+    points, ranges = points.compress(inside, axis=0), ranges.compress(inside)
+    cell = (row * _COLUMNS + column).compress(inside)
     nearest = np.full((_UP + _DOWN) * _COLUMNS, np.inf, dtype=np.float32)
     np.minimum.at(nearest, cell, ranges)
     limit = _without_holes(nearest.reshape(-1, _COLUMNS)).ravel()[cell]
-    return np.asarray(points[ranges < limit + _SLACK + _SLACK_SLOPE * ranges])
+    return points.compress(ranges < limit + _SLACK + _SLACK_SLOPE * ranges, axis=0)
 
 
 def _without_holes(nearest: Floats32) -> Floats32:

@@ -288,7 +288,8 @@ class PlaceScorer:
                 chosen.append((group, replace(hypothesis, T_map_odom=T[group[0]], hinted=hinted)))
                 origins.append(origin if origin < count else -1)
         newest = np.array([group[0] for group, _ in chosen], dtype=np.int64)
-        votes = np.array([min(ranks[group].min(), len(observed.groups) - 1) for group, _ in chosen], dtype=np.int64)
+        rank, last = ranks.tolist(), len(observed.groups) - 1
+        votes = np.array([min(last, *(rank[row] for row in group)) for group, _ in chosen], dtype=np.int64)
         history = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
@@ -361,9 +362,12 @@ def _places(pose: Floats, rank: Floats32) -> list[list[int]]:
     along += np.outer(sin, sin)
     same = (gap < SAME_DISTANCE**2) & (along > np.cos(SAME_ANGLE))
     free = np.ones(len(order), dtype=bool)
+    alone, rows = (np.count_nonzero(same, axis=1) == 1).tolist(), order.tolist()
     out = []
     for k, row in enumerate(same):
-        if free[k]:
+        if alone[k]:
+            out.append([rows[k]])
+        elif free[k]:
             members = np.flatnonzero(row & free)
             free[members] = False
             out.append(order[members].tolist())
