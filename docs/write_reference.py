@@ -14,6 +14,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
 
 import coview_stream
@@ -136,11 +137,38 @@ def options_page() -> str:
 
 
 def names_table() -> str:
-    """Return the public names of ``coview_stream`` with the first sentence of each docstring."""
+    """Return the public names of ``coview_stream`` with the first sentence of each docstring, and what each has."""
     names = sorted((name for name in coview_stream.__all__ if not name.startswith("_")), key=str.casefold)
-    sentences = [inspect.getdoc(getattr(coview_stream, name)).split("\n\n")[0] for name in names]
-    rows = [(code(name), role_free(cell(text))) for name, text in zip(names, sentences, strict=True)]
+    rows = []
+    for name in names:
+        thing = getattr(coview_stream, name)
+        text = role_free(cell(inspect.getdoc(thing).split("\n\n")[0]))
+        rows.append((code(name), " ".join([text, *members_of(thing)])))
     return table_of("|", rows) + "\n"
+
+
+def members_of(thing: object) -> Iterator[str]:
+    """Yield in one sentence the parameters of a function, or the parameters and members of a class with methods."""
+    if inspect.isfunction(thing):
+        yield f"{code(called(thing))}."
+    if not inspect.isclass(thing) or issubclass(thing, Exception | enum.Enum) or thing.__name__.endswith("Config"):
+        return
+    members = [field.name for field in dataclasses.fields(thing)] if dataclasses.is_dataclass(thing) else []
+    if not members:
+        yield f"{code(called(thing))}:"
+    ours = [base for base in thing.__mro__ if base.__module__.startswith("coview_stream")]
+    for name, value in ((name, getattr(thing, name)) for base in ours for name in vars(base)):
+        if isinstance(value, property | cached_property):
+            members.append(name)
+        elif callable(value):
+            members.append(called(value))
+    yield ", ".join(code(member) for member in dict.fromkeys(members) if not member.startswith("_")) + "."
+
+
+def called(thing: object) -> str:
+    """Return a function or class with the names of its parameters."""
+    names = [str(p.replace(annotation=p.empty, default=p.empty)) for p in inspect.signature(thing).parameters.values()]
+    return f"{thing.__name__}({', '.join(name for name in names if name != 'self')})"
 
 
 def python_page(text: str) -> str:

@@ -80,7 +80,7 @@ class MapSummary:
         """Return one line; the size in feet too where no reference system states the unit."""
         area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
         width, depth = self.width * FOOT, self.depth * FOOT
-        feet = f" ({width:.0f} x {depth:.0f} m if in feet: --crs feet)" if self.crs == UNKNOWN else ""
+        feet = f" ({width:.0f} x {depth:.0f} m if in feet: build --crs feet)" if self.crs == UNKNOWN else ""
         return (
             f"{self.width:.0f} x {self.depth:.0f} m{feet} with points on {area}, {self.density:.3g} points/m2 kept, "
             f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "

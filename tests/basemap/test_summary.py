@@ -40,7 +40,7 @@ def test_summary_has_the_size_that_the_cloud_has(town, tmp_path):
     assert found.warnings == ()
     assert "crs unknown" in str(found)
     width, depth = found.width, found.depth
-    feet = f"({width * 0.3048:.0f} x {depth * 0.3048:.0f} m if in feet: --crs feet)"
+    feet = f"({width * 0.3048:.0f} x {depth * 0.3048:.0f} m if in feet: build --crs feet)"
     assert f"{width:.0f} x {depth:.0f} m {feet} with" in str(found)
     assert "feet" not in str(replace(found, crs="EPSG:25832"))
 

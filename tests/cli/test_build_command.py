@@ -44,7 +44,7 @@ def test_last_line_tells_what_the_map_covers_and_warnings_are_one_line_each(map_
     assert main(["build", str(tmp_path / "thin.ply"), "-o", str(tmp_path / "site.coview"), "--radius", "20"]) == 0
     captured = capsys.readouterr()
     last = captured.out.splitlines()[-1]
-    assert last.startswith("40 x 40 m (12 x 12 m if in feet: --crs feet) with points on ")
+    assert last.startswith("40 x 40 m (12 x 12 m if in feet: build --crs feet) with points on ")
     for fact in ("points/m2", "heights -", "crs unknown", "per km2"):
         assert fact in last
     lines = captured.err.splitlines()
@@ -113,7 +113,7 @@ def test_directory_of_tiles_is_built_converted_and_shown(cloud, tmp_path, capsys
     assert main(["build", str(cloud), "-o", site, "--workers", "1", "--no-learned"]) == 0
     assert re.search(r"\d+ tiles of 320 m, 0 as they were", out := capsys.readouterr().out)
     assert re.search(
-        r"^1\d x 1\d m \(\d x \d m if in feet: --crs feet\) with .* points/m2 kept, heights .*, crs unknown, .* tiles",
+        r"^1\d x 1\d m \(\d x \d m if in feet: build --crs feet\) with .* points/m2 kept, heights .* unknown, .* tiles",
         out,
         re.M,
     )
