@@ -7,7 +7,7 @@ import importlib.util
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ from coview_stream.errors import ConfigError, CoViewError, TransportError
 
 if TYPE_CHECKING:
     from coview_stream.doctor.finding import Finding
+    from coview_stream.doctor.network_checks import Heard
     from coview_stream.stream.transport.keys import RobotKeys
 
 HELP = "check this machine, a map, the network and the robots' messages, with a remedy for each finding"
@@ -97,6 +98,8 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     zenoh = connect is not None and importlib.util.find_spec("zenoh") is not None  # a finding where it is missing
     if connect is not None and zenoh:
         compose(connect, args.listen, args.zenoh_config)  # mistakes before anything slow
+    # the robot may stop before the other checks, which take seconds, are done
+    heard = (yield from _listen(args, connect, keys)) if connect is not None and zenoh else None
     yield from machine_findings()
     sha256 = base_map = None
     if args.map is not None:
@@ -125,15 +128,18 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
             drawn = sys.stderr.isatty() and importlib.util.find_spec("tqdm") is not None
             with progress_bar("judging", unit="frame") if drawn else nullcontext() as follow:
                 yield from run_findings(recorded, base_map, config, follow)
-    if connect is not None and zenoh:
-        yield from _network(args, connect, keys, sha256)
+    if heard is not None:
+        from coview_stream.doctor.network_checks import robots_findings
+
+        yield from robots_findings(heard, sha256)
 
 
-def _network(
-    args: argparse.Namespace, connect: list[str], keys: list[RobotKeys], sha256: str | None
-) -> Iterator[Finding]:
+def _listen(
+    args: argparse.Namespace, connect: list[str], keys: list[RobotKeys]
+) -> Generator[Finding, None, Heard | None]:
+    """Yield the finding about the connection, and return what came; None without one."""
     from coview_stream.doctor.finding import from_error
-    from coview_stream.doctor.network_checks import connection_finding, robots_findings
+    from coview_stream.doctor.network_checks import connection_finding, listen
     from coview_stream.stream.transport.zenoh_transport import open_transport
 
     logger = logging.getLogger("coview_stream.stream")
@@ -143,14 +149,14 @@ def _network(
         transport = open_transport(connect, args.listen, args.zenoh_config)
     except TransportError as error:
         yield from_error("network", error)
-        return
+        return None
     finally:
         logger.setLevel(before)
     try:
         connected = connection_finding(transport, connect)
         yield connected
-        if connected.verdict != "FAIL":
-            codecs = (args.cloud_encoding, args.odometry_encoding)
-            yield from robots_findings(transport, keys, args.seconds, codecs, sha256)
+        if connected.verdict == "FAIL":
+            return None
+        return listen(transport, keys, args.seconds, (args.cloud_encoding, args.odometry_encoding))
     finally:
         transport.close()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 
-from coview_stream.doctor.capture import Codecs, Wait, capture_cloud, capture_odometry, capture_robots
+from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_cloud, capture_odometry, capture_robots
 from coview_stream.doctor.finding import Finding
 from coview_stream.doctor.frame_checks import frame_findings
 from coview_stream.doctor.robot_checks import (
@@ -234,33 +234,45 @@ def try_tcp(endpoint: str) -> str:
         return f"cannot be reached: {error.strerror or error}"
 
 
-def robots_findings(
+@dataclass(frozen=True)
+class Heard:
+    """What came over the network: the robots' messages, other clouds and odometry, and robots that have a node."""
+
+    captures: list[RobotCapture]
+    candidates: list[Candidate]
+    served: set[str]
+
+
+def listen(
     transport: Transport,
     keys: Sequence[RobotKeys],
     seconds: float,
     codecs: Codecs = (None, None),
-    sha256: str | None = None,
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[Finding]:
-    """Listen to all robots at once and judge each; without any, or if one is silent, look for others."""
+) -> Heard:
+    """Listen to all robots at once; without any, or if one is silent, look for others."""
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
     names = [*(k.robot for k in keys), *{k.alive.partition(f"/{k.robot}/")[0] for k in keys}]
     candidates = discover(transport, wait, names) if silent or not keys else []
     # robots of any base whose node holds a liveliness token
     tokens = transport.tokens("**/alive") if candidates else ()
-    served = {token.split("/")[-2] for token in tokens if "/" in token}
-    for capture in captures:
+    return Heard(captures, candidates, {token.split("/")[-2] for token in tokens if "/" in token})
+
+
+def robots_findings(heard: Heard, sha256: str | None = None) -> Iterator[Finding]:
+    """Judge each robot, with the map's ``sha256`` where a map is checked; without any, list those that send."""
+    for capture in heard.captures:
         k = capture.keys
-        others = served - {k.robot}
-        yield from cloud_findings(capture, candidates_text(candidates, "cloud", k.cloud, others))
-        yield from odometry_findings(capture, candidates_text(candidates, "odometry", k.odometry, others))
+        others = heard.served - {k.robot}
+        yield from cloud_findings(capture, candidates_text(heard.candidates, "cloud", k.cloud, others))
+        yield from odometry_findings(capture, candidates_text(heard.candidates, "odometry", k.odometry, others))
         yield from cross_findings(capture)
         yield from frame_findings(captured_frames(capture), k.robot)
         yield node_finding(capture, sha256)
-    if not keys:
-        texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(candidates, channel))]
+    if not heard.captures:
+        texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(heard.candidates, channel))]
         if texts:
             yield Finding("ok", "robots", "; ".join(texts))
         else:

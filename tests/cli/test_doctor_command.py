@@ -111,16 +111,26 @@ def test_no_robot_on_the_network(capsys):
     endpoint = free_endpoint()
     code, found = findings_of(capsys, "--robot", "r1", "--connect", endpoint)
     assert code == 1
-    assert [f["verdict"] for f in found] == ["ok", "FAIL"]  # nothing more to say of the robot
-    assert f"{endpoint} refuses" in found[1]["found"]
+    assert [(f["verdict"], f["what"]) for f in found] == [("FAIL", "network"), ("ok", "machine")]  # nothing more
+    assert f"{endpoint} refuses" in found[0]["found"]
 
 
 def test_endpoint_in_use_is_reported(capsys):
     with Robot() as robot:
         code, found = findings_of(capsys, "--listen", robot.endpoint)
     assert code == 1
-    assert found[-1]["what"] == "network"
-    assert "in use" in found[-1]["found"].lower()
+    assert found[0]["what"] == "network"
+    assert "in use" in found[0]["found"].lower()
+
+
+@pytest.mark.slow
+def test_robots_are_heard_before_the_machine_is_checked(capsys, monkeypatch):
+    """A robot that stops meanwhile has been heard."""
+    with Robot() as robot:
+        monkeypatch.setattr(machine, "machine_findings", lambda: robot.__exit__() or iter([]))
+        _, found = findings_of(capsys, "--robot", "r1", "--connect", robot.endpoint, "--seconds", "0.5")
+    assert found[1]["what"] == "clouds"
+    assert "Hz" in found[1]["found"]
 
 
 def test_doctor_without_robot_checks_machine_and_map(world_file, tmp_path, capsys):

@@ -15,6 +15,7 @@ from coview_stream.doctor.network_checks import (
     discover,
     from_key,
     from_token,
+    listen,
     robots_findings,
     try_tcp,
 )
@@ -45,7 +46,7 @@ class Time:
 
 def findings(net, messages, keys=(KEYS,), seconds=3.0, **more):
     time = Time(net, *messages)
-    return list(robots_findings(net, keys, seconds, wait=time.wait, clock=time.clock, **more))
+    return list(robots_findings(listen(net, keys, seconds, wait=time.wait, clock=time.clock), **more))
 
 
 DRIVE = [*((t, odometry(t)) for t in steps(50)), *((t + 0.05, cloud(t)) for t in steps(10))]
