@@ -58,15 +58,16 @@ class _Robot:
     frames: FrameTree = field(default_factory=FrameTree)  # of /tf_static
     T_map_odom: Pose | None = None  # of the newest pose; kept while there is none
     posed_at: float = 0.0  # local time of the newest pose
-    newest_ns: int | None = None  # stamp of the newest cloud or odometry
-    odometry_ns: int | None = None  # of the newest odometry
+    heard_ns: int | None = None  # stamp of the last cloud or odometry
+    odometry_ns: int | None = None  # newest of odometry's stamps since its clock began
+    restarts: int = 0  # of odometry's frame, by the node
     clock_said: bool = False  # that the stamps contradict this node's clock
     outputs: dict[str, Any] = field(default_factory=dict)  # rclpy's publishers
     lock: threading.Lock = field(default_factory=threading.Lock)  # of ``T_map_odom`` with ``odometry_ns``
 
     def check_cloud(self, sample: Sample) -> Sample:
         """Return a cloud with its mount, of /tf_static, or refused for its frame."""
-        self.newest_ns, frame = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload)
+        self.heard_ns, frame = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload)
         self.frames.lidar = frame
         body = self.body_frame or self.frames.body()  # odometry may name no body
         if self.check_frames and frame and self.odometry_ns is None:
@@ -88,19 +89,25 @@ class _Robot:
         if frame == self.map_frame:
             return _refused(sample, f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?")
         with self.lock:
-            if self.odometry_ns is not None and stamp_ns < self.odometry_ns - _CACHE * 1e9:
-                self.T_map_odom = None  # the sender began anew, and so did its frame
-            self.newest_ns = self.odometry_ns = stamp_ns
+            self.heard_ns = stamp_ns
+            self.odometry_ns = max(stamp_ns, self.odometry_ns or stamp_ns)
         self.odometry_frame, self.body_frame = frame, ros2.frame_id(sample.payload, 1)
         return sample
 
+    def note_restarts(self, count: int) -> None:
+        """Forget map -> odom where the node has found that odometry's frame began anew."""
+        with self.lock:
+            if count > self.restarts:
+                self.T_map_odom, self.odometry_ns = None, self.heard_ns
+            self.restarts = count
+
     def clock(self, now_ns: int) -> str:
         """Return how the stamps contradict the node's clock; empty if they do not."""
-        if self.newest_ns is None:
+        if self.heard_ns is None:
             return ""
         if not now_ns:
             return "use_sim_time is set and nothing comes on /clock"
-        late = (now_ns - self.newest_ns) / 1e9
+        late = (now_ns - self.heard_ns) / 1e9
         if abs(late) <= _CACHE:
             return ""
         side = "before" if late > 0 else "after"
@@ -355,8 +362,10 @@ class Ros2Transport:
     def _write_pose(self, robot: _Robot, payload: bytes) -> None:
         pose = json_messages.decode_pose(Sample("", payload))
         with robot.lock:
-            if robot.odometry_ns is not None and pose.stamp_ns > robot.odometry_ns:
-                return  # of before the sender began anew
+            if robot.odometry_ns is not None:
+                if pose.stamp_ns > robot.odometry_ns:
+                    return  # of before the sender began anew
+                robot.odometry_ns = pose.stamp_ns  # a stray stamp far ahead is forgotten
             robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
         robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
 
@@ -364,14 +373,17 @@ class Ros2Transport:
         """Broadcast map -> odom as it is known at the stamp of odometry that came; while the place is lost, as it was.
 
         With odometry, not with poses: a lookup of the body at odometry's stamp then does not wait for the next pose.
+        But not at a stamp from before the newest: of a late sample, or of a clock that may have begun anew.
         """
-        publisher, T, frame = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame
-        if publisher is not None and T is not None and frame and robot.odometry_ns is not None:
-            publisher.publish(ros2_outputs.encode_transform(T, robot.odometry_ns, robot.map_frame, frame))
+        publisher, T, frame, stamp_ns = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame, robot.heard_ns
+        if publisher is not None and T is not None and frame and stamp_ns is not None and stamp_ns == robot.odometry_ns:
+            publisher.publish(ros2_outputs.encode_transform(T, stamp_ns, robot.map_frame, frame))
 
     def _write_status(self, robot: _Robot, payload: bytes) -> None:
         status = json.loads(payload)
         now_ns = self._node.get_clock().now().nanoseconds
+        counters = status.get("counters", {})
+        robot.note_restarts(sum(counters.get(name, 0) for name in ("clock_restarts", "odometry_jumps")))
         if status["map_sha256"] != self._shown and time.monotonic() >= self._retry_at:
             self._map_wanted.put(Sample("map", b""))
         clock = robot.clock(now_ns)

@@ -8,16 +8,17 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
-from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import small_world
 from ros_robot import ENVIRONMENT, RosRobot, cloud_message, place_of, stamp_of
+from sockets import free_endpoint
 
 from coview_stream.basemap.summary import MapView
 from coview_stream.cli import main, options, serve
@@ -25,17 +26,20 @@ from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, pose_to_tum, rot_z
 from coview_stream.geometry.transforms import transform as transform_points
-from coview_stream.messages import encode_pose, ros2, ros2_outputs
-from coview_stream.messages.types import CloudMessage, Encoded, Sample
+from coview_stream.localization.state import State
+from coview_stream.messages import decode_pose, encode_cloud, encode_odometry, encode_pose, ros2, ros2_outputs
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, Sample
+from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 from coview_stream.stream.transport import ros2_transport
 from coview_stream.stream.transport.keys import matches, robot_keys
 from coview_stream.stream.transport.rmw import dds_type, publisher_token, type_hash
 from coview_stream.stream.transport.ros2_node import settings_of, start_node
 from coview_stream.stream.transport.ros2_transport import Ros2Transport
+from coview_stream.stream.transport.zenoh_transport import open_transport
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "node"))
 from fake_node import Site
-from fake_robot import POINTS, cloud, message, ns, odometry
+from fake_robot import POINTS, message, ns
 
 NO_ROS = "no rclpy here: pip install -e '.[test-ros2]', Python 3.11 to 3.13"
 KEYS = robot_keys("native", "coview", "r1", "r1/points", "r1/odom", "r1/pose")
@@ -58,8 +62,8 @@ def robot(ros):
 class RosSite(Site):
     """A node without threads whose network is ROS; its engine knows every place at once."""
 
-    def __init__(self, *args):
-        super().__init__("r1", net=Ros2Transport(start_node(args), [KEYS]))
+    def __init__(self, *args, engines=None):
+        super().__init__("r1", net=Ros2Transport(start_node(args), [KEYS]), engines=engines)
         self.sessions["r1"].keys = self.keys["r1"] = KEYS
         self.node.declare()
 
@@ -124,34 +128,51 @@ def drive(robot, site, seconds, points=POINTS):
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_another_transport_to_the_last_digit(robot, site):
-    other = Site("r1")
-    other.node.declare()
-    for k in range(5):
-        drive(robot, site, 0.1 * k)
-        other.net.publish(odometry(0.1 * k))
-        other.net.publish(cloud(0.1 * k))
-        other.net.publish(odometry(0.1 * k + 0.01))
-        other.work("r1")
-        wanted = other.poses("r1")[-1]
-        got = robot.poses[-1]
-        assert stamp_of(got) == wanted.stamp_ns
-        assert got.header.frame_id == "map"
-        np.testing.assert_allclose(place_of(got), pose_to_tum(wanted.T_map_body), atol=1e-9)
-        np.testing.assert_allclose(np.reshape(got.pose.covariance, (6, 6)), wanted.covariance, atol=1e-12)
+def test_same_frames_have_the_poses_that_they_have_over_zenoh(robot, world_map, world_drive):
+    """Either engine gets a frame once it has worked on the one before: both work on the same ones."""
+    engines, endpoint, heard = [(TrackEngine(world_map), SearchEngine(world_map)) for _ in "12"], free_endpoint(), []
+    site, net, far = RosSite(engines=engines[0]), open_transport(listen=[endpoint]), open_transport([endpoint])
+    with closing(site.net), closing(net), closing(far):
+        other = Site("r1", net=net, engines=engines[1])
+        other.node.declare()
+        site.meet(robot)
+        keys = other.keys["r1"]
+        far.subscribe(keys.pose, lambda sample: heard.append(decode_pose(sample)), "all")
+        moves, clouds = far.publisher(keys.odometry, "data"), far.publisher(keys.cloud, "data")
+        assert far.await_subscriber(keys.cloud, 10.0)
+        assert far.await_subscriber(keys.odometry, 10.0)
+        for k, (points, T_odom_body) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
+            robot.send(ns(0.5 * k), points, T_odom_body)
+            moves.put(encode_odometry(OdometryMessage(ns(0.5 * k), T_odom_body), "json"))
+            clouds.put(encode_cloud(CloudMessage(ns(0.5 * k), points), "xyz"))
+            for each in (site, other):
+                robot.until(lambda each=each, k=k: each.work("r1") or each.sessions["r1"].counters.processed > k, 60.0)
+                each.node.publish_poses(time.monotonic())
+            assert other.sessions["r1"].state()[0] is site.sessions["r1"].state()[0]
+            if other.sessions["r1"].state()[0] is State.TRACKING:
+                robot.until(lambda k=k: heard and heard[-1].stamp_ns == ns(0.5 * k))
+                robot.until(lambda k=k: robot.poses and stamp_of(robot.poses[-1]) == ns(0.5 * k))
+        assert len(robot.poses) == len(heard) > 5
+    for got, wanted in zip(robot.poses, heard, strict=True):
+        assert (stamp_of(got), got.header.frame_id) == (wanted.stamp_ns, "map")
+        np.testing.assert_allclose(place_of(got), pose_to_tum(wanted.T_map_body), atol=1e-6)
+        np.testing.assert_allclose(np.reshape(got.pose.covariance, (6, 6)), wanted.covariance, atol=1e-6)
 
 
-@pytest.fixture
-def transforms(ros, monkeypatch):
-    """Type of transforms, which no wheel has: any other will do, for bytes go out and in as they are."""
-    from geometry_msgs.msg import PolygonStamped
+@pytest.fixture(scope="module")
+def transforms(tmp_path_factory):
+    """Type of transforms; no wheel has it, so it is built as a user would."""
+    pytest.importorskip("rclpy", reason=NO_ROS)
+    if find_spec("tf2_msgs") is None:
+        folder = tmp_path_factory.mktemp("tf2")
+        command = [sys.executable, Path(__file__).parents[3] / "examples/ros2/tf2_msgs.py", folder]
+        done = subprocess.run(command, env=python_environment(), capture_output=True, text=True)
+        if done.returncode:
+            pytest.skip(f"tf2_msgs cannot be built: {done.stderr.splitlines()[-1]}")
+        sys.path.append(str(folder))
+    from tf2_msgs.msg import TFMessage
 
-    package, messages = ModuleType("tf2_msgs"), ModuleType("tf2_msgs.msg")
-    package.__spec__ = ModuleSpec("tf2_msgs", None)
-    messages.TFMessage = PolygonStamped
-    monkeypatch.setitem(sys.modules, "tf2_msgs", package)
-    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", messages)
-    return PolygonStamped
+    return TFMessage
 
 
 def test_body_that_odometry_does_not_name_is_that_of_tf_static():
@@ -165,10 +186,13 @@ def test_body_that_odometry_does_not_name_is_that_of_tf_static():
 
 @pytest.mark.slow
 def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, transforms):
+    from rclpy.serialization import deserialize_message
+
     latched = robot.latched(1)
     publisher = robot.node.create_publisher(transforms, "/tf_static", latched)
     T_body_lidar = pose_from(rot_z(0.3), [0.2, 0.0, 0.5])
-    publisher.publish(ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne"))
+    static = ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne")
+    publisher.publish(deserialize_message(static, transforms))
     site = RosSite()
     try:
         site.meet(robot)
@@ -189,9 +213,10 @@ def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, transforms):
 
 
 @pytest.mark.slow
-def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, transforms):
+@pytest.mark.parametrize("back", [3.0, 60.0])
+def test_transform_follows_the_pose_freezes_while_lost_and_ends_with_the_senders_clock(robot, transforms, back):
     heard = []
-    robot.node.create_subscription(transforms, "/tf", heard.append, 10, raw=True)
+    robot.node.create_subscription(transforms, "/tf", heard.append, 10)
     site = RosSite()
     try:
         site.meet(robot)
@@ -203,27 +228,41 @@ def test_transform_follows_the_pose_and_freezes_while_the_place_is_lost(robot, t
         assert (parent, child) == ("map", "odom")
         pose = site.sessions["r1"].pose()
         before = encode_pose(pose, "json")
+        robot.move(ns(0.22), message(0.22).T_odom_body)  # late, and too late for tf2
         np.testing.assert_allclose(live, pose_to_tum(pose.T_map_body @ inverse(message(0.25).T_odom_body)), atol=1e-9)
         site.sessions["r1"].restart_search("asked", forget=True)
         site.told(robot, lambda: "frozen" in robot.values()["map -> odom"])
         robot.move(ns(0.3), message(0.3).T_odom_body)
         robot.until(lambda: transform(heard[-1])[2] == ns(0.3))
         np.testing.assert_array_equal(transform(heard[-1])[3], live)
-        count, received = len(heard), site.counters().odometry_received
-        for k in range(5):  # the sender began anew: its frame is another
-            robot.move(ns(-60.0 + 0.1 * k), message(0.1 * k).T_odom_body)
-        robot.until(lambda: site.counters().odometry_received > received + 3)
-        site.net.publisher(KEYS.pose, "pose").put(before)  # as long as the restart is not certain
-        received = site.counters().odometry_received
-        robot.move(ns(-59.0), message(0.5).T_odom_body)
-        robot.until(lambda: site.counters().odometry_received > received)
+        count, moments = len(heard), iter(0.05 * np.arange(1000) - back)
+        stamps = [transform(each)[2] for each in heard]
+        assert stamps == sorted(stamps)
+
+        def restarted():  # the sender began anew: its frame is another
+            at = next(moments)
+            robot.move(ns(at), message(at).T_odom_body)
+            time.sleep(0.05)
+            return site.counters().clock_restarts
+
+        robot.until(restarted)
+        site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
+        site.net.publisher(KEYS.pose, "pose").put(before)
+        for _ in range(5):
+            restarted()
         assert len(heard) == count
+        drive(robot, site, next(moments))
+        at = next(moments)
+        robot.move(ns(at), message(at).T_odom_body)
+        robot.until(lambda: transform(heard[-1])[2] == ns(at))
+        robot.move(ns(next(moments)), message(99.0).T_odom_body)  # its frame alone
+        site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
     finally:
         site.net.close()
 
 
-def transform(payload):
-    (row,) = ros2.store().deserialize_cdr(payload, ros2_outputs.TRANSFORMS).transforms
+def transform(message):
+    (row,) = message.transforms
     t, q, stamp = row.transform.translation, row.transform.rotation, row.header.stamp
     values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
     return row.header.frame_id, row.child_frame_id, stamp.sec * 1_000_000_000 + stamp.nanosec, values
@@ -330,6 +369,11 @@ def test_odometry_in_the_maps_frame_is_another_localizers_pose(robot, site):
 
 @pytest.mark.slow
 def test_stamps_of_another_clock_are_told(robot, site):
+    robot.move(ns(-0.1), message(-0.1).T_odom_body)
+    robot.until(lambda: site.sessions["r1"].inputs.odometry.newest.stamp_ns == ns(-0.1))
+    robot.clouds.publish(cloud_message(100_000_000_000, POINTS))  # of a simulator that has just begun
+    site.told(robot, lambda: robot.values().get("late") == "1" and "of one clock" in robot.values()["reason"])
+    assert (robot.level(), robot.poses) == (b"\1", [])
     drive(robot, site, 0.0)
     site.told(robot, lambda: "before this node's clock" in robot.values().get("clock", ""))
     assert robot.level() == b"\1"
@@ -639,7 +683,9 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
     served = Served(world_file, tmp_path, *arguments)
     try:
         robot.found()
-        robot.clouds.publish(cloud_message(time.time_ns(), np.zeros((0, 3))))  # zero width
+        robot.send(time.time_ns(), np.zeros((0, 3)), run.T_odom_body[0])  # zero width
+        robot.until(lambda: (robot.values().get("rejected"), robot.level()) == ("1", b"\1"), 60.0)
+        assert "points" in robot.values()["errors"]
         truth, at = play(robot, run, 150.0, 0, lambda: len(robot.poses) > 10)
         assert max(errors(robot, truth)) < 0.3
         robot.until(lambda: robot.level() == b"\0")
@@ -658,7 +704,7 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
         assert max(errors(robot, truth)) < 0.3
         # and so does the node
         code, seconds = served.end()
-        assert (code, seconds < 2.0) == (0, True)
+        assert (code, seconds < 4.0) == (0, True)  # 2 s where the machine is not busy with other tests
         served = Served(world_file, tmp_path, *arguments)
         robot.until(lambda: not robot.clouds.get_subscription_count(), 40.0)
         robot.found()
