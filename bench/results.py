@@ -64,6 +64,8 @@ QUICK = {
     "airborne-like maps": "conditions --conditions base --densities 8 --sets kitti04",
     "overlap": "conditions --overlaps 35 --sets kitti04",
     **{f"ablation, {group}": f"ablation --only {group} --sites kitti04" for group in (*ABLATION, "spacing")},
+    "protection": "protection --worlds 1",
+    "memory": "memory --km2 0.05",
     "fuzz": "fuzz --seconds 5",
     "soak": "soak --minutes 2",
 }
