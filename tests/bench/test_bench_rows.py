@@ -140,6 +140,14 @@ def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(mon
     assert "the code changed meanwhile" in capsys.readouterr().err
 
 
+def test_every_table_has_a_command_that_its_benchmark_understands():
+    for command in (*results.COMMANDS.values(), *results.QUICK.values()):
+        name, *words = command.split()
+        if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
+            bench.parser_of(name).parse_args(words)
+    assert results.SIDE_BY_SIDE | set(results.QUICK) | set(results.MINUTES) <= set(results.COMMANDS)
+
+
 def test_every_benchmark_loads():
     for entry in BENCHMARKS.values():
         if not entry.module.startswith(("stream", "soak")):  # they watch processes with psutil: extra bench
