@@ -16,13 +16,14 @@ from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.machine_checks import GB, MIN_MEMORY
 from coview_stream.errors import CloudError, CoViewError, MapError, RunError, install_command
+from coview_stream.geometry.protection import one_in
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.localization.calibration.calibration import Calibration
     from coview_stream.recordings.run import Frame, Run
 
-    Judge = Callable[[Frame], tuple[str, str] | None]
+    Judge = Callable[[Frame], tuple[str, str, float] | None]
     Progress = Callable[[int, int], None]
 
 _NETWORK_MEMORY = 0.04 * GB  # of the network and SciPy, in the process that searches
@@ -235,7 +236,8 @@ def sensor_findings(
 ) -> Iterator[Finding]:
     """Hold clouds, odometry and, with a map, registrations to it against each other over the run.
 
-    Yields the fault of most of the frames that speak for one, and the calibration at the end, both as while tracking.
+    Yields the fault that is more probable than none at some frame (poses are withheld long before), of several that of
+    most of the frames that speak for one, and the calibration at the end, both as while tracking.
     """
     try:
         judge, calibration = _judge(base_map, config)
@@ -244,7 +246,7 @@ def sensor_findings(
     stride = max(1, int(_BETWEEN / max(float(np.median(np.diff(run.stamps))), 1e-6)))
     stride -= stride % 2 == 0  # two drivers may take turns
     indices = range(0, len(run), stride)[:_WATCHED]
-    told = list[tuple[str, str]]()
+    told = list[tuple[str, str, float]]()
     for done, index in enumerate(indices, start=1):
         if progress is not None:
             progress(done, len(indices))
@@ -256,10 +258,11 @@ def sensor_findings(
             told.append(fault)
     seconds = float(run.stamps[indices[-1]] - run.stamps[0])
     of = "clouds and odometry" if base_map is None else "clouds, odometry and map"
-    if told:
-        cause = Counter(cause for cause, _ in told).most_common(1)[0][0]
-        reason = next(reason for other, reason in reversed(told) if other == cause)
-        found = f"{reason}; so in {len(told)} of {len(indices)} frames"
+    surest = max((probability for _, _, probability in told), default=0.0)
+    if surest > 0.5:
+        cause = Counter(cause for cause, _, _ in told).most_common(1)[0][0]
+        reason = next(reason for other, reason, _ in reversed(told) if other == cause)
+        found = f"{reason}; so in {len(told)} of {len(indices)} frames (wrong {one_in(1.0 - surest)})"
         yield Finding("FAIL", "sensors", found, f"cause {cause}: `coview-stream help reasons` says what to do")
     else:
         yield Finding("ok", "sensors", f"{of} tell the same motion over {seconds:.0f} s")
@@ -269,7 +272,7 @@ def sensor_findings(
 
 
 def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Callable[[], Calibration]]:
-    """Return a function that takes a frame and returns cause and reason of a fault, and one for the calibration."""
+    """Return a function that returns cause, reason and probability of a frame's fault, and one for the calibration."""
     from coview_stream.localization.frame import FramePreparation
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.tracking.monitor import FAULTS
@@ -279,18 +282,20 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
     if base_map is not None:
         localizer = Localizer(base_map, config)
 
-        def localized(frame: Frame) -> tuple[str, str] | None:
+        def localized(frame: Frame) -> tuple[str, str, float] | None:
             said = localizer.step(frame.points, frame.T_odom_body, frame.stamp).evidence
-            return (said.cause.value, said.reason) if said is not None and said.cause in FAULTS else None
+            if said is None or said.cause not in FAULTS:
+                return None
+            return said.cause.value, said.reason, localizer.sensor_fault
 
         return localized, lambda: localizer.calibration
     frames, drift = FramePreparation(config), Drift.of(TrackingConfig())
     witness = Witness(config.registration, frames.estimator)
 
-    def watched(frame: Frame) -> tuple[str, str] | None:
+    def watched(frame: Frame) -> tuple[str, str, float] | None:
         prepared = frames.prepare(frame.points, frame.T_odom_body, frame.stamp, drift.variances)
         witness.add(prepared.stamp, prepared.cloud, prepared.scan, prepared.T_odom_raw)
         accused = witness.while_searching(drift)
-        return None if accused is None else (accused.cause.value, accused.sentence)
+        return None if accused is None else (accused.cause.value, accused.sentence, witness.faults.sensors)
 
     return watched, lambda: frames.calibration

@@ -123,6 +123,11 @@ class Localizer(SavedState):
         ground, changed = self._tracker.ground.metres, self._tracker.change.metres
         return replace(self._frames.calibration, ground=ground, changed=changed)
 
+    @property
+    def sensor_fault(self) -> float:
+        """Probability that clouds or odometry have a fault, by the newest comparison."""
+        return 1.0 if self._frames.conventions.finding is not None else self._witness.faults.sensors
+
     def prepare(self) -> None:
         """Do the work that the first search and the first registrations would wait for: some seconds, once.
 

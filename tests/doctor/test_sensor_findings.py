@@ -15,6 +15,7 @@ from coview_stream.clouds.reference_system import FOOT
 from coview_stream.config import LocalizerConfig
 from coview_stream.doctor import map_checks
 from coview_stream.doctor.map_checks import place_finding, run_findings
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.recordings.run import Run
 
 BEGIN = 18  # frame of the fault
@@ -91,3 +92,13 @@ def test_large_map_is_not_built_again_in_metres(in_feet, monkeypatch):
     finding = place_finding(run, base_map, LocalizerConfig())
     assert finding.found.startswith("none on this map after")
     assert "(feet were not tried: " in finding.remedy
+
+
+@pytest.mark.parametrize("probability", [0.02, 0.98])
+def test_fault_that_is_less_probable_than_none_fails_no_run(way, monkeypatch, probability):
+    """Poses are withheld at one in a thousand; of many frames one reaches that by chance."""
+    told = iter([None] * 5 + [("mixed", "clouds do not fit each other", probability)])
+    monkeypatch.setattr(map_checks, "_judge", lambda *_: ((lambda frame: next(told, None)), Calibration))
+    run = run_of(way.clouds, way.T_odom_body)
+    (found, *_) = map_checks.sensor_findings(run, None, LocalizerConfig())
+    assert (found.what, found.verdict) == ("sensors", "FAIL" if probability > 0.5 else "ok")

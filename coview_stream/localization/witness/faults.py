@@ -191,6 +191,11 @@ class FaultPosterior:
         """Probability that odometry is wrong, and the lidar right."""
         return self.slip + sum(h.weight for h in self.scaled)
 
+    @property
+    def sensors(self) -> float:
+        """Probability that a fault of the clouds, their stamps or odometry's goes on."""
+        return 1.0 - self.good - self.odometry
+
     def add(self, step: Step) -> None:
         """Move the probabilities over a step (see the module)."""
         o, dt = step.odometry.motion, step.seconds
