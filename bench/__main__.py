@@ -42,7 +42,6 @@ class Benchmark(NamedTuple):
 _BOTH, _ANY = (1, 2), (None,)
 
 BENCHMARKS = {
-    "libraries": Benchmark("speed.libraries", "quadrants beside Taichi and NumPy; prepared launches", (1,)),
     "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH),
     "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY),
     "search": Benchmark("speed.search", "a step of the whole search"),

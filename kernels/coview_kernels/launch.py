@@ -3,7 +3,7 @@
 A call of a kernel costs 15 us in quadrants 1.3 and 36 in Taichi 1.7, and 5 to 20 us more for each argument (measured):
 types are looked up, checked and converted every time. A :class:`Launch` sets the arguments once and afterwards costs
 4 us, plus 3 for an array that changes. Without it a filter of 20,000 points takes 1.7 times as long, an alignment of
-1,500 points 1.4 times, a small call 5 times (``python -m bench libraries``). It uses the library's own launch context,
+1,500 points 1.4 times, a small call 5 times (commit 731ba9db, bench/speed). It uses the library's own launch context,
 which is not public, so only that of the versions that it has been tested with; elsewhere it calls the kernel.
 """
 

@@ -1,7 +1,7 @@
 """Start, choice and end of the backend, in the only module that imports quadrants (or Taichi, which it is a fork of).
 
 "Taichi" stands for either, here and elsewhere: both compile the same source. Quadrants comes first: it needs no system
-library but libc, and starts in half the time (``python -m bench libraries``).
+library but libc, and starts in half the time (commit 731ba9db, bench/speed).
 
 Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
 launched on the same thread, and concurrent launches fail now and then. One daemon thread owns it and takes calls from

@@ -4,7 +4,7 @@ Descriptors are compared by the cosines of their columns (sectors). A turn by n 
 are one circular correlation per ring, i.e. a product per frequency, summed over the rings, and one inverse FFT. BLAS
 does the product at the speed of memory; a Taichi version was several times slower, so NumPy serves every backend.
 
-One query, 9,527 candidates of 20 x 60, two shared cores: ``python -m bench libraries``
+One query, 9,527 candidates of 20 x 60, two shared cores (commit 731ba9db, bench/speed):
 
 =============================================  ========
 BLAS per frequency + irfft (here)              3 to 5 ms
