@@ -80,7 +80,8 @@ class SearchRequests:
             each._replace(submap=thinned(each.submap, each.T_odom_body[:3, 3], config)) for each in request.earlier
         )
         submap = thinned(request.submap, request.position, config)
-        return replace(request, submap=submap, earlier=tuple(earlier))
+        prior = self._frames.estimator.lean_prior
+        return replace(request, submap=submap, earlier=tuple(earlier), lean_prior=prior)
 
     def guess(self, guess: PlaceGuess) -> None:
         """Try a guess of the place; a circle that comes, goes or changes begins an epoch."""

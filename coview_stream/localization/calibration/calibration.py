@@ -260,6 +260,21 @@ class Calibration:
         }
 
 
+LEVEL = math.radians(0.5)
+"""Radians by which a scan may lean and still be read as level: 0.15 m, the tolerance of ground, at 17 m."""
+
+
+def lean_prior(lean: float, sigma: float) -> float:
+    """Return the log-probability of a lean that was chosen to fit, of a sensor that leans by ``sigma`` on each axis.
+
+    It is that of all leans within :data:`LEVEL`, as scans do not tell them apart; 0 for a lean that is less.
+    """
+    if lean < LEVEL:
+        return 0.0
+    spread = math.hypot(sigma, LEVEL)
+    return 2.0 * math.log(LEVEL / spread) - 0.5 * (lean / spread) ** 2
+
+
 class RawScan:
     """Points of a frame in the sensor's axes, with the frame's odometry; levelled when they are read.
 

@@ -34,6 +34,7 @@ from coview_stream.localization.calibration.calibration import (
     HEADING_TOLERANCE,
     LEVER_TOLERANCE,
     Calibration,
+    lean_prior,
 )
 from coview_stream.localization.calibration.delay_search import DELAYS, RESOLUTION, DelaySearch, SeenMotion
 from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
@@ -217,8 +218,12 @@ class CalibrationBelief:
         self.P[:2] *= wider
         self.P[:, :2] *= wider
 
-    def update(self, measured: Floats, H: Floats, R: Floats) -> float:
-        """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood."""
+    def update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> float:
+        """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood.
+
+        It tells nothing unless it is ``right``, by a probability: the gain is as much smaller.
+        """
+        R = R / right + (1.0 / right - 1.0) * H @ self.P @ H.T
         gap = measured - H @ self.x
         distance = float(gap @ np.linalg.solve(H @ self.P @ H.T + R, gap))
         R = R * heavier(distance, len(gap))
@@ -326,6 +331,14 @@ class CalibrationEstimator:
         self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
         self._probability = 0.0  # that the leading place is right
         self._apply()
+
+    @property
+    def lean_prior(self) -> float:
+        """Log-probability of the applied lean where a place that only leads a search has told it, else 0."""
+        if self._supposed is None:
+            return 0.0
+        known = self._known.applied()
+        return lean_prior(self.calibration.leans_from(known), known.sigma_tilt)
 
     def learn(self, earlier: Calibration, same_run: bool = False) -> None:
         """Take over the components of an earlier calibration that have a smaller sigma than the present ones.
@@ -468,8 +481,8 @@ class CalibrationEstimator:
         self._update(gap + J @ _motion_part(applied), H, noise + bent**2)
 
     def measure_frames(
-        self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float,
-        moments: Moments = (None, None),
+        self, motion: Pose, step: Pose, variances: Floats, sigmas: Floats, moments: Moments = (None, None),
+        right: float = 1.0,
     ) -> Pose:  # fmt: skip
         """Add a motion between frames measured by the lidar alone (eq. C4); return ``step``, newly corrected.
 
@@ -477,9 +490,9 @@ class CalibrationEstimator:
             motion: (4, 4) of the levelled body.
             step: (4, 4) odometry's motion, corrected by the calibration of its time.
             variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
-            position: sigma of ``motion``, metres.
-            angle: sigma of ``motion``, radians.
+            sigmas: (6,) of ``motion``, (rx, ry, rz, x, y, z).
             moments: as of :meth:`measure_motion`.
+            right: probability that ``motion`` is no failed registration.
         """
         t, before = step[:3, 3], self.calibration
         applied = np.array([before.roll, before.pitch])
@@ -488,19 +501,19 @@ class CalibrationEstimator:
         H = np.zeros((1, SIZE))
         H[0, :2] = -t[1], t[0]
         rise = np.array([motion[2, 3] - t[2] + H[0, :2] @ applied])
-        self._update(rise, H, np.array([[variances[5] + position**2]]))
+        self._update(rise, H, np.array([[variances[5] + sigmas[5] ** 2]]), right)
         H = np.zeros((2, SIZE))
         H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # the lidar's heading, which is better than odometry's
-        self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
-        noise = np.diag(variances[[3, 4, 2]] + np.array([position, position, angle]) ** 2)
+        self._update(turned[:2] + H[:, :2] @ applied, H, np.diag(variances[:2] + (_LEAN * sigmas[:2]) ** 2), right)
+        noise = np.diag(variances[[3, 4, 2]] + sigmas[[3, 4, 2]] ** 2 / right)
         level = self.calibration.T_body_cloud @ inverse(before.T_body_cloud)
         return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, moments)
 
-    def _update(self, measured: Floats, H: Floats, R: Floats) -> None:
-        """Add a measurement ``measured`` = H x + noise of covariance R to both beliefs."""
-        likelihood = self._known.update(measured, H, R)
+    def _update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> None:
+        """Add a measurement to both beliefs, as :meth:`CalibrationBelief.update`."""
+        likelihood = self._known.update(measured, H, R, right)
         if self._supposed is not None:
-            ratio = self._supposed.update(measured, H, R) - likelihood
+            ratio = self._supposed.update(measured, H, R, right) - likelihood
             right = self._probability * math.exp(min(ratio, 50.0))
             self._probability = right / (right + 1.0 - self._probability)
         self._apply()

@@ -28,6 +28,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
+from coview_stream.localization.registration.register import registration_covariance, remove_prior
 from coview_stream.localization.registration.surfaces import (
     LONGEST,
     motion_prior,
@@ -89,17 +90,20 @@ class FrameMotion:
         """
         reference = self._reference
         if reference is not None:
-            T_registered = self._registered(reference, points, T_odom_body, estimator)
-            if T_registered is not None:
+            seen = self._registered(reference, points, T_odom_body, estimator)
+            if seen is not None:
                 both = reference.moment, moment
-                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, T_registered, estimator, drift, both)
+                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, seen, estimator, drift, both)
         self._reference = _Reference(*surface_points(points), T_odom_body, moment)
         return T_odom_body
 
     def _registered(
         self, reference: _Reference, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator
-    ) -> Pose | None:
-        """Return the registered pose (4, 4), odometry <- body; None if the frames cannot be registered."""
+    ) -> tuple[Pose, Floats] | None:
+        """Return the registered pose (4, 4), odometry <- body, and its covariance; None if registration fails.
+
+        The covariance (6, 6) is over (rx, ry, rz, x, y, z), odometry's axes, of the pairs alone.
+        """
         far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
         if len(reference.points) < MIN_PAIRS or far > LONGEST:
             return None
@@ -114,28 +118,37 @@ class FrameMotion:
             return None
         prior = motion_prior(np.eye(4), far)
         registration = register_to_cloud(scan, target, prior, self._config, T_odom_body[:3, 3])
-        return None if registration is None else registration.T_map_source @ T_odom_body
+        if registration is None:
+            return None
+        T = registration.T_map_source @ T_odom_body
+        about_body = prior._replace(T_map_source=T_odom_body)
+        information = remove_prior(registration._replace(T_map_source=T), about_body, self._config)[1]
+        return T, registration_covariance(information, self._config)
 
 
 def _corrected(
-    before: Pose, T_odom_body: Pose, T_registered: Pose, estimator: CalibrationEstimator, drift: Variances,
+    before: Pose, T_odom_body: Pose, seen: tuple[Pose, Floats], estimator: CalibrationEstimator, drift: Variances,
     moments: Moments,
 ) -> Pose:  # fmt: skip
     """Give the estimator a registered motion from ``before`` (4, 4); return the newest odometry (4, 4), fused."""
+    T_registered, covariance = seen
     level = estimator.calibration.T_body_cloud
     motion, step = inverse(before) @ T_registered, inverse(before) @ T_odom_body
     far = float(np.linalg.norm(step[:3, 3]))
     variances = drift(far, abs(yaw_of(step)))
+    R = before[:3, :3].T
+    turned = np.block([[R, np.zeros((3, 3))], [np.zeros((3, 3)), R]])
     position, angle = motion_sigmas(far)
-    right = _probability_right(motion, step, variances, estimator.calibration)
-    sigmas = position / math.sqrt(right), angle / math.sqrt(right)
-    step = estimator.measure_frames(motion, step, variances, *sigmas, moments)
+    least = np.array([angle] * 3 + [position] * 3)
+    sigmas, there = (np.sqrt(least**2 + np.diag(C)) for C in (turned @ covariance @ turned.T, covariance))
+    right = _probability_right(motion, step, variances, sigmas, estimator.calibration)
+    step = estimator.measure_frames(motion, step, variances, sigmas, moments, right)
     turn = estimator.calibration.T_body_cloud @ inverse(level)
     motion = turn @ motion @ inverse(turn)
-    return _fused(before @ step, before @ motion, variances, *sigmas)
+    return _fused(before @ step, before @ motion, variances, there / math.sqrt(right))
 
 
-def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration: Calibration) -> float:
+def _probability_right(motion: Pose, step: Pose, variances: Floats, noise: Floats, calibration: Calibration) -> float:
     """Return the probability that a registration succeeded, by its difference from odometry's ``step``.
 
     A failed one (a street looks alike along its length, a lorry drives away) may end anywhere within its reach.
@@ -144,8 +157,6 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration:
     gap = np.concatenate([log_so3(motion[:3, :3] @ step[:3, :3].T), motion[:3, 3] - step[:3, 3]])
     tilt, sigma = calibration.sigma_tilt * far, calibration.sigma_heading
     constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, sigma * far, tilt])
-    position, angle = motion_sigmas(far)
-    noise = np.array([angle] * 3 + [position] * 3)
     right = _POORER**2 * variances + constant**2 + noise**2
     turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that shows in rotation
     right[:2] += (calibration.sigma_tilt * turn) ** 2
@@ -156,14 +167,17 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, calibration:
     return max(1.0 / (1.0 + math.exp(min(ratio, 50.0))), 1e-6)
 
 
-def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, position: float, angle: float) -> Pose:
-    """Return odometry's pose (4, 4), moved and turned about the vertical towards the lidar's by their variances."""
+def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, sigmas: Floats) -> Pose:
+    """Return odometry's pose (4, 4), moved and turned about the vertical towards the lidar's by their variances.
+
+    ``sigmas`` (6,) of the lidar's, (rx, ry, rz, x, y, z).
+    """
     moved = T_odometry.copy()
     for axis in range(3):
         gap = float(T_seen[axis, 3] - T_odometry[axis, 3])
-        moved[axis, 3] += _share(gap, float(variances[3 + axis]), position**2) * gap
+        moved[axis, 3] += _share(gap, float(variances[3 + axis]), float(sigmas[3 + axis] ** 2)) * gap
     turn = float(log_so3(T_seen[:3, :3] @ T_odometry[:3, :3].T)[2])
-    moved[:3, :3] = rot_z(_share(turn, float(variances[2]), angle**2) * turn) @ T_odometry[:3, :3]
+    moved[:3, :3] = rot_z(_share(turn, float(variances[2]), float(sigmas[2] ** 2)) * turn) @ T_odometry[:3, :3]
     return moved
 
 

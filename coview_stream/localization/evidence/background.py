@@ -30,8 +30,6 @@ _CALIBRATED = 1.75
 below e in less than a share e of them (``python -m bench.integrity.calibrate``)."""
 OPEN = 0.01
 """Share of places that are as clear of structure and as level as the right one, presumed: open roads."""
-PRESUMED = 1.0 / OPEN
-"""Chance places that the presumed share counts as: one of them is open."""
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
 _TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure

@@ -13,7 +13,8 @@ their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that ex
 as q >= 0. Points outside the survey add nothing; a rival that covers them gains.
 
 The ground counts as one observation, as a road is level everywhere: its share is compared with the Beta distribution of
-the chance places' shares. Some chance places are as clear and level as the right one (:func:`open_shares`).
+the chance places' shares. Some chance places are as clear and level as the right one
+(:mod:`coview_stream.localization.evidence.open_places`).
 
 The prior is even between "one of these places" and "none of these" (outside the map, a wrong map, a rearranged site),
 and falls with a place's rank in the votes. Likelihoods are against chance, so "none of these" has the likelihood 1.
@@ -29,7 +30,7 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.distributions import log_beta
-from coview_stream.localization.evidence.background import OPEN, PRESUMED, Background, outcomes
+from coview_stream.localization.evidence.background import Background, outcomes
 from coview_stream.localization.evidence.observation import Share
 
 KEPT = np.linspace(0.05, 1.0, 20)  # shares q
@@ -86,21 +87,12 @@ def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     q = KEPT[:, None, None]
     explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
     structure = np.einsum("pc,qdc->pqd", counts, np.log(explained / background.structure)) * background.number[0]
-    rest = _clear_and_level(observed, background)
+    rest = clear_and_level(observed, background)
     rest -= np.logaddexp(np.log1p(-background.open), np.log(background.open) + rest)  # a chance place may be open, too
     return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
 
 
-def open_shares(chance: Floats32, background: Background) -> Floats:
-    """Return the probability (Q, L) that a chance place is as clear and level as the right one, by the nuisances.
-
-    It is the mean responsibility of open places at the chance places (P, 7), and of :data:`PRESUMED` more.
-    """
-    odds = OPEN * np.exp(np.minimum(_clear_and_level(chance, background), 500.0))
-    return np.asarray(((odds / (1.0 - OPEN + odds)).sum(axis=0) + OPEN * PRESUMED) / (len(chance) + PRESUMED))
-
-
-def _clear_and_level(observed: Floats32, background: Background) -> Floats:
+def clear_and_level(observed: Floats32, background: Background) -> Floats:
     """Return log-likelihood ratios (P, Q, L) of free space and ground against a chance place that is not open."""
     passed = background.passed * (KEPT[:, None] * _LEAKS + 1.0 - KEPT[:, None])  # (Q, L)
     hit = observed[:, Share.PASSED].astype(np.float64)

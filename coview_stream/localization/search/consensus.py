@@ -57,6 +57,12 @@ class Hypothesis:
     registration: Registration | None = None
     evidence: Evidence | None = None
 
+    def after(self, T_other_odom: Pose) -> Hypothesis:
+        """Return the hypothesis of the odometry frame, from one of another (4, 4) that it has been turned into."""
+        T = self.T_map_odom @ T_other_odom
+        registration = None if self.registration is None else self.registration._replace(T_map_source=T)
+        return replace(self, T_map_odom=T, registration=registration)
+
 
 class Vote(Protocol):
     """One keyframe's scores of the stations at every shift; shift n means yaw -2 pi n / ``sectors`` (eq. 9)."""

@@ -12,6 +12,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, yaw_of
+from coview_stream.localization.calibration.calibration import lean_prior
 from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
@@ -25,10 +26,7 @@ from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANC
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # poses of a guess that are tried at a keyframe
-
-
-_LEVEL = math.radians(0.5)
-"""Radians by which a scan may lean and still be read as level: 0.15 m, the field's tolerance of ground, at 17 m."""
+_STREET = 12.0  # metres from the leader: the farthest hypothesis beside it, moved as far as it may be
 
 
 @dataclass(frozen=True)
@@ -131,35 +129,43 @@ class GlobalSearch:
         """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
         if request.epoch != self._epoch:
             self._begin(request)
-        scan = self._observed(request)
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
-        guessed = self._guessed(request, scan)
+        guessed = self._guessed(request)
         voted, ranks = [*voted, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
-        hypotheses, first = [*voted, *hints], not self._scorer.scans
-        scored = self._scorer.score(hypotheses, ranks, len(hints), scan)  # against chance, all keyframes
+        hypotheses, first, scan = [*voted, *hints], not self._scorer.scans, self._observed(request)
+        scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
-        self._note_hints(scored, hints, request)
-        reading, scans = Reading(request, scan, scored, leader), self._scorer.scans
+        reading = Reading(request, scan, scored, leader)
         if first and leader is not None and scored.error >= self.config.acceptance.risk:
             reading = self._leaning(reading, leader, hypotheses, ranks, len(hints)) or reading
-            scans = [reading.scan]
+        self._note_hints(reading.scored, hints, request)
+        result = self._decide(reading)
+        if result.accepted is not None:
+            self.clear()
+        return replace(result, considered=Considered.of(reading.scored, request, self.base_map.origin))
+
+    def _decide(self, reading: Reading) -> SearchResult:
+        """Decide about a keyframe's first place by its rivals along the street, its modes, and parts that moved."""
         request, scan, scored, leader = reading.request, reading.scan, reading.scored, reading.leader
         undecided = 0.0
-        if leader is not None and scored.error < self.config.acceptance.risk:
-            place = scored.places[0]
-            modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
-            leader, undecided = modes.best, modes.undecided
-        if leader is not None and scored.error < 0.5:  # a stated error that is not acted on has to be true as well
-            scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
+        if leader is not None:
+            scored = self._gathered(scored, leader, scan, request)
+            if scored.error < self.config.acceptance.risk:
+                place = scored.places[0]
+                modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
+                leader, undecided = modes.best, modes.undecided
+            if scored.error < 0.5:  # a stated error that is not acted on has to be true as well
+                scans = [*self._scorer.scans[:-1], scan]
+                scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
         if leader is not None:
             level = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
             result = replace(result, leader=level @ reading.turn)
         if result.accepted is not None:
-            self.clear()
-        return replace(result, considered=Considered.of(scored, request, self.base_map.origin))
+            result = replace(result, accepted=result.accepted.after(reading.turn))
+        return result
 
     def _leaning(
         self, upright: Reading, leader: Hypothesis, hypotheses: list[Hypothesis], ranks: list[int], hints: int
@@ -172,15 +178,14 @@ class GlobalSearch:
         request, T_odom_body = upright.request, upright.request.T_odom_body
         seen = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
         R = rot_z(-yaw_of(seen)) @ seen[:3, :3]
-        lean, sigma = tilt_of(seen), math.hypot(request.calibration.sigma_tilt, _LEVEL)
-        if lean < _LEVEL:
+        prior = lean_prior(tilt_of(seen), request.calibration.sigma_tilt)
+        if prior == 0.0:
             return None
-        prior = 2.0 * math.log(_LEVEL / sigma) - 0.5 * (lean / sigma) ** 2
         turned = request.turned(R)
         scan = self._observed(turned)
         scorer = PlaceScorer(self.base_map)
         scorer.starts = self._scorer.starts
-        scored = scorer.score(hypotheses, ranks, hints, scan, prior)
+        scored = scorer.score(hypotheses, ranks, hints, scan, prior + request.lean_prior)
         found = self._register(scored, scan, turned)
         if found is None or not same_place(found.T_map_odom, leader.T_map_odom, turned, BASIN_DISTANCE, BASIN_ANGLE):
             return None
@@ -210,7 +215,7 @@ class GlobalSearch:
         ranked = [(place, rank) for r in self._recognizers for rank, place in enumerate(r.hypotheses())]
         return [place for place, _ in ranked], [rank for _, rank in ranked]
 
-    def _guessed(self, request: SearchRequest, scan: ObservedScan) -> list[Hypothesis]:
+    def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
         """Return the best few poses of a guess, on the ground, each time that they are due.
 
         All poses around one place would be taken for the chance places of this map.
@@ -223,6 +228,7 @@ class GlobalSearch:
         guesses = on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
         if len(guesses) <= _GUESSES:
             return guesses
+        scan = self._observed(request)
         poses = scan.poses(np.array([guess.T_map_odom for guess in guesses]))
         scores = scan.few.look_up(self.base_map.field, poses, Move.FAR).scores
         return [guesses[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
@@ -236,6 +242,28 @@ class GlobalSearch:
         if leader is None or not same_place(leader.T_map_odom, best.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
             return None
         return leader
+
+    def _gathered(self, scored: Scored, leader: Hypothesis, scan: ObservedScan, request: SearchRequest) -> Scored:
+        """Count rivals along the leader's street as the leader where registration leads them there.
+
+        The field tells poses a few metres along a street hardly apart; points against surfaces do. Only where that may
+        lead to an acceptance.
+        """
+
+        def around(place: Hypothesis, distance: float) -> bool:
+            return same_place(place.T_map_odom, leader.T_map_odom, request, distance, BASIN_ANGLE)
+
+        risk, error = self.config.acceptance.risk, scored.error
+        near = [place for place in scored.places[1:] if around(place, _STREET) and not around(place, BASIN_DISTANCE)]
+        if error < risk or error - sum(place.probability for place in near) >= risk:
+            return scored
+        for place in near[:_GUESSES]:
+            found = register_place(
+                place, scan, self.base_map, self.config, self._local_maps, widest=self.config.registration.search[0]
+            )
+            if found is not None and around(found, BASIN_DISTANCE):
+                error -= place.probability
+        return replace(scored, error=max(error, scored.none))
 
     def _note_hints(self, scored: Scored, hints: list[Hypothesis], request: SearchRequest) -> None:
         """Note whether the keyframe spoke against the hints that it tried."""

@@ -70,14 +70,15 @@ class Modes:
 
 def register_place(
     place: Hypothesis, scan: ObservedScan, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps,
-    start: Pose | None = None,
+    start: Pose | None = None, widest: float = _WIDEST,
 ) -> Hypothesis | None:  # fmt: skip
     """Register a scan at a place; None off the map, with too few pairs, or if the result leans.
 
-    Registration starts at ``start`` (4, 4), a ``T_map_odom``, by default the place's.
+    Registration starts at ``start`` (4, 4), a ``T_map_odom``, by default the place's, with correspondences up to
+    ``widest`` metres long.
     """
     settings, T = config.registration, place.T_map_odom if start is None else start
-    scales = tuple(scale for scale in settings.search if scale <= _WIDEST) or settings.search[-1:]
+    scales = tuple(scale for scale in settings.search if scale <= widest) or settings.search[-1:]
     target = local_maps.around(transform(T, scan.body[None])[0])
     if target is None:
         return None

@@ -75,6 +75,7 @@ class SearchRequest:
         calibration: has levelled ``cloud``.
         area: the only part of the map to search, metres from its zero; None for all of it.
         earlier: keyframes that the search goes on with, oldest first, where clouds were levelled anew.
+        lean_prior: log-probability of the lean that levels the clouds, where it was chosen to fit a leading place.
     """
 
     stamp: float
@@ -90,6 +91,7 @@ class SearchRequest:
     calibration: Calibration = field(default_factory=Calibration)
     area: Circle | None = None
     earlier: tuple[EarlierKeyframe, ...] = ()
+    lean_prior: float = 0.0
 
     @property
     def position(self) -> Floats:

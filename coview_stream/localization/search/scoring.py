@@ -19,14 +19,10 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
-from coview_stream.localization.evidence.likelihood import (
-    expected_by_chance,
-    log_likelihood_ratios,
-    open_shares,
-    posterior,
-)  # fmt: skip
+from coview_stream.localization.evidence.likelihood import expected_by_chance, log_likelihood_ratios, posterior
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
+from coview_stream.localization.evidence.open_places import OpenPlaces
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
@@ -37,6 +33,7 @@ _KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones
 _NEWEST = 8  # keyframes that are searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
+_SIGHT = 35.0  # metres from the leader within which places have its ground and its free space in common
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
 
@@ -167,6 +164,7 @@ class PlaceScorer:
     def __init__(self, base_map: BaseMap) -> None:
         """Score by a map's likelihood field, which is loaded at the first keyframe."""
         self._base_map = base_map
+        self._open = OpenPlaces(base_map.stations)
         self.clear()
 
     @property
@@ -177,6 +175,7 @@ class PlaceScorer:
     def clear(self) -> None:
         """Forget all places, keyframes and starts."""
         self.starts = 1
+        self._open.clear()
         self._followed = _Followed.none()
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
@@ -320,18 +319,23 @@ class PlaceScorer:
         most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, distant = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
+        elsewhere = chance
         self._scatter.append(scatter(observed.shares[first]))
+        stations = [-1 if place.station is None else place.station for place in followed.hypotheses]
+        above = (poses[:, 2] - self._base_map.stations[stations, 2])[np.array(stations) >= 0]
+        self._open.look(self._base_map.field, scan.few, float(np.median(above)) if len(above) else 0.0)
         sample, over_time = self._over_time(observed, first, scan)
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             spread = np.mean(measured, axis=0) * left_in_mean(over_time[chance[sample]])
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
-            background = replace(background, open=open_shares(now, background))
+            background = replace(background, open=self._open.share(observed.shares[first][elsewhere], background))
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
+            elsewhere = _apart(places, leader, _SIGHT, np.pi)
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])

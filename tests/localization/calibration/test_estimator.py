@@ -8,8 +8,8 @@ from se3 import exp_se3
 
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
-from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.calibration import LEVEL, Calibration
+from coview_stream.localization.calibration.estimator import SIZE, CalibrationBelief, CalibrationEstimator
 from coview_stream.localization.frame import OdometryCorrection
 
 NOISE = np.diag([0.02**2, 0.02**2, np.radians(0.1) ** 2])  # along the way, across, of the heading
@@ -146,6 +146,28 @@ def test_motion_from_frame_to_frame_refutes_a_supposed_lean():
     for _ in range(8):
         level = pose_from(estimator.calibration.R_body_cloud, np.zeros(3))
         motion = level @ step @ np.linalg.inv(level)
-        estimator.measure_frames(motion, step, np.full(6, 1e-5), 0.02, np.radians(0.2))
+        estimator.measure_frames(motion, step, np.full(6, 1e-5), np.array([*np.radians([0.2] * 3), 0.02, 0.02, 0.02]))
     assert before > np.radians(3.0)
     assert abs(estimator.calibration.pitch) < np.radians(0.5)
+
+
+def test_measurement_that_may_be_wrong_moves_the_belief_as_much_less():
+    H, R, gap = np.eye(1, SIZE), np.array([[np.radians(0.5) ** 2]]), np.radians([1.0])
+    moved = []
+    for right in (1.0, 0.25):
+        belief = CalibrationBelief(sensor_leans=True)
+        belief.update(gap, H, R, right)
+        moved.append(belief.x[0])
+    assert moved[1] == pytest.approx(0.25 * moved[0], rel=0.05)
+
+
+def test_lean_that_a_leading_place_has_told_costs_its_probability():
+    estimator = CalibrationEstimator()
+    assert estimator.lean_prior == 0.0
+    T = pose_from(exp_so3(np.radians([0.0, 4.0, 0.0])), np.zeros(3))
+    estimator.suppose_attitude(T, np.eye(4), np.radians(0.3) ** 2, 0.99)
+    spread = np.hypot(CalibrationEstimator().calibration.sigma_tilt, LEVEL)
+    lean = estimator.calibration.leans_from(Calibration())
+    assert estimator.lean_prior == pytest.approx(2 * np.log(LEVEL / spread) - 0.5 * (lean / spread) ** 2)
+    estimator.forget_leader()
+    assert estimator.lean_prior == 0.0

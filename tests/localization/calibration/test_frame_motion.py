@@ -17,13 +17,17 @@ DRIFT = Drift.of(TrackingConfig()).variances
 STEPS = [pose_from(rot_z(0.1 * k), [4.0 * k - 12.0, -12.0 + 0.5 * k, 1.7]) for k in range(6)]
 
 
-def compare(odometry, lean=(0.0, 0.0), poses=STEPS):
-    """Feed a robot's frames, its sensor leaning by ``lean`` degrees; return the estimator and the mended odometry."""
+def compare(odometry, lean=(0.0, 0.0), poses=STEPS, lowest=-np.inf):
+    """Feed a robot's frames, its sensor leaning by ``lean`` degrees; return the estimator and the mended odometry.
+
+    Points below ``lowest`` metres, of the body, are not seen.
+    """
     scene, R = boxes(3), exp_so3(np.radians([*lean, 0.0]))
     motion, estimator = FrameMotion(LocalizerConfig().registration, 2.0), CalibrationEstimator()
     mended, correction = [], OdometryCorrection()
     for k, (T_map_body, T) in enumerate(zip(poses, odometry, strict=True)):
         cloud = scan(scene, T_map_body, k)[::3]
+        cloud = cloud[cloud[:, 2] > lowest]
         T_odom_body = correction.correct(T, estimator.calibration)
         assert motion.is_due(T_odom_body)
         T_odom_body = motion.refine((cloud @ R.T).astype(np.float32), T_odom_body, estimator, DRIFT)
@@ -69,6 +73,14 @@ def test_heading_that_drifts_is_mended():
         return abs(np.degrees(np.arctan2(turned[1, 0], turned[0, 0])))
 
     assert heading(mended) < 0.6 * heading(odometry)
+
+
+def test_walls_alone_do_not_show_a_climb():
+    """The height between two frames is open where no ground is in sight: a wrong start is no lean of the sensor."""
+    climbing = [pose_from(T[:3, :3], T[:3, 3] + [0.0, 0.0, 0.3 * k]) for k, T in enumerate(STEPS)]
+    with_ground, walls = (compare(climbing, lowest=lowest)[0].calibration for lowest in (-np.inf, -1.2))
+    assert abs(np.degrees(walls.pitch)) < 0.5 * abs(np.degrees(with_ground.pitch))
+    assert walls.sigma_tilt > 1.2 * with_ground.sigma_tilt
 
 
 def test_frames_that_have_nothing_to_do_with_each_other_change_little():

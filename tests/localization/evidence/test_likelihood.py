@@ -31,10 +31,10 @@ from coview_stream.localization.evidence.likelihood import (
     expected_by_chance,
     log_likelihood_ratios,
     nuisance_prior,
-    open_shares,
     posterior,
 )
 from coview_stream.localization.evidence.observation import Share
+from coview_stream.localization.evidence.open_places import OpenPlaces
 
 BACKGROUND = Background(CHANCE, PASSED, (1.5, 1.5), (30.0, 12.0))
 GOOD = np.array([0.75, 0.15, 0.04, 0.06])
@@ -145,23 +145,6 @@ def test_ground_is_one_observation_and_bounded(background):
     assert (np.diff(grounds) >= -1.0).all()
 
 
-def test_open_places_among_chance_make_another_open_one_worth_less():
-    """One in a hundred is presumed; chance places that are rough, or open, say more."""
-    known = Background(CHANCE, PASSED, (0.8, 8.0), (30.0, 60.0))
-    rough = observation(np.tile(CHANCE, (300, 1)), passed=PASSED, ground=0.05)
-    clear = observation(np.tile(CHANCE, (300, 1)), passed=0.0, ground=0.95)
-    assert open_shares(rough[:0], known) == pytest.approx(0.01)
-    assert open_shares(rough, known) == pytest.approx(1 / 400, rel=0.05)
-    some = open_shares(np.concatenate([rough[:285], clear[:15]]), known)
-    assert some == pytest.approx(16 / 400, rel=0.01)
-    few, usual, many = (
-        ratio([GOOD], passed=0.0, ground=0.95, background=replace(known, open=share))[0]
-        for share in (open_shares(rough, known), 0.01, some)
-    )
-    assert few > usual + 1.0
-    assert many < usual - 1.0
-
-
 def test_few_explained_points_of_a_changed_site_are_worth_something():
     """A third of what stands is as the map has it, the rest is as by chance."""
     changed = 0.35 * GOOD + 0.65 * CHANCE
@@ -239,22 +222,24 @@ ERRORS = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4)
 PLACES = 250  # of a search
 
 
-def smallest_error(places, rng, times=1.0):
+def smallest_error(places, stations, rng, times=1.0):
     """Smallest error that a search states at any keyframe, of places (P, W, 7), as :class:`PlaceScorer` has it.
 
-    Each observation is counted ``times``.
+    Each observation is counted ``times``. The ``stations`` (S, W, 7) are others.
     """
     count, keyframes, _ = places.shape
+    opened = OpenPlaces(np.empty((0, 3), dtype=np.float32))
     votes, spreads, smallest = rng.permutation(count), [], 1.0
     for k in range(keyframes):
         now, mean = places[:, k], places[:, : k + 1].mean(axis=1)
         others = np.ones(count, dtype=bool)
         spreads.append(scatter(now))
+        opened.add(stations[:, k])
         for last in (False, True):
             spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
             known = estimate_background(now[others], spread, mean[others])
             known = replace(known, number=(times * known.number[0], times * known.number[1]))
-            known = replace(known, open=open_shares(now[others], known))
+            known = replace(known, open=opened.share(now[others], known))
             ratios = log_likelihood_ratios(mean, known)
             if not last:  # the leader is not among what it is compared with
                 others = np.arange(count) != np.argmin(np.log1p(votes) - ratios)
@@ -267,7 +252,7 @@ def smallest_error(places, rng, times=1.0):
 def too_often(draw, searches, times=1.0):
     """Stated errors that chance reaches more often than they say, with the number of searches that do."""
     rng = np.random.default_rng(1)
-    errors = np.array([smallest_error(draw(rng), rng, times) for _ in range(searches)])
+    errors = np.array([smallest_error(draw(rng), draw(rng), rng, times) for _ in range(searches)])
     counts = {error: int((errors < error).sum()) for error in ERRORS}
     return {error: count for error, count in counts.items() if count > binom.ppf(0.999, searches, error)}
 

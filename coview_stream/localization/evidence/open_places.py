@@ -1,0 +1,72 @@
+"""Share of a map's places that are as clear of structure and as level as the right one: open roads, car parks, fields.
+
+Ground and free space of a scan agree with the map at the right place, and at every open place. How rare open places are
+decides how much that agreement is worth (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
+plain, as much as ten nats in hills. They are counted twice, and the larger share holds: among the places that the
+search scores, hundreds that votes have named, and among stations all over the map, thousands that nothing has chosen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import coview_kernels as kernels
+from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.localization.evidence.background import OPEN, Background
+from coview_stream.localization.evidence.likelihood import clear_and_level
+from coview_stream.localization.evidence.observation import ScanPart, Share
+
+_STATIONS = 4096  # that a keyframe is observed from: 20 ms of a search's step
+_MOST = 8 * _STATIONS  # stations of a search: rarer open places are not told from none
+_PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
+_STEPS = 8  # of expectation and maximization: each halves the error or better
+_SEED = 20240
+
+
+class OpenPlaces:
+    """Count of open places at stations all over a map, keyframe by keyframe."""
+
+    def __init__(self, stations: Floats32) -> None:
+        """Count at some of the ``stations`` (M, 3) of a map."""
+        self._stations = stations
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all counts."""
+        self._random = np.random.default_rng(_SEED)
+        self._count, self._open = 0, np.zeros((1, 1))  # stations; sum of their probabilities (Q, L)
+        self.add(np.empty((0, len(Share)), dtype=np.float32))
+
+    def look(self, field: kernels.FieldMap, part: ScanPart, height: float) -> None:
+        """Observe a map's ``field`` from random stations and headings, the body ``height`` metres above the station."""
+        if self._count >= _MOST or not len(self._stations):
+            return self.add(np.empty((0, len(Share)), dtype=np.float32))
+        at = self._stations[self._random.integers(len(self._stations), size=_STATIONS)].astype(np.float64)
+        heading = self._random.uniform(-np.pi, np.pi, _STATIONS)
+        poses = np.column_stack([at[:, :2], at[:, 2] + height, heading])
+        return self.add(part.look_up(field, poses, kernels.Move.NEAR).shares)
+
+    def add(self, observed: Floats32) -> None:
+        """Add a keyframe's observations (S, 7) at stations that nothing has chosen."""
+        self._newest, self._before = observed, (self._count, self._open)
+
+    def share(self, chance: Floats32, background: Background) -> Floats:
+        """Return the probability (Q, L) that a chance place is open, by the nuisances; ``chance`` (P, 7) are scored."""
+        scored, anywhere = _odds(chance, background), _odds(self._newest, background)
+        self._count = self._before[0] + len(anywhere)
+        share: Floats = np.full(scored.shape[1:], OPEN)
+        for _ in range(_STEPS):
+            self._open = self._before[1] + _probabilities(anywhere, share).sum(axis=0)
+            rate = (self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)
+            share = np.maximum(rate, _probabilities(scored, share).sum(axis=0) / (len(chance) + 1.0))  # one is not
+        return share
+
+
+def _odds(observed: Floats32, background: Background) -> Floats:
+    """Return likelihood ratios (P, Q, L) of open places to others at places with these observations (P, 7)."""
+    return np.asarray(np.exp(np.clip(clear_and_level(observed, background), -500.0, 500.0)))
+
+
+def _probabilities(odds: Floats, share: Floats) -> Floats:
+    """Return probabilities (P, Q, L) that places are open, where a ``share`` (Q, L) of all is."""
+    return np.asarray(share * odds / (1.0 - share + share * odds))

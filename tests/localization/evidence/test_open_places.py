@@ -1,0 +1,73 @@
+"""Open places: how rare they are, among scored places and all over a map, and what another one is worth then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_scans import CHANCE, PASSED, observation
+from trackers import observed
+
+from coview_stream.localization.evidence.background import Background
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.open_places import OpenPlaces
+
+KNOWN = Background(CHANCE, PASSED, (0.8, 8.0), (30.0, 60.0))
+ROUGH = observation(np.tile(CHANCE, (3900, 1)), passed=PASSED, ground=0.05)
+CLEAR = observation(np.tile(CHANCE, (300, 1)), passed=0.0, ground=0.95)
+NOWHERE = np.empty((0, 3), dtype=np.float32)
+
+
+def share(scored, *keyframes):
+    """The share by scored places, and by stations at each keyframe."""
+    places = OpenPlaces(NOWHERE)
+    for stations in keyframes:
+        places.add(stations)
+        found = places.share(scored, KNOWN)
+    return found
+
+
+def test_share_is_presumed_then_counted_over_the_keyframes():
+    assert share(ROUGH[:300], ROUGH[:0]) == pytest.approx(0.01)
+    assert share(ROUGH[:300], ROUGH) == pytest.approx(1 / 4000, rel=0.05)
+    assert share(ROUGH[:300], ROUGH, ROUGH) == pytest.approx(1 / 7900, rel=0.05)
+    assert share(ROUGH[:300], ROUGH, np.concatenate([ROUGH, CLEAR])) == pytest.approx(301 / 8200, rel=0.05)
+
+
+def test_scored_places_that_are_open_count_however_rare_others_are():
+    some = np.concatenate([ROUGH[:285], CLEAR[:15]])
+    assert share(some, ROUGH) == pytest.approx(15 / 300, rel=0.05)
+
+
+def test_the_same_background_asked_twice_counts_stations_once():
+    places = OpenPlaces(NOWHERE)
+    places.add(ROUGH)
+    once = places.share(ROUGH[:300], KNOWN)
+    np.testing.assert_array_equal(places.share(ROUGH[:300], KNOWN), once)
+    places.clear()
+    places.add(ROUGH[:0])
+    assert places.share(ROUGH[:300], KNOWN) == pytest.approx(0.01)
+
+
+def test_another_open_place_is_worth_as_much_as_open_places_are_rare():
+    few, usual, many = (
+        log_likelihood_ratios(CLEAR[:1], replace(KNOWN, open=found))[0]
+        for found in (share(ROUGH[:300], ROUGH), 0.01, share(CLEAR[:300], ROUGH))
+    )
+    assert few == pytest.approx(usual + np.log(40.0), abs=0.5)
+    assert many < 0.1
+
+
+def test_stations_of_a_level_site_are_open_to_a_robot_on_its_ground(world_map, world_drive):
+    """The small world is level; a robot that is held two metres above its place has the ground of none."""
+    scan, places = (
+        observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False),
+        OpenPlaces(world_map.stations),
+    )
+    level = world_drive.T_map_body[0][2, 3] - world_map.stations[0, 2]
+    places.look(world_map.field, scan.few, level)
+    found = places.share(ROUGH[:300], KNOWN)
+    places.clear()
+    places.look(world_map.field, scan.few, level + 40.0)
+    assert found.min() > 10.0 * places.share(ROUGH[:300], KNOWN).max()
