@@ -65,6 +65,8 @@ QUICK = {
     "overlap": "conditions --overlaps 35 --sets kitti04",
     **{f"ablation, {group}": f"ablation --only {group} --sites kitti04" for group in (*ABLATION, "spacing")},
     "protection": "protection --worlds 1",
+    "covariance": "covariance --sets kitti04",
+    "smooth": "smooth kitti04",
     "memory": "memory --km2 0.05",
     "fuzz": "fuzz --seconds 5",
     "soak": "soak --minutes 2",

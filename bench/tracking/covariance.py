@@ -51,7 +51,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for name in asked.sets:
         yield judge(name, USES.get(name, "held out"), _TRUTH.get(name, "as given"), real(RealSet(asked.data / name)))
     for family in FAMILIES.values():
-        for world, variant in family.worlds(1 if asked.quick else asked.worlds):
+        for world, variant in family.worlds(0 if asked.quick else asked.worlds):
             drive, label = measure(folder(), world, variant), f"{world.kind}-{world.sensor}-{world.seed}"
             twist, covariances = (np.array(drive[key], dtype=np.float64) for key in ("twist", "covariances"))
             found = figures(twist.reshape(-1, 6), covariances.reshape(-1, 6, 6))

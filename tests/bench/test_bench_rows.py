@@ -110,18 +110,17 @@ def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(mon
     old = (("a", "gone"), ("a, quick", "gone"), ("by hand", "kept"))
     parts = [results.block(name, "old", text, "2026-01-01", "abc1234") for name, text in old]
     page.write_text("# Mine\n" + "".join(parts))
-    monkeypatch.setattr(results, "COMMANDS", {"a": "a", "b": "b"})
+    monkeypatch.setattr(results, "COMMANDS", {"a": "a", "dirt": "b"})  # dirt is one that runs side by side
     monkeypatch.setattr(results, "fingerprint", lambda *parts: code[0])
-    monkeypatch.setattr(results, "SIDE_BY_SIDE", {"b"})
     monkeypatch.setattr(results, "measured", lambda name, threads: ran.append(name) or f"of {name}" * good[name])
 
     def release() -> int:
-        return results.main(["--work", str(tmp_path / "work"), "--page", str(page)], release=True)
+        return results.main(["--work", str(tmp_path / "work"), "--page", str(page), "--jobs", "1"], release=True)
 
     assert release() == 1
     out, err = capsys.readouterr()
-    assert "code 1: 1 of 2 tables; missing: b" in out
-    assert "code 1: 2 of 2 tables to make, about 0.1 h" in err
+    assert "code 1: 1 of 2 tables; missing: dirt" in out
+    assert "code 1: 2 of 2 tables to make, about 1.1 h" in err
     assert "gone" in page.read_text()
     good["b"] = True
     assert release() == 0
@@ -130,7 +129,7 @@ def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(mon
     assert "gone" not in page.read_text()
     assert page.read_text().endswith(parts[-1])
     assert ", code 1, 0.0 min\n\nof a\n" in page.read_text()
-    assert "1 of 2 tables to make, about 0.0 h" in capsys.readouterr().err
+    assert "1 of 2 tables to make, about 1.0 h" in capsys.readouterr().err
     code[0] = "2"
     assert release() == 0
     assert ran[3:] == ["b", "a"]

@@ -175,18 +175,17 @@ def test_a_site_without_a_map_costs_its_runs_and_is_made_again(tmp_path, monkeyp
     assert calls == [site[0]] * 2
 
 
-def test_a_site_is_made_once_by_processes_that_share_a_folder_and_not_after_the_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "map_of", lambda case: None)
-    monkeypatch.setattr(run, "Robot", lambda base: None)
-    monkeypatch.setattr(run, "drive_of", lambda case: None)
+def test_a_site_that_another_process_makes_is_not_made_again_nor_one_after_the_time(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(run, "map_of", lambda case: calls.append(case) or 1 / 0)
     site = plan("surveys", 2)[0]
     assert run.on_site(site, tmp_path, "a", until=0.0) == ([], False)
     with (tmp_path / f"{site[0].kind}-{site[0].seed}.busy").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert run.on_site(site, tmp_path, "a") == ([], False)
-    results, new = run.on_site(site, tmp_path, "a")
-    assert ([each["outcome"] for each in results], new) == (["no way"] * 2, True)
-    assert run.on_site(site, tmp_path, "a", until=0.0) == (results, False)
+    assert not calls
+    assert len(run.on_site(site, tmp_path, "a")[0]) == 2
+    assert calls == [site[0]]
 
 
 def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
