@@ -29,6 +29,7 @@ from coview_stream.basemap.signature import (
     check_sections,
     check_signature,
     file_identity,
+    open_plain,
     serialized,
     sha256_of,
     sign_header,
@@ -199,11 +200,7 @@ def open_file(
         MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
             with the key. DependencyError: there is a key, and no ``cryptography``.
     """
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
-    with file:
+    with _opened(path) as file:
         if opened is not None:
             opened(file)
         identity = file_identity(file)
@@ -246,12 +243,16 @@ def open_file(
 
 def signer(path: Path) -> str | None:
     """Return the unverified fingerprint of the key that signed a map, None if none did; MapError if it is no map."""
+    with _opened(path) as file:
+        metadata = _header(path, file)[0].get("__metadata__", {})
+    return str(metadata.get("signer")) if "signature" in metadata else None
+
+
+def _opened(path: Path) -> BinaryIO:
     try:
-        with path.open("rb") as file:
-            metadata = _header(path, file)[0].get("__metadata__", {})
+        return open_plain(path)
     except OSError as error:
         raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
-    return str(metadata.get("signer")) if "signature" in metadata else None
 
 
 def _header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:

@@ -6,6 +6,7 @@ and replaced as one.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -171,6 +172,13 @@ class Trust(NamedTuple):
 
     key: VerifyKey
     verified: FileIdentity | None = None
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """Open a file to read; OSError for a pipe as well, which nobody may write to."""
+    if path.is_fifo():
+        raise OSError(errno.ESPIPE, "it is a pipe")
+    return path.open("rb")
 
 
 def file_identity(file: BinaryIO) -> FileIdentity:

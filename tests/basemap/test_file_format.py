@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coview_stream.basemap import file_format
+from coview_stream.basemap.site.manifest import read_manifest
 from coview_stream.errors import MapError
 
 PARAMETERS = {"config": {"block": 2.0}, "crs": 'PROJCS["Zürich"]', "sources": {"a.laz": "00ff"}}
@@ -162,9 +164,12 @@ def test_file_that_is_not_a_map_is_refused(tmp_path, content):
 
 
 def test_missing_files_and_directories_are_refused(tmp_path):
-    for path in (tmp_path / "none.coview", tmp_path):
+    os.mkfifo(tmp_path / "manifest.json")  # nobody writes to it
+    for path in (tmp_path / "none.coview", tmp_path, tmp_path / "manifest.json"):
         with pytest.raises(MapError, match="cannot read the map"):
             file_format.load(path)
+    with pytest.raises(MapError, match="it is a pipe"):
+        read_manifest(tmp_path)
     with pytest.raises(MapError, match=r"a directory that exists"):
         file_format.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
 

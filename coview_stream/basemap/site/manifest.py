@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
-from coview_stream.basemap.signature import SigningKey, VerifyKey, sha256_of
+from coview_stream.basemap.signature import SigningKey, VerifyKey, open_plain, sha256_of
 from coview_stream.basemap.site.layers import most_bytes, most_points
 from coview_stream.basemap.site.site_grid import Around, SiteGrid
 from coview_stream.basemap.site.store import SHA256
@@ -254,7 +254,7 @@ class Manifest:
 def read_manifest(directory: Path, name: str = FILE) -> bytes:
     """Return the bytes of the manifest of a site's directory; MapError if it is missing."""
     try:
-        with (directory / name).open("rb") as file:
+        with open_plain(directory / name) as file:
             return file.read(MAX_MANIFEST + 1)
     except OSError as error:
         raise MapError(

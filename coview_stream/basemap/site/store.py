@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from coview_kernels.runtime import is_private
-from coview_stream.basemap.signature import FileIdentity, file_identity
+from coview_stream.basemap.signature import FileIdentity, file_identity, open_plain
 from coview_stream.clouds.atomic_file import atomic_file, atomic_path
 from coview_stream.errors import ConfigError, MapError
 
@@ -73,7 +73,7 @@ class TileStore:
         """Return a layer's bytes; MapError if the file is missing, cut off or changed."""
         path = self.path(sha256)
         try:
-            with path.open("rb") as file:
+            with open_plain(path) as file:
                 content = file.read(size + 1)
         except OSError as error:
             raise MapError(f"{path}: cannot be read ({error.strerror}); fetch or build the site again") from error
