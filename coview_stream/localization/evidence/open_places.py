@@ -8,6 +8,8 @@ search scores, hundreds that votes have named, and among stations all over the m
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 import coview_kernels as kernels
@@ -16,10 +18,11 @@ from coview_stream.localization.evidence.background import OPEN, Background
 from coview_stream.localization.evidence.likelihood import clear_and_level
 from coview_stream.localization.evidence.observation import ScanPart, Share
 
-_STATIONS = 4096  # that a keyframe is observed from: 20 ms of a search's step
+_STATIONS = 4096  # that a keyframe is observed from
 _MOST = 8 * _STATIONS  # stations of a search: rarer open places are not told from none
 _PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
-_STEPS = 8  # of expectation and maximization: each halves the error or better
+_STEPS = 5  # of expectation and maximization
+_EVERY = 8  # one of so many structure points is looked up
 _SEED = 20240
 
 
@@ -44,7 +47,9 @@ class OpenPlaces:
         at = self._stations[self._random.integers(len(self._stations), size=_STATIONS)].astype(np.float64)
         heading = self._random.uniform(-np.pi, np.pi, _STATIONS)
         poses = np.column_stack([at[:, :2], at[:, 2] + height, heading])
-        return self.add(part.look_up(field, poses, kernels.Move.NEAR).shares)
+        # structure only moves the scan as it moves those at scored places
+        ground = replace(part, points=replace(part.points, structure=part.points.structure[::_EVERY]))
+        return self.add(ground.look_up(field, poses, kernels.Move.NEAR).shares)
 
     def add(self, observed: Floats32) -> None:
         """Add a keyframe's observations (S, 7) at stations that nothing has chosen."""
@@ -54,19 +59,20 @@ class OpenPlaces:
         """Return the probability (Q, L) that a chance place is open, by the nuisances; ``chance`` (P, 7) are scored."""
         scored, anywhere = _odds(chance, background), _odds(self._newest, background)
         self._count = self._before[0] + len(anywhere)
-        share: Floats = np.full(scored.shape[1:], OPEN)
+        share = np.full(scored.shape[1:], OPEN, dtype=np.float32)
         for _ in range(_STEPS):
             self._open = self._before[1] + _probabilities(anywhere, share).sum(axis=0)
             rate = (self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)
-            share = np.maximum(rate, _probabilities(scored, share).sum(axis=0) / (len(chance) + 1.0))  # one is not
-        return share
+            named = _probabilities(scored, share).sum(axis=0) / (len(chance) + 1.0)  # one more is not open
+            share = np.maximum(rate, named).astype(np.float32)
+        return share.astype(np.float64)
 
 
-def _odds(observed: Floats32, background: Background) -> Floats:
+def _odds(observed: Floats32, background: Background) -> Floats32:
     """Return likelihood ratios (P, Q, L) of open places to others at places with these observations (P, 7)."""
-    return np.asarray(np.exp(np.clip(clear_and_level(observed, background), -500.0, 500.0)))
+    return np.exp(np.clip(clear_and_level(observed, background), -80.0, 80.0).astype(np.float32))
 
 
-def _probabilities(odds: Floats, share: Floats) -> Floats:
+def _probabilities(odds: Floats32, share: Floats32) -> Floats32:
     """Return probabilities (P, Q, L) that places are open, where a ``share`` (Q, L) of all is."""
     return np.asarray(share * odds / (1.0 - share + share * odds))
