@@ -399,22 +399,24 @@ def test_sim_time_comes_from_the_clock_topic(robot):
         site.net.close()
 
 
-@pytest.mark.slow
-def test_initial_pose_is_a_hypothesis_and_one_in_another_frame_is_refused(robot, site):
+def guess_of(x, y, frame="map"):
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
+    guess = PoseWithCovarianceStamped()
+    guess.header.frame_id, guess.pose.pose.orientation.w = frame, 1.0
+    guess.pose.pose.position.x, guess.pose.pose.position.y = x, y
+    return guess
+
+
+@pytest.mark.slow
+def test_initial_pose_is_a_hypothesis_and_one_in_another_frame_is_refused(robot, site):
     robot.move(ns(0.0), message(0.0).T_odom_body)
     robot.until(robot.guesses.get_subscription_count)
-    guess = PoseWithCovarianceStamped()
-    guess.pose.pose.orientation.w = 1.0
-    guess.pose.pose.position.x = 5.0
-    guess.header.frame_id = "odom"
-    robot.guesses.publish(guess)
+    robot.guesses.publish(guess_of(5.0, 0.0, "odom"))
     session = site.sessions["r1"]
     robot.until(lambda: any("give it in 'map'" in text for text in session.errors.texts))
     assert session.hints.guess is None
-    guess.header.frame_id = "map"
-    robot.guesses.publish(guess)
+    robot.guesses.publish(guess_of(5.0, 0.0))
     robot.until(lambda: session.hints.guess is not None)
     assert session.hints.guess.x == 5.0
 
@@ -458,13 +460,33 @@ def test_topics_of_two_robots_are_apart(robot):
         net.close()
 
 
-def test_type_hashes_are_those_of_rclpy(robot):
-    """An independent oracle of the keys of rmw_zenoh: the hashes in rclpy's type descriptions."""
-    for topic, kind in (("/r1/points", ros2.CLOUD), ("/r1/odom", ros2.ODOMETRY), ("/initialpose", ros2.POSE)):
-        robot.until(lambda topic=topic: robot.node.get_publishers_info_by_topic(topic))
-        (end,) = robot.node.get_publishers_info_by_topic(topic)
-        assert end.topic_type == kind
-        assert str(end.topic_type_hash).endswith(type_hash(kind).removeprefix("RIHS01_"))
+@pytest.mark.slow
+def test_topics_are_those_of_the_page_and_type_hashes_those_of_rclpy(robot, site):
+    """As ``ros2 topic info -v`` has them; the hashes are an independent oracle of the keys of rmw_zenoh."""
+    readers, writers = robot.node.get_subscriptions_info_by_topic, robot.node.get_publishers_info_by_topic
+    for topic, ends_of, kind, reliability in (
+        ("/r1/points", readers, ros2.CLOUD, "BEST_EFFORT"),
+        ("/r1/odom", readers, ros2.ODOMETRY, "BEST_EFFORT"),
+        ("/initialpose", readers, ros2.POSE, "BEST_EFFORT"),
+        ("/r1/pose", writers, ros2.POSE, "RELIABLE"),
+        ("/diagnostics", writers, ros2_outputs.DIAGNOSTICS, "RELIABLE"),
+    ):
+        robot.until(lambda ends_of=ends_of, topic=topic: ends_of(topic))
+        (end,) = ends_of(topic)
+        assert (end.node_name, end.topic_type) == ("coview_stream", kind)
+        assert (end.qos_profile.reliability.name, end.qos_profile.durability.name) == (reliability, "VOLATILE")
+        if kind != ros2_outputs.DIAGNOSTICS:
+            assert str(end.topic_type_hash).endswith(type_hash(kind).removeprefix("RIHS01_"))
+
+
+@pytest.mark.slow
+def test_a_node_without_ros_imports_nothing_of_it(ros):
+    names = "coview_stream, coview_stream.cli.serve, coview_stream.stream.node.serve, sys"
+    code = f"import {names}; print(sorted(n for n in sys.modules if n.partition('.')[0] in ('rclpy', 'sensor_msgs')))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=python_environment(), capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
 
 
 def test_keys_of_rmw_zenoh_are_those_of_another_library():
@@ -661,7 +683,8 @@ def play(robot, run, seconds, begin, until=lambda: False):
         at = at_of(begin + k, run)
         stamp = first + 200_000_000 * k  # of an even drive, however this machine stutters
         truth[stamp] = run.T_map_body[at]
-        robot.send(stamp, run.clouds[at], run.T_odom_body[at])
+        for _ in range((1, 2, 1, 0, 1)[k % 5]):  # a frame in five comes twice, and one not at all
+            robot.send(stamp, run.clouds[at], run.T_odom_body[at])
         if until():
             break
         time.sleep(max(0.0, started + 0.2 * (k + 1) - time.monotonic()))
@@ -683,10 +706,17 @@ def test_process_finds_loses_and_finds_the_robot_through_restarts_of_either_side
     served = Served(world_file, tmp_path, *arguments)
     try:
         robot.found()
-        robot.send(time.time_ns(), np.zeros((0, 3)), run.T_odom_body[0])  # zero width
-        robot.until(lambda: (robot.values().get("rejected"), robot.level()) == ("1", b"\1"), 60.0)
-        assert "points" in robot.values()["errors"]
+
+        def refused():
+            robot.send(time.time_ns(), np.zeros((0, 3)), run.T_odom_body[0])  # zero width
+            time.sleep(0.1)
+            return "rejected" in robot.values()
+
+        robot.until(refused, 60.0)
+        assert (robot.level(), "points" in robot.values()["errors"]) == (b"\1", True)
+        robot.guesses.publish(guess_of(20.0, -20.0))  # wrong
         truth, at = play(robot, run, 150.0, 0, lambda: len(robot.poses) > 10)
+        assert int(robot.values()["duplicate"]) > 1
         assert max(errors(robot, truth)) < 0.3
         robot.until(lambda: robot.level() == b"\0")
         assert robot.heard["/map_points"][0].header.frame_id == "map"
