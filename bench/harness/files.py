@@ -51,11 +51,13 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dic
     ``spec`` holds a :func:`fingerprint` of the code. Only a dictionary is stored; ``make`` may write files itself.
     """
     spec = json.loads(json.dumps(spec))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.with_suffix(".lock").open("w") as lock:
+    beside = file.parent.with_name(f"{file.parent.name}-{file.stem}.lock")  # what makes a world wants an empty folder
+    beside.parent.mkdir(parents=True, exist_ok=True)
+    with beside.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # benchmarks side by side make it once
         if not file.is_file() or json.loads(file.read_text())["spec"] != spec:
             made = make()
+            file.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(file) as part:
                 result = made if isinstance(made, dict) else {}
                 part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
