@@ -182,6 +182,8 @@ def run(args: argparse.Namespace) -> int:
             with stop_on_signals(lambda: hangups.append(1)) as stop:
                 ended = _serve(options, stop, children, hangups, sinks)
         if not ended:  # a regular exit would wait for the thread that is stuck in the network
+            for child in children.values():
+                child.process.kill()  # one that compiles would notice only then
             logging.shutdown()
             sys.stdout.flush()
             sys.stderr.flush()

@@ -11,9 +11,10 @@ from types import SimpleNamespace
 import pytest
 from sockets import free_endpoint, until
 
+from coview_stream.cli import main
 from coview_stream.cli import serve as command
 from coview_stream.errors import ConfigError, install_command
-from coview_stream.stream.node import serve
+from coview_stream.stream.node import engine_process, serve
 from coview_stream.stream.node.engine_process import CancelledError
 from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import robot_keys
@@ -35,6 +36,28 @@ def test_signal_ends_serve(world_file, start):
     process = start("serve", world_file, "--robot", "r1", *listen, "--humble", "--max-speed", "20")
     assert any("ready" in line for line in process.stderr)
     end(process)
+
+
+def test_engines_are_killed_where_a_stuck_thread_forbids_a_regular_exit(world_file, monkeypatch):
+    class Left(Exception):
+        pass
+
+    def leave(code):
+        raise Left([child.process.killed for child in children.values()])
+
+    children = {kind: SimpleNamespace(close=lambda: None, process=Killable()) for kind in ("search", "tracking")}
+    monkeypatch.setattr(engine_process, "start_children", lambda lidar: children)
+    monkeypatch.setattr(command, "_serve", lambda *args: False)
+    monkeypatch.setattr(command.os, "_exit", leave)
+    with pytest.raises(Left, match=r"\[True, True\]"):
+        main(["serve", str(world_file), "--robot", "r1", "--listen", free_endpoint(), "--quiet", "--no-state"])
+
+
+class Killable:
+    killed = False
+
+    def kill(self):
+        self.killed = True
 
 
 @pytest.mark.slow
