@@ -267,7 +267,8 @@ LEVEL = math.radians(0.5)
 def lean_prior(lean: float, sigma: float) -> float:
     """Return the log-probability of a lean that was chosen to fit, of a sensor that leans by ``sigma`` on each axis.
 
-    It is that of all leans within :data:`LEVEL`, as scans do not tell them apart; 0 for a lean that is less.
+    It is that of all leans within :data:`LEVEL`, as scans do not tell them apart. A smaller lean is none, and costs
+    nothing.
     """
     if lean < LEVEL:
         return 0.0

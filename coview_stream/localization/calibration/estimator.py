@@ -514,8 +514,8 @@ class CalibrationEstimator:
         likelihood = self._known.update(measured, H, R, right)
         if self._supposed is not None:
             ratio = self._supposed.update(measured, H, R, right) - likelihood
-            right = self._probability * math.exp(min(ratio, 50.0))
-            self._probability = right / (right + 1.0 - self._probability)
+            odds = self._probability * math.exp(min(ratio, 50.0))
+            self._probability = odds / (odds + 1.0 - self._probability)
         self._apply()
 
     def _apply(self) -> None:

@@ -28,7 +28,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.clouds import LocalMap, prepare_scan
-from coview_stream.localization.registration.register import registration_covariance, remove_prior
+from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.registration.surfaces import (
     LONGEST,
     motion_prior,
@@ -121,9 +121,8 @@ class FrameMotion:
         if registration is None:
             return None
         T = registration.T_map_source @ T_odom_body
-        about_body = prior._replace(T_map_source=T_odom_body)
-        information = remove_prior(registration._replace(T_map_source=T), about_body, self._config)[1]
-        return T, registration_covariance(information, self._config)
+        pairs = registration.information - self._config.inflation**2 * prior.information
+        return T, registration_covariance(pairs, self._config)
 
 
 def _corrected(

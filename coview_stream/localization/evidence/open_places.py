@@ -24,48 +24,57 @@ _PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them 
 _STEPS = 5  # of expectation and maximization
 _EVERY = 8  # one of so many structure points is looked up
 _SEED = 20240
+_NOTHING = np.empty((0, len(Share)), dtype=np.float32)
+SIGHT = 35.0
+"""Metres from the leader within which places have its ground and its free space in common."""
 
 
 class OpenPlaces:
     """Count of open places at stations all over a map, keyframe by keyframe."""
 
-    def __init__(self, stations: Floats32) -> None:
-        """Count at some of the ``stations`` (M, 3) of a map."""
-        self._stations = stations
+    def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
         """Forget all counts."""
         self._random = np.random.default_rng(_SEED)
         self._count, self._open = 0, np.zeros((1, 1))  # stations; sum of their probabilities (Q, L)
-        self.add(np.empty((0, len(Share)), dtype=np.float32))
+        self.add(_NOTHING, np.empty((0, 2)))
 
-    def look(self, field: kernels.FieldMap, part: ScanPart, height: float) -> None:
-        """Observe a map's ``field`` from random stations and headings, the body ``height`` metres above the station."""
-        if self._count >= _MOST or not len(self._stations):
-            return self.add(np.empty((0, len(Share)), dtype=np.float32))
-        at = self._stations[self._random.integers(len(self._stations), size=_STATIONS)].astype(np.float64)
+    def look(self, field: kernels.FieldMap, stations: Floats32, part: ScanPart, height: float) -> None:
+        """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading."""
+        if self._count >= _MOST or not len(stations):
+            return self.add(_NOTHING, np.empty((0, 2)))
+        at = stations[self._random.integers(len(stations), size=_STATIONS)].astype(np.float64)
         heading = self._random.uniform(-np.pi, np.pi, _STATIONS)
         poses = np.column_stack([at[:, :2], at[:, 2] + height, heading])
         # structure only moves the scan as it moves those at scored places
         ground = replace(part, points=replace(part.points, structure=part.points.structure[::_EVERY]))
-        return self.add(ground.look_up(field, poses, kernels.Move.NEAR).shares)
+        return self.add(ground.look_up(field, poses, kernels.Move.NEAR).shares, at[:, :2])
 
-    def add(self, observed: Floats32) -> None:
-        """Add a keyframe's observations (S, 7) at stations that nothing has chosen."""
-        self._newest, self._before = observed, (self._count, self._open)
+    def add(self, observed: Floats32, at: Floats) -> None:
+        """Add a keyframe's observations (S, 7) at stations (S, 2) that nothing has chosen."""
+        self._newest, self._at, self._before = observed, at, (self._count, self._open)
 
-    def share(self, chance: Floats32, background: Background) -> Floats:
-        """Return the probability (Q, L) that a chance place is open, by the nuisances; ``chance`` (P, 7) are scored."""
-        scored, anywhere = _odds(chance, background), _odds(self._newest, background)
+    def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
+        """Return the probability (Q, L) that a chance place is open, by the nuisances.
+
+        Args:
+            chance: (P, 7) observations at scored places more than :data:`SIGHT` from the leader.
+            background: of the other shares.
+            leader: x, y, ... of the leader: stations as near are left out as well.
+        """
+        newest = self._newest
+        if leader is not None:
+            newest = newest[np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT]
+        scored, anywhere = _odds(chance, background), _odds(newest, background)
         self._count = self._before[0] + len(anywhere)
-        share = np.full(scored.shape[1:], OPEN, dtype=np.float32)
+        named = rate = np.full(scored.shape[1:], OPEN, dtype=np.float32)
         for _ in range(_STEPS):
-            self._open = self._before[1] + _probabilities(anywhere, share).sum(axis=0)
-            rate = (self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)
-            named = _probabilities(scored, share).sum(axis=0) / (len(chance) + 1.0)  # one more is not open
-            share = np.maximum(rate, named).astype(np.float32)
-        return share.astype(np.float64)
+            named = _probabilities(scored, named).sum(axis=0) / np.float32(len(chance) + 1)  # one more is not open
+            self._open = self._before[1] + _probabilities(anywhere, rate).sum(axis=0)
+            rate = ((self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)).astype(np.float32)
+        return np.maximum(rate, named).astype(np.float64)
 
 
 def _odds(observed: Floats32, background: Background) -> Floats32:

@@ -38,6 +38,7 @@ class Reading:
         scan: of it.
         scored: the places.
         leader: the first one, registered; None if that failed.
+        level: (4, 4) the leader's ``T_map_odom``, level by the newest frame alone; None without a leader.
         turn: (4, 4) turned odometry frame <- odometry frame.
     """
 
@@ -45,6 +46,7 @@ class Reading:
     scan: ObservedScan
     scored: Scored
     leader: Hypothesis | None
+    level: Pose | None
     turn: Pose = field(default_factory=lambda: np.eye(4))
 
 
@@ -129,6 +131,7 @@ class GlobalSearch:
         """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
         if request.epoch != self._epoch:
             self._begin(request)
+        self._scorer.area = request.area
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request)
@@ -137,9 +140,9 @@ class GlobalSearch:
         hypotheses, first, scan = [*voted, *hints], not self._scorer.scans, self._observed(request)
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
-        reading = Reading(request, scan, scored, leader)
-        if first and leader is not None and scored.error >= self.config.acceptance.risk:
-            reading = self._leaning(reading, leader, hypotheses, ranks, len(hints)) or reading
+        reading = Reading(request, scan, scored, leader, self._level(leader, request))
+        if first and scored.error >= self.config.acceptance.risk:
+            reading = self._leaning(reading, hypotheses, ranks, len(hints)) or reading
         self._note_hints(reading.scored, hints, request)
         result = self._decide(reading)
         if result.accepted is not None:
@@ -160,23 +163,27 @@ class GlobalSearch:
                 scans = [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
-        if leader is not None:
-            level = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
+        level = reading.level if leader is reading.leader else self._level(leader, request)
+        if level is not None:
             result = replace(result, leader=level @ reading.turn)
         if result.accepted is not None:
             result = replace(result, accepted=result.accepted.after(reading.turn))
         return result
 
-    def _leaning(
-        self, upright: Reading, leader: Hypothesis, hypotheses: list[Hypothesis], ranks: list[int], hints: int
-    ) -> Reading | None:
+    def _level(self, leader: Hypothesis | None, request: SearchRequest) -> Pose | None:
+        if leader is None:
+            return None
+        return levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
+
+    def _leaning(self, upright: Reading, hypotheses: list[Hypothesis], ranks: list[int], hints: int) -> Reading | None:
         """Read the scan as one of a sensor that leans as the leader has it; None where that tells nothing else.
 
         A sensor leans alike at all places: all are scored anew, among chance places of the same lean. The lean was
         chosen to fit, so its reading counts by its prior probability.
         """
-        request, T_odom_body = upright.request, upright.request.T_odom_body
-        seen = levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
+        request, leader, seen = upright.request, upright.leader, upright.level
+        if leader is None or seen is None:
+            return None
         R = rot_z(-yaw_of(seen)) @ seen[:3, :3]
         prior = lean_prior(tilt_of(seen), request.calibration.sigma_tilt)
         if prior == 0.0:
@@ -184,14 +191,15 @@ class GlobalSearch:
         turned = request.turned(R)
         scan = self._observed(turned)
         scorer = PlaceScorer(self.base_map)
-        scorer.starts = self._scorer.starts
+        scorer.starts, scorer.area = self._scorer.starts, request.area
         scored = scorer.score(hypotheses, ranks, hints, scan, prior + request.lean_prior)
         found = self._register(scored, scan, turned)
         if found is None or not same_place(found.T_map_odom, leader.T_map_odom, turned, BASIN_DISTANCE, BASIN_ANGLE):
             return None
-        about_body = T_odom_body[:3, 3]
+        about_body = request.position
         turn = pose_from(R, about_body - R @ about_body)
-        return Reading(turned, scan, scored.together_with(upright.scored), found, turn)
+        level = self._level(found, turned)
+        return Reading(turned, scan, scored.together_with(upright.scored), found, level, turn)
 
     def _begin(self, request: SearchRequest) -> None:
         """Begin anew with a request, or go on with its earlier keyframes: then it is no other start."""
@@ -254,7 +262,12 @@ class GlobalSearch:
             return same_place(place.T_map_odom, leader.T_map_odom, request, distance, BASIN_ANGLE)
 
         risk, error = self.config.acceptance.risk, scored.error
-        near = [place for place in scored.places[1:] if around(place, _STREET) and not around(place, BASIN_DISTANCE)]
+        first = scored.places[0]
+        near = [
+            place for place in scored.places[1:]
+            if around(place, _STREET) and not around(place, BASIN_DISTANCE)
+            and not same_place(place.T_map_odom, first.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE)
+        ]  # fmt: skip
         if error < risk or error - sum(place.probability for place in near) >= risk:
             return scored
         for place in near[:_GUESSES]:

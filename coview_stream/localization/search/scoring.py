@@ -18,11 +18,12 @@ import numpy as np
 from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import expected_by_chance, log_likelihood_ratios, posterior
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
-from coview_stream.localization.evidence.open_places import OpenPlaces
+from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
@@ -33,7 +34,6 @@ _KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones
 _NEWEST = 8  # keyframes that are searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
-_SIGHT = 35.0  # metres from the leader within which places have its ground and its free space in common
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
 
@@ -90,11 +90,19 @@ class Scored:
         return round(float(np.exp(-(share * np.log(share)).sum())))
 
     def together_with(self, other: Scored) -> Scored:
-        """Return these places with the errors by both readings of the scan, which have the same first place."""
+        """Return these places with the error by both readings of the scan, which have the same first place.
+
+        The odds against "none", which is one and the same, add up; the other's places are only in the error.
+        """
         none = [max(each.none, 1e-300) for each in (self, other)]
-        first = [each.places[0].probability / part for each, part in zip((self, other), none, strict=True)]
-        rest = self.error / none[0] + other.error / none[1] - 1.0  # "none" once
-        return replace(self, error=rest / (rest + sum(first)), none=1.0 / (rest + sum(first)))
+        right = sum((1.0 - each.error) / part for each, part in zip((self, other), none, strict=True))
+        wrong = sum(each.error / part for each, part in zip((self, other), none, strict=True)) - 1.0
+        share = 1.0 / (right + wrong)
+        places = [replace(place, probability=place.probability / none[0] * share) for place in self.places]
+        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
+        return replace(
+            self, places=places, error=wrong * share, none=share, second=None if second is None else places[second]
+        )
 
     def doubted(self, moved: MovedPart) -> Scored:
         """Add the error by a moved part: either part may be the unmoved one."""
@@ -159,12 +167,14 @@ class PlaceScorer:
 
     Attributes:
         starts: how often the search has started since a place was accepted.
+        area: the only part of the map that is searched; None for all of it.
     """
 
     def __init__(self, base_map: BaseMap) -> None:
         """Score by a map's likelihood field, which is loaded at the first keyframe."""
         self._base_map = base_map
-        self._open = OpenPlaces(base_map.stations)
+        self.area: Circle | None = None
+        self._open = OpenPlaces()
         self.clear()
 
     @property
@@ -319,23 +329,28 @@ class PlaceScorer:
         most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, distant = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
-        elsewhere = chance
+        elsewhere, leader = chance, None
         self._scatter.append(scatter(observed.shares[first]))
         stations = [-1 if place.station is None else place.station for place in followed.hypotheses]
         above = (poses[:, 2] - self._base_map.stations[stations, 2])[np.array(stations) >= 0]
-        self._open.look(self._base_map.field, scan.few, float(np.median(above)) if len(above) else 0.0)
+        anywhere = self._base_map.stations
+        if self.area is not None:
+            anywhere = anywhere[self.area.holds(anywhere)]
+        self._open.look(self._base_map.field, anywhere, scan.few, float(np.median(above)) if len(above) else 0.0)
         sample, over_time = self._over_time(observed, first, scan)
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             spread = np.mean(measured, axis=0) * left_in_mean(over_time[chance[sample]])
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
-            background = replace(background, open=self._open.share(observed.shares[first][elsewhere], background))
+            background = replace(
+                background, open=self._open.share(observed.shares[first][elsewhere], background, leader)
+            )
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
-            elsewhere = _apart(places, leader, _SIGHT, np.pi)
+            elsewhere = _apart(places, leader, SIGHT, np.pi)
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])

@@ -228,13 +228,13 @@ def smallest_error(places, stations, rng, times=1.0):
     Each observation is counted ``times``. The ``stations`` (S, W, 7) are others.
     """
     count, keyframes, _ = places.shape
-    opened = OpenPlaces(np.empty((0, 3), dtype=np.float32))
+    opened = OpenPlaces()
     votes, spreads, smallest = rng.permutation(count), [], 1.0
     for k in range(keyframes):
         now, mean = places[:, k], places[:, : k + 1].mean(axis=1)
         others = np.ones(count, dtype=bool)
         spreads.append(scatter(now))
-        opened.add(stations[:, k])
+        opened.add(stations[:, k], np.full((len(stations), 2), np.inf))
         for last in (False, True):
             spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
             known = estimate_background(now[others], spread, mean[others])

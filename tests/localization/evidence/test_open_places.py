@@ -16,14 +16,18 @@ from coview_stream.localization.evidence.open_places import OpenPlaces
 KNOWN = Background(CHANCE, PASSED, (0.8, 8.0), (30.0, 60.0))
 ROUGH = observation(np.tile(CHANCE, (3900, 1)), passed=PASSED, ground=0.05)
 CLEAR = observation(np.tile(CHANCE, (300, 1)), passed=0.0, ground=0.95)
-NOWHERE = np.empty((0, 3), dtype=np.float32)
+
+
+def at(observations):
+    """Stations a metre apart."""
+    return np.column_stack([np.arange(len(observations)), np.zeros(len(observations))])
 
 
 def share(scored, *keyframes):
     """The share by scored places, and by stations at each keyframe."""
-    places = OpenPlaces(NOWHERE)
+    places = OpenPlaces()
     for stations in keyframes:
-        places.add(stations)
+        places.add(stations, at(stations))
         found = places.share(scored, KNOWN)
     return found
 
@@ -40,13 +44,20 @@ def test_scored_places_that_are_open_count_however_rare_others_are():
     assert share(some, ROUGH) == pytest.approx(15 / 300, rel=0.05)
 
 
+def test_stations_in_sight_of_the_leader_are_left_out():
+    places = OpenPlaces()
+    places.add(np.concatenate([CLEAR[:30], ROUGH[:870]]), at(ROUGH[:900]))
+    assert places.share(ROUGH[:300], KNOWN) == pytest.approx(31 / 1000, rel=0.05)
+    assert places.share(ROUGH[:300], KNOWN, np.zeros(4)) == pytest.approx(1 / (1000 - 36), rel=0.05)
+
+
 def test_the_same_background_asked_twice_counts_stations_once():
-    places = OpenPlaces(NOWHERE)
-    places.add(ROUGH)
+    places = OpenPlaces()
+    places.add(ROUGH, at(ROUGH))
     once = places.share(ROUGH[:300], KNOWN)
     np.testing.assert_array_equal(places.share(ROUGH[:300], KNOWN), once)
     places.clear()
-    places.add(ROUGH[:0])
+    places.add(ROUGH[:0], at(ROUGH[:0]))
     assert places.share(ROUGH[:300], KNOWN) == pytest.approx(0.01)
 
 
@@ -60,14 +71,11 @@ def test_another_open_place_is_worth_as_much_as_open_places_are_rare():
 
 
 def test_stations_of_a_level_site_are_open_to_a_robot_on_its_ground(world_map, world_drive):
-    """The small world is level; a robot that is held two metres above its place has the ground of none."""
-    scan, places = (
-        observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False),
-        OpenPlaces(world_map.stations),
-    )
+    """The small world is level; a robot that is held forty metres above its place has the ground of none."""
+    scan, places = (observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False), OpenPlaces())
     level = world_drive.T_map_body[0][2, 3] - world_map.stations[0, 2]
-    places.look(world_map.field, scan.few, level)
+    places.look(world_map.field, world_map.stations, scan.few, level)
     found = places.share(ROUGH[:300], KNOWN)
     places.clear()
-    places.look(world_map.field, scan.few, level + 40.0)
+    places.look(world_map.field, world_map.stations, scan.few, level + 40.0)
     assert found.min() > 10.0 * places.share(ROUGH[:300], KNOWN).max()

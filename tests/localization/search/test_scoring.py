@@ -198,6 +198,12 @@ def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_driv
     assert leaning.places[0].ratio == upright.places[0].ratio
     assert leaning.none == pytest.approx(upright.none * np.exp(4.0), rel=0.05)
     both = leaning.together_with(upright)
-    odds = sum(each.places[0].probability / each.none for each in (upright, leaning))
+    odds = sum((1.0 - each.error) / each.none for each in (upright, leaning))
     rest = sum(each.error / each.none for each in (upright, leaning)) - 1.0
     assert both.error == pytest.approx(rest / (rest + odds))
+    assert sum(place.probability for place in both.places) + both.none <= 1.0
+    # a rival far away, by the other reading alone, keeps its weight however many of these places turn out to be one
+    far = replace(upright, error=0.02, none=1e-6)
+    both = leaning.together_with(far)
+    others = sum(place.probability for place in both.places[1:])
+    assert both.error - others == pytest.approx(0.02, rel=0.2)
