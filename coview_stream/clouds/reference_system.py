@@ -65,7 +65,7 @@ def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high:
     if flaw is None:
         return None
     remedy = f"reproject it to {_metric_system(system, low, high)}"
-    if "feet" in flaw and importlib.util.find_spec("pyproj") is None:
+    if "feet" in flaw and text and importlib.util.find_spec("pyproj") is None:
         remedy = "pip install 'pyproj>=3.6', by which they are converted"
     return f"{flaw} according to its reference system; {remedy}"
 

@@ -131,6 +131,9 @@ class Run:
         first, end = np.searchsorted(stamps, self.stamps[0]), np.searchsorted(stamps, self.stamps[-1], "right")
         if len(self) < 2 or not delay:
             return self
+        if first >= end:
+            lasts = self.stamps[-1] - self.stamps[0]
+            raise RunError(f"{self.path}: the clouds' delay, {abs(delay):g} s, is longer than the run, {lasts:.1f} s")
         stamps = stamps[first:end]
         after = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self) - 1)
         share = (stamps - self.stamps[after - 1]) / (self.stamps[after] - self.stamps[after - 1])

@@ -246,6 +246,8 @@ def test_slice_of_a_run_is_a_run(run: Path) -> None:
 def test_clouds_that_are_late_have_earlier_odometry(run: Path, delay: float) -> None:
     opened = open_run(run)
     assert opened.with_late_clouds(0.0) is opened
+    with pytest.raises(RunError, match="longer than the run"):
+        opened.with_late_clouds(100.0 * delay)
     moved = opened.with_late_clouds(delay)
     kept = [k for k, stamp in enumerate(STAMPS - delay) if STAMPS[0] <= stamp <= STAMPS[-1]]
     np.testing.assert_allclose(moved.stamps, STAMPS[kept] - delay, atol=1e-6)

@@ -155,6 +155,8 @@ class EngineFeed(Generic[R]):
             robot.handle_result(job, result, time.monotonic())
             self._on_change(robot)
             self.wake_for(robot)  # a frame may have asked for a search
+        finally:
+            runner.on_doubt = lambda: None  # else it keeps the job's cloud
 
     def watch(self, engine: str) -> None:
         """Check an engine without a job: a dead one is reported, and started again before it is needed."""

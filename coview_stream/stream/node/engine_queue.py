@@ -213,7 +213,7 @@ class EngineQueue:
         self.considered: Considered | None = None  # places of the newest search; None once there is a place
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
-        self._doubting: Job | None = None  # newest job that contradicted the place
+        self._doubting: Job | None = None  # the job under way, if it contradicts the place
         self._frame_done: QueuedFrame | None = None  # the newest one
         self._search_result: SearchResult | None = None
         self._request: SearchRequest | None = None
@@ -304,7 +304,7 @@ class EngineQueue:
         frame = self._frame_under_way
         if job.epoch != self.epoch or frame is None:
             return None
-        self._frame_under_way, self._frame_done = None, frame
+        self._frame_under_way, self._doubting, self._frame_done = None, None, frame
         if job.points is not None:
             self.latency.add(now - frame.paired.received)
             self.longest_wait = max(self.longest_wait, now - frame.waiting_since)
@@ -323,7 +323,7 @@ class EngineQueue:
         self._errors.add_first(f"{self.robot}: {kind}", last_line(reason))
         if job.epoch != self.epoch:
             return False
-        self._frame_under_way = None
+        self._frame_under_way = self._doubting = None
         if job.points is not None:
             # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
             self._search_result = self._search_result or job.search_result

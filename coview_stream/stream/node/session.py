@@ -245,7 +245,8 @@ class Session:
 
     def note_doubt(self, job: Job) -> None:
         """Give no pose until the result of a job comes: its frame contradicts the place."""
-        self.queue.note_doubt(job)
+        with self.lock:
+            self.queue.note_doubt(job)
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
         """Count a job without a result; unless it was ``rejected``, its engine has forgotten the robot."""
