@@ -221,6 +221,10 @@ def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: 
             pool.shutdown(cancel_futures=True)
 
 
+class _TooLateError(Exception):
+    """A site was to begin after the time."""
+
+
 def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tuple[list[Result], bool]:
     """Make all runs on one map unless they are there; return them, and whether they were made now.
 
@@ -240,7 +244,7 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
 
     def make() -> dict[str, Any]:
         if time.monotonic() > until:
-            raise TimeoutError
+            raise _TooLateError
         new.append(site)
         robot = Robot(map_of(site[0]))
         return {"runs": [run | one(case, robot) for run, case in zip(about, site, strict=True)]}
@@ -248,8 +252,11 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
     with file.with_suffix(".busy").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return [], False
+        try:
             results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]
-        except (BlockingIOError, TimeoutError):
+        except _TooLateError:
             return [], False
         except Exception as error:  # the other sites go on
             return [run | _failed(error) for run in about], True
