@@ -12,6 +12,7 @@ right within 3 m and 5 degrees.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
@@ -20,13 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import PYTHON, built, environment, folder
+from bench.harness.files import PYTHON, built, environment, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, table
 from bench.integrity.integrity import Tally, percent, planned
 from bench.integrity.plan import FAMILIES, Run
 from bench.integrity.run import Result, cloud_of, drive_of
 from bench.integrity.run import judged as outcome
 from coview_stream.clouds import read_tum, write_cloud, write_tum
+from coview_stream.errors import InputError
 from coview_stream.report.evaluation import MAX_STAMP_GAP
 
 COUNT, QUICK = 100, 4  # runs
@@ -68,24 +70,22 @@ def score(answer: Path, truth: Path) -> dict[str, Any]:
 
 
 def locate(run: Run, below: Path, answers: Path) -> None:
-    """Answer with the commands of the product unless that is done."""
+    """Answer with the commands of the product unless this code has; InputError if they fail."""
     out, world = answers / name_of(run), below / name_of(run)
-    if not out.with_suffix(".tum").is_file():
+
+    def work() -> None:
         site = built(world / "map.laz", world / "site.coview")
-        words = (
-            *PYTHON,
-            "-m",
-            "coview_stream",
-            "locate",
-            str(site),
-            str(world / "run"),
-            "-o",
-            str(out),
-            "--no-pictures",
-        )
-        subprocess.run(words, env=environment(1), capture_output=True)  # exit code 1: no pose
+        shutil.rmtree(out, ignore_errors=True)
+        words = (str(site), str(world / "run"), "-o", str(out), "--no-pictures")
+        command = (*PYTHON, "-m", "coview_stream", "locate", *words)
+        done = subprocess.run(command, env=environment(1), capture_output=True, text=True)
+        if done.returncode not in (0, 1):  # 1: no pose
+            raise InputError(f"locating {out.name}: {done.stderr.strip()[-200:]}")
         found = out / "trajectory.tum"
+        answers.mkdir(parents=True, exist_ok=True)
         out.with_suffix(".tum").write_text(found.read_text() if found.is_file() else "")
+
+    remembered(out.with_suffix(".json"), {"code": fingerprint()}, work)
 
 
 def options(parser: ArgumentParser) -> None:
