@@ -155,7 +155,10 @@ def _check_options(words: list[str], known: list[str], command: str) -> None:
         option = word.partition("=")[0]
         if option.startswith("--") and not any(name.startswith(option) for name in known):
             near = did_you_mean(option, [name for name in known if name.startswith("--")])
-            raise ConfigError(f"{command} has no option {option}; {near} `{PROGRAM} {command} --help` explains them")
+            end = "" if near.endswith("?") else ";"
+            raise ConfigError(
+                f"{command} has no option {option}; {near}{end} `{PROGRAM} {command} --help` explains them"
+            )
 
 
 def _dispatch(argv: list[str]) -> int:

@@ -73,6 +73,7 @@ class RobotCapture:
     alive: bool = False
     began: float = 0.0
     ended: float = 0.0
+    ended_ns: int = 0  # wall clock, as in the status; 0 where nothing has been captured
 
 
 def capture_robots(
@@ -118,7 +119,7 @@ def capture_robots(
     wait(seconds)
     over = True
     for capture in captures:
-        capture.ended = clock()
+        capture.ended, capture.ended_ns = clock(), time.time_ns()
         capture.alive = bool(transport.tokens(capture.keys.alive))
     return captures
 

@@ -280,6 +280,8 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
     from coview_stream.localization.witness.witness import Witness
 
     if base_map is not None:
+        from coview_stream.localization.calibration.calibration import Calibration
+
         localizer = Localizer(base_map, config)
 
         def localized(frame: Frame) -> tuple[str, str, float] | None:
@@ -288,7 +290,10 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
                 return None
             return said.cause.value, said.reason, localizer.sensor_fault
 
-        return localized, lambda: localizer.calibration
+        def measured() -> Calibration:  # a lean of places that only led a search is no advice
+            return localizer.calibration if localizer.state.has_place else Calibration()
+
+        return localized, measured
     frames, drift = FramePreparation(config), Drift.of(TrackingConfig())
     witness = Witness(config.registration, frames.estimator)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import math
 import statistics
-import time
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -307,7 +306,7 @@ def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
     return frames
 
 
-def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None = None) -> Finding:
+def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
     """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None for any."""
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
@@ -328,7 +327,7 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
         return Finding("FAIL", "node", f"{found}, not {sha256[:12]}", "it serves another map: restart it", robot)
     if status.get("version") != __version__:
         return Finding("warn", "node", f"{found}, here {__version__}", "run the same version on both sides", robot)
-    behind = ((time.time_ns() if now_ns is None else now_ns) - _number(status, "stamp_ns")) * 1e-9
+    behind = (capture.ended_ns - _number(status, "stamp_ns")) * 1e-9  # judging others takes seconds
     if behind > _MAX_STATUS_AGE:
         return Finding("warn", "node", f"{found}; {_seconds(behind)} old", "its clock, or this one, is wrong", robot)
     errors = status.get("errors")

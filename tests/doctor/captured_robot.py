@@ -38,6 +38,7 @@ def capture(clouds=(), odometry=(), seconds=3.0, **more):
         [capture_cloud(sample, at) for at, sample in clouds],
         [capture_odometry(sample, at) for at, sample in odometry],
         ended=seconds,
+        ended_ns=ns(0),
         **more,
     )
 

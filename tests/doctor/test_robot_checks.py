@@ -271,7 +271,7 @@ def test_too_short_capture_gives_no_cross_checks():
     ],
 )
 def test_node_status_finding(status, alive, verdict, part):
-    found = node_finding(capture(status=status, alive=alive), SHA, ns(0))
+    found = node_finding(capture(status=status, alive=alive), SHA)
     assert found.verdict == verdict
     assert part in found.found
 
@@ -279,10 +279,10 @@ def test_node_status_finding(status, alive, verdict, part):
 def test_who_serves_the_robot_is_told():
     robot = capture(status=STATUS, alive=True)
     robot.servers = {"abc on machine-7"}
-    found = node_finding(robot, SHA, ns(0))
+    found = node_finding(robot, SHA)
     assert found.verdict == "ok"
     assert "node abc on machine-7" in found.found
     robot.servers |= {"def"}
-    found = node_finding(robot, SHA, ns(0))
+    found = node_finding(robot, SHA)
     assert found.verdict == "warn"
     assert "abc on machine-7, def publish" in found.found
