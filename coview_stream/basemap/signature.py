@@ -175,7 +175,7 @@ class Trust(NamedTuple):
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a file to read; OSError for a pipe as well, which nobody may write to."""
+    """Open a file to read; OSError for a pipe as well, as opening one waits for a writer."""
     if path.is_fifo():
         raise OSError(errno.ESPIPE, "it is a pipe")
     return path.open("rb")

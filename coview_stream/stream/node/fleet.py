@@ -185,7 +185,7 @@ class Fleet:
                 del self._arriving[robot]
 
     def _share(self) -> None:
-        """Give up the robots that a node of a higher rank serves; take those of this node, and those of nobody."""
+        """Give up robots that a higher-ranked node serves; take those of this node and those without any."""
         alive, look = self.members.alive, self.members.looks
         if alive != self._ranked:
             self._ranked, self._owners = alive, {robot: owner(robot, alive) for robot in self._endpoints}
