@@ -120,6 +120,7 @@ class GlobalSearch:
         self._hints = HintSchedule()
         self._guesses = HintSchedule()
         self._scorer.clear()
+        self._keyframes = 0
 
     def reset(self) -> None:
         """Forget the newest descriptors as well."""
@@ -137,11 +138,12 @@ class GlobalSearch:
         guessed = self._guessed(request)
         voted, ranks = [*voted, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
-        hypotheses, first, scan = [*voted, *hints], not self._scorer.scans, self._observed(request)
+        hypotheses, scan = [*voted, *hints], self._observed(request)
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         reading = Reading(request, scan, scored, leader, self._level(leader, request))
-        if first and scored.error >= self.config.acceptance.risk:
+        self._keyframes += 1
+        if scored.error >= self.config.acceptance.risk:
             reading = self._leaning(reading, hypotheses, ranks, len(hints)) or reading
         self._note_hints(reading.scored, hints, request)
         result = self._decide(reading)
@@ -178,8 +180,9 @@ class GlobalSearch:
     def _leaning(self, upright: Reading, hypotheses: list[Hypothesis], ranks: list[int], hints: int) -> Reading | None:
         """Read the scan as one of a sensor that leans as the leader has it; None where that tells nothing else.
 
-        A sensor leans alike at all places: all are scored anew, among chance places of the same lean. The lean was
-        chosen to fit, so its reading counts by its prior probability.
+        A sensor leans alike at all places: all are scored anew by this keyframe alone, among chance places of the same
+        lean. The lean was chosen to fit, so its reading counts by its prior probability, and a later keyframe's as
+        another start.
         """
         request, leader, seen = upright.request, upright.leader, upright.level
         if leader is None or seen is None:
@@ -191,7 +194,10 @@ class GlobalSearch:
         turned = request.turned(R)
         scan = self._observed(turned)
         scorer = PlaceScorer(self.base_map)
-        scorer.starts, scorer.area = self._scorer.starts, request.area
+        scorer.starts, scorer.area = self._scorer.starts * self._keyframes, request.area
+        if self._keyframes > 1:
+            followed = self._scorer.followed
+            hypotheses, ranks = [*followed.hypotheses, *hypotheses], [*followed.votes.tolist(), *ranks]
         scored = scorer.score(hypotheses, ranks, hints, scan, prior + request.lean_prior)
         found = self._register(scored, scan, turned)
         if found is None or not same_place(found.T_map_odom, leader.T_map_odom, turned, BASIN_DISTANCE, BASIN_ANGLE):
@@ -204,8 +210,9 @@ class GlobalSearch:
     def _begin(self, request: SearchRequest) -> None:
         """Begin anew with a request, or go on with its earlier keyframes: then it is no other start."""
         starts = self._scorer.starts + (bool(self._scorer.scans) and not request.earlier)
+        keyframes = self._keyframes if request.earlier else 0
         self.clear()
-        self._epoch, self._scorer.starts = request.epoch, starts
+        self._epoch, self._scorer.starts, self._keyframes = request.epoch, starts, keyframes
         self._scorer.go_on_with([self._observed(each) for each in request.earlier])
 
     def _observed(self, keyframe: SearchRequest | EarlierKeyframe) -> ObservedScan:

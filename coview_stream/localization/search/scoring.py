@@ -110,7 +110,7 @@ class Scored:
 
 
 @dataclass(frozen=True)
-class _Followed:
+class Followed:
     """P followed places and their observations.
 
     Attributes:
@@ -126,13 +126,13 @@ class _Followed:
     newest: Ints
 
     @classmethod
-    def none(cls) -> _Followed:
+    def none(cls) -> Followed:
         nothing = np.empty(0, dtype=np.int64)
         return cls([], nothing, np.empty((0, 0, len(Share)), dtype=np.float32), nothing)
 
-    def __getitem__(self, order: Ints) -> _Followed:
+    def __getitem__(self, order: Ints) -> Followed:
         hypotheses = [self.hypotheses[k] for k in order]
-        return _Followed(hypotheses, self.votes[order], self.observed[order], self.newest[order])
+        return Followed(hypotheses, self.votes[order], self.observed[order], self.newest[order])
 
 
 @dataclass(frozen=True)
@@ -182,11 +182,16 @@ class PlaceScorer:
         """Newest keyframes, eight at most, the newest last."""
         return self._scans[-_NEWEST:]
 
+    @property
+    def followed(self) -> Followed:
+        """Followed places, the most probable first."""
+        return self._followed
+
     def clear(self) -> None:
         """Forget all places, keyframes and starts."""
         self.starts = 1
         self._open.clear()
-        self._followed = _Followed.none()
+        self._followed = Followed.none()
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
 
@@ -194,7 +199,7 @@ class PlaceScorer:
         """Begin with earlier keyframes, oldest first: places are compared by them as well."""
         self._scans = scans
         self._scatter = [np.full(4, np.nan)] * len(scans)
-        self._followed = replace(_Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
+        self._followed = replace(Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
 
     def score(
         self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
@@ -280,7 +285,7 @@ class PlaceScorer:
 
     def _follow(
         self, scan: ObservedScan, observed: _Observed, hypotheses: list[Hypothesis], ranks: Ints, hints: int
-    ) -> _Followed:
+    ) -> Followed:
         """Choose the places to follow: the best now, the best so far, and those of hints."""
         before = self._followed
         count = len(before.votes)
@@ -307,7 +312,7 @@ class PlaceScorer:
             history[~anew] = before.observed[row[~anew]]
             history[anew] = self._look_back(T[newest[anew]])
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
-        return _Followed([place for _, place in chosen], votes, shares, newest)
+        return Followed([place for _, place in chosen], votes, shares, newest)
 
     def _look_back(self, T_map_odom: Floats) -> Floats32:
         """Return the earlier keyframes' observations (P, W, 7) at new places, with the drift since undone."""
@@ -318,7 +323,7 @@ class PlaceScorer:
             out[:, k], T_map_odom = observed.shares, scan.transforms(observed.poses)
         return out
 
-    def _evidence(self, followed: _Followed, observed: _Observed, scan: ObservedScan) -> Floats:
+    def _evidence(self, followed: Followed, observed: _Observed, scan: ObservedScan) -> Floats:
         """Return log-likelihood ratios (P,) against the places that are not around the leader."""
         mean, first = followed.observed.mean(axis=1), observed.first
         if not len(mean):

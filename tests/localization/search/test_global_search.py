@@ -121,6 +121,19 @@ def test_sensor_that_leans_is_found_at_its_first_keyframe_by_its_prior(never_sur
     assert leans.considered.none < 1e-6 * improbable.considered.none
 
 
+def test_sensor_that_leans_is_found_at_a_later_keyframe_by_its_prior(never_sure, world_drive):
+    drawn = Calibration(sigma_tilt=np.radians(0.2))
+    requests = list(run_of(leaning(world_drive), 2))
+    first, known = (replace(request, calibration=drawn) for request in requests)
+    never_sure.update(first)
+    leans = never_sure.update(requests[1])
+    never_sure.update(replace(first, epoch=Epoch(1)))
+    improbable = never_sure.update(replace(known, epoch=Epoch(1)))
+    assert off(leans.leader) < 0.3
+    assert leans.evidence.evidence.ground > 0.8
+    assert leans.considered.none < 1e-3 * improbable.considered.none
+
+
 def test_lean_is_measured_by_the_newest_frame_alone(never_sure, world_drive):
     """Frames along the way stand where odometry has them: together they show a part of the lean."""
     results = [never_sure.update(request) for request in run_of(leaning(world_drive), 6)]
