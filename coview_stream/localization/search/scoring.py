@@ -127,6 +127,7 @@ class Followed:
 
     @classmethod
     def none(cls) -> Followed:
+        """Return no places, at no keyframes."""
         nothing = np.empty(0, dtype=np.int64)
         return cls([], nothing, np.empty((0, 0, len(Share)), dtype=np.float32), nothing)
 
