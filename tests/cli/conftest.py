@@ -1,7 +1,5 @@
 """Refusals of the command line."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``coview-stream airborne``: a cloud in, a cloud out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """``coview-stream info --ambiguity``: a sentence, numbers, a picture."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``coview-stream build``: a map or one line, never half a map."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import itertools

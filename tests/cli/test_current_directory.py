@@ -1,7 +1,5 @@
 """Neither the commands nor the processes that they start import from the current directory."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

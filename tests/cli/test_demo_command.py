@@ -1,7 +1,5 @@
 """``coview-stream demo`` end to end in a small world."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

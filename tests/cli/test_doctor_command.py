@@ -1,7 +1,5 @@
 """``coview-stream doctor``: lines, JSON and exit codes; a real robot on loopback."""
 
-from __future__ import annotations
-
 import json
 import threading
 

@@ -1,7 +1,5 @@
 """``coview-stream eval`` on files."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A disk that is full while a map is built or a run is localized: one line, and the files before it stay."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``coview-stream fuse``: files in every format, coordinates, names of sources and bad input."""
 
-from __future__ import annotations
-
 import json
 
 import laspy

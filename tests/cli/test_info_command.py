@@ -1,7 +1,5 @@
 """``coview-stream info``: the contents of a map, or one line."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

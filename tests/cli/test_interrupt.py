@@ -1,7 +1,5 @@
 """Ctrl-C ends a command with 130 wherever it comes, and its cleanup is done."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

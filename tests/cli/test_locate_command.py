@@ -1,7 +1,5 @@
 """``coview-stream locate``: files and exit code for success, failure and bad input."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The command line's frame: errors are one line, exit codes keep their promise, nothing heavy loads early."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """``--mount`` of ``locate``, ``serve`` and ``replay``: clouds of a turned lidar are those of the body."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """Processes of commands that run for long: signals end waits, and every record of the log is one line of JSON."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import logging

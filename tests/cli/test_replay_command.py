@@ -1,7 +1,5 @@
 """``coview-stream replay`` over real sockets, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

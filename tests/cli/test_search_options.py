@@ -1,7 +1,5 @@
 """``--risk`` and ``--reloc`` of ``locate`` and ``serve``, and ``build --learned``."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """``coview-stream serve`` ends on a signal, even while it waits, and refuses robots that it could not tell apart."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import socket

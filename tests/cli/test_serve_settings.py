@@ -1,7 +1,5 @@
 """``serve --config node.toml``: every option and setting, the command line before the file, mistakes by name."""
 
-from __future__ import annotations
-
 import pytest
 
 from coview_stream.cli import build_parser, main, serve

@@ -1,7 +1,5 @@
 """``keygen``, ``build --sign`` and ``--verify-key``: a map of somebody else is one line and exit code 2."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """``serve --state`` and ``--no-state``: where the last poses go, by default and by word."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import threading

@@ -1,7 +1,5 @@
 """``coview-stream watch``: table, JSON lines, viewer; signals, closed pipes and silence."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

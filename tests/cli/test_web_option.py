@@ -1,7 +1,5 @@
 """``--web`` of ``serve`` and ``watch``: the page of a live session, and addresses that are none."""
 
-from __future__ import annotations
-
 import json
 import queue
 import re

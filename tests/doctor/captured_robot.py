@@ -1,7 +1,5 @@
 """A robot that sends what a test says, as received by the doctor on a fake clock."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coview_stream.doctor.capture import RobotCapture, capture_cloud, capture_odometry

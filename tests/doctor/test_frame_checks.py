@@ -1,7 +1,5 @@
 """Clouds against odometry: the usual faults of a set-up on a simulated drive and, where they are, on real runs."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace

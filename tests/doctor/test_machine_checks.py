@@ -1,7 +1,5 @@
 """Findings about machine, libraries and map; probes survive a library that crashes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

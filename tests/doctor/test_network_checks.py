@@ -1,7 +1,5 @@
 """Collecting over a fake network, without time; and what plain TCP says."""
 
-from __future__ import annotations
-
 import json
 import socket
 

@@ -1,7 +1,5 @@
 """Findings about one channel: what is usual is ok, and every fault has its own name and remedy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from captured_robot import KEYS, SWEEP, capture, cloud, ns, odometry, steps, usual

@@ -1,7 +1,5 @@
 """A run whose clouds or odometry lie: the doctor names the sensor, without a map, and contradicts itself nowhere."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which codec reads a sample: option > Encoding > key > hint > magic."""
 
-from __future__ import annotations
-
 import pytest
 from codec_bytes import POINTS, STAMP, XYZ, cdr_cloud
 

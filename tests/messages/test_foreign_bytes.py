@@ -1,7 +1,5 @@
 """Bytes of foreign encoders (Cyclone DDS, JavaScript, Foxglove) are read, or refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bytes that must never change, in both directions: literal, or composed by hand in codec_bytes."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

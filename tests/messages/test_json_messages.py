@@ -1,7 +1,5 @@
 """Hypotheses and locations: strictly read, and as other readers see them."""
 
-from __future__ import annotations
-
 import json
 import math
 

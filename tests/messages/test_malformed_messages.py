@@ -1,7 +1,5 @@
 """Nothing but a message or a MessageError comes out of any bytes."""
 
-from __future__ import annotations
-
 import json
 import struct
 import tracemalloc

@@ -1,7 +1,5 @@
 """Clouds as drivers really lay them out: types, strides, byte orders, organised rows, times and rings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from codec_bytes import POINTS, STAMP, TURN, XYZ, cdr_cloud, pb_cloud, pb_pose

@@ -1,7 +1,5 @@
 """Runs without odometry, in files and in recordings, around a registration that knows the truth."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Folders as SC-LIO-SAM, MulRan, KITTI's raw data and FAST-LIO have them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Eqs 15-17 on cases small enough to be worked out by hand."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exported trajectories, read back by what reads such files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Pictures: each is a PNG that shows something, also where there is little to show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Picture of a map from above: what stands is told apart, and lies where it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

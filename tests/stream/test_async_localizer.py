@@ -1,7 +1,5 @@
 """AsyncLocalizer: the fixes of a Localizer, calls that never wait, and processes that die, stop or are forked away."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

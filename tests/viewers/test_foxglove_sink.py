@@ -1,7 +1,5 @@
 """The view in Foxglove: a recording is read back, and a client of the server sees the same topics."""
 
-from __future__ import annotations
-
 import socket
 
 import numpy as np

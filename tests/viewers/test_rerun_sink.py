@@ -1,7 +1,5 @@
 """The view in rerun: a file without a viewer, and one line where there is no display."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

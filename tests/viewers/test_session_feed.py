@@ -1,7 +1,5 @@
 """The feed of a session: what comes over the network, decoded and handed to every sink."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

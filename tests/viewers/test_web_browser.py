@@ -1,7 +1,5 @@
 """The page in a headless Chromium while frames stream: robots drawn, states told, the node lost and found."""
 
-from __future__ import annotations
-
 import json
 import threading
 

@@ -1,7 +1,5 @@
 """The server of the web page: its files and events, refusals, and that it waits for no client."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

@@ -1,7 +1,5 @@
 """Events of the web page: poses, statuses from anyone, scans in the map frame, the map."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

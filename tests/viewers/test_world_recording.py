@@ -1,7 +1,5 @@
 """A simulated world recorded in MCAP: survey, truth with the scans, odometry from the same beginning, by stamp."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The table of robots: its cells, and when they become empty. The tests set the time."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

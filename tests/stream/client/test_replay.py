@@ -1,7 +1,5 @@
 """Replays: what is sent, when and in which order, on a clock of the test's own."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Sites over zenoh, on loopback: served, fetched, followed while they change; nothing else of a directory is given."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A robot, and nodes without threads, declared on a network in memory."""
 
-from __future__ import annotations
-
 import pytest
 from fake_node import declared
 from fake_robot import Robot

@@ -1,7 +1,5 @@
 """A node without threads, its robots, and the network between them."""
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -1,7 +1,5 @@
 """A node as an operator has it: a process of its own, and a robot that drives."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """Errors, missing frames, latencies, and the deadlines of regular work."""
 
-from __future__ import annotations
-
 import pytest
 
 from coview_stream.stream.node.counters import ErrorLog, Latency, MissingFrames, PoseRate, Rate

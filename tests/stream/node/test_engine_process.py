@@ -1,7 +1,5 @@
 """Engine runners: results and failures of jobs, and an engine in a process of its own that dies and comes back."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """Queue of one robot's work for the engines, and the order of robots at an engine: nobody waits without end."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

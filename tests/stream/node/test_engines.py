@@ -1,7 +1,5 @@
 """The track and the search engine on the small world: together they are a localizer; robots do not mix."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

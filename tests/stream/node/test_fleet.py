@@ -1,7 +1,5 @@
 """Fleets: who serves a robot, which robots move when nodes come and go, and how a place is handed on."""
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -1,7 +1,5 @@
 """A fleet on machines of its own, network namespaces: a cable is pulled, a node hangs, and both come back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

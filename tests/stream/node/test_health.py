@@ -1,7 +1,5 @@
 """Health of a node: live, ready and why not; metrics that Prometheus can read; slow readers hold up nobody."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

@@ -1,7 +1,5 @@
 """Guesses of a robot's place from the network: bounded, checked, handed to the engine once, and told where refused."""
 
-from __future__ import annotations
-
 import logging
 import math
 

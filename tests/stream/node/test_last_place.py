@@ -1,7 +1,5 @@
 """The last pose on disk: comes back as it was, or not at all, and never as an exception."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Places that a node keeps between two starts: saved, handed over, forgotten; a bad disk is only a warning."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """A node that makes odometry itself, and its engine in a process that dies and comes back."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

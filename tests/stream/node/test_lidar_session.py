@@ -1,7 +1,5 @@
 """The session of a robot that sends clouds only; the test plays the odometry engine."""
 
-from __future__ import annotations
-
 import fake_robot
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The node on a network in memory: declared keys, statuses, queries, and its end."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

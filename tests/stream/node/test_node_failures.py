@@ -1,7 +1,5 @@
 """Failures of one robot and of the engines, and whose turn it is."""
 
-from __future__ import annotations
-
 import json
 import time
 from types import SimpleNamespace

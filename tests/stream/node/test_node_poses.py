@@ -1,7 +1,5 @@
 """The node's poses: a drive through the small world, formats, silence."""
 
-from __future__ import annotations
-
 import json
 import time
 

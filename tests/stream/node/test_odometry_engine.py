@@ -1,7 +1,5 @@
 """The engine behind ``serve --odometry kiss-icp``: robots apart, and honest about every new beginning."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 

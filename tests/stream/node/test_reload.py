@@ -1,7 +1,5 @@
 """Change of the map under a running node: no pose is lost, a map that cannot be used changes nothing."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

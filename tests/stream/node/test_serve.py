@@ -1,7 +1,5 @@
 """The start of a node: an error leaves nothing running; a node that has a key takes only maps signed with that key."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

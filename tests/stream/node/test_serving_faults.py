@@ -1,7 +1,5 @@
 """Clocks that jump and stand still, more frames than can be processed, and a full disk, with real processes."""
 
-from __future__ import annotations
-
 import resource
 import sys
 import time

@@ -1,7 +1,5 @@
 """Links that go bad between a node, a router and a robot, with real processes: found again, and no pose is false."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

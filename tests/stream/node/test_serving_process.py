@@ -1,7 +1,5 @@
 """Real processes: a served map is replaced, systemd gets notices, engines are killed and stopped."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """Every counter of a session, by the message that causes it."""
 
-from __future__ import annotations
-
 import numpy as np
 from fake_robot import (
     KEYS,

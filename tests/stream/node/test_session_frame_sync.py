@@ -1,7 +1,5 @@
 """Pairing of frames with odometry, and the reasons of a state without either."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_robot import KEYS, POINTS, SHA, Robot, cloud, ends, ns, odometry, pose, reason, tracking

@@ -1,7 +1,5 @@
 """Poses that may be believed, and silence that ends them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Events in random order: nothing raises, every cloud is counted once, no pose without a fix."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

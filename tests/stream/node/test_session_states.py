@@ -1,7 +1,5 @@
 """Session's epochs, its states after pauses and doubts, and their history."""
 
-from __future__ import annotations
-
 import json
 import random
 import re

@@ -1,7 +1,5 @@
 """A node of several maps: poses, places and guesses are in the frame of the one that they are of."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

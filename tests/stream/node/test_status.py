@@ -1,7 +1,5 @@
 """Statuses: bounded in size, with the router's reconnections and the places that a search considers."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

@@ -1,7 +1,5 @@
 """Notices to systemd: sent where a socket is named, and nowhere else; they stop when the node is not live."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """A robot in ROS 2, as foreign to the node under test as a driver is: real rclpy, a context and a thread of its own."""
 
-from __future__ import annotations
-
 import random
 import threading
 import time

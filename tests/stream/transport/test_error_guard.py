@@ -1,7 +1,5 @@
 """Errors of handlers in the log: how often, of how many places, and in which letters."""
 
-from __future__ import annotations
-
 import logging
 
 from coview_stream.stream.transport.error_guard import RateLimitedErrors

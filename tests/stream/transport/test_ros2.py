@@ -1,7 +1,5 @@
 """ROS 2 as transport, against a real rclpy over loopback: topics as Nav2 and RViz read them, bad input, restarts."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import signal

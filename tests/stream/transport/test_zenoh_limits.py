@@ -1,7 +1,5 @@
 """Over real sockets: a message that is too large is not copied, and reports never wait."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
