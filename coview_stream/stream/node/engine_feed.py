@@ -9,7 +9,7 @@ from functools import partial
 from typing import Generic, Protocol, TypeVar
 
 from coview_stream.stream.node.counters import last_line
-from coview_stream.stream.node.engine_process import DiedError, EngineRunner, FailedError, RejectedError
+from coview_stream.stream.node.engine_process import DiedError, EngineProcess, FailedError, RejectedError
 from coview_stream.stream.node.engine_queue import EngineQueue, Job, Result, RoundRobin, search_order
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
@@ -63,7 +63,7 @@ class EngineFeed(Generic[R]):
     def __init__(
         self,
         robots: Sequence[R],
-        engines: Mapping[str, EngineRunner],
+        engines: Mapping[str, EngineProcess],
         errors: RateLimitedErrors,
         on_change: Callable[[R | None], None],
     ) -> None:

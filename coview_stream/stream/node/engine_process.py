@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CoViewError
@@ -113,44 +113,11 @@ def engine_environment(kind: str) -> dict[str, str]:
     return threads | ours | {"OPENBLAS_NUM_THREADS": "1"}
 
 
-class EngineRunner(Protocol):
-    """Runs an engine's jobs one at a time.
+class EngineProcess:
+    """Runs an engine's jobs in a child process, one at a time. A child that hangs is killed.
 
     Attributes:
         on_doubt: called during a job if its frame contradicts the robot's place.
-    """
-
-    on_doubt: Callable[[], None]
-
-    def run(self, job: Job) -> Result:
-        """Do one job and wait for it; RejectedError, FailedError or DiedError."""
-        ...
-
-    @property
-    def pid(self) -> int | None:
-        """Process id, None while there is none."""
-        ...
-
-    @property
-    def ready(self) -> bool:
-        """Whether a job would be done at once."""
-        ...
-
-    def watch(self) -> None:
-        """Check the engine while it has no job, never waiting; a dead one is reported once, then started."""
-        ...
-
-    def end_stopped(self) -> None:
-        """Kill an engine that is stopped or hangs; called from any thread, once a second."""
-        ...
-
-    def close(self) -> None:
-        """End the engine; a job under way raises DiedError."""
-        ...
-
-
-class EngineProcess:
-    """Runs an engine's jobs in a child process. A child that hangs is killed.
 
     Args:
         kind: ``track``, ``search`` or ``odometry``.
@@ -218,15 +185,14 @@ class EngineProcess:
         Raises:
             CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
         """
-        if "ready" in self._awaited:
-            self._await("ready", cancelled)
+        self._await("ready", cancelled)
 
     def wait_prepared(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until a job would not wait any more; arguments and errors as of :meth:`wait_ready`."""
         for message in list(self._awaited):
             self._await(message, cancelled)
 
-    def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
+    def _await(self, message: str, cancelled: Callable[[], bool]) -> None:
         while message in self._awaited:
             with self._exchange(self.open_timeout) as pipe:
                 while not pipe.poll(_POLL_INTERVAL):
@@ -248,7 +214,7 @@ class EngineProcess:
             self._awaited.remove(kind)
 
     def run(self, job: Job) -> Result:
-        """Do one job; a dead child is started again first."""
+        """Do one job and wait for it; RejectedError, FailedError or DiedError. A dead child is started again first."""
         if self._child is None:
             self.start()
         try:

@@ -20,7 +20,7 @@ from coview_stream.errors import CoViewError, printable
 from coview_stream.localization.state import State
 from coview_stream.stream.node.counters import Rate
 from coview_stream.stream.node.engine_feed import EngineFeed
-from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineRunner
+from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineProcess
 from coview_stream.stream.node.robot_endpoints import GeoOutput, MapViewAnswer, RobotEndpoints
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
@@ -49,7 +49,7 @@ class OpenedMap(NamedTuple):
 
     sha256: str  # of the map
     # by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``
-    engines: Mapping[str, EngineRunner]
+    engines: Mapping[str, EngineProcess]
     sessions: Sequence[Session]  # one per robot, in the node's order, without any message
     file: Path | None = None  # that it was opened from; None where it is not needed
 

@@ -70,13 +70,6 @@ def test_any_bytes_are_a_place_or_an_input_error(payload):
             continue
 
 
-def test_guess_goes_to_the_engine_with_one_frame():
-    robot, guess = Robot(), PlaceGuess(1.0, 2.0)
-    assert robot.session.guess_place(guess)
-    assert robot.frame(0.0, unknown).guess is guess
-    assert robot.frame(0.1, unknown).guess is None
-
-
 def test_guess_that_comes_while_the_place_is_known_is_not_taken():
     robot = Robot().localized(0.0)
     assert not robot.session.guess_place(PlaceGuess(1.0, 2.0))

@@ -38,18 +38,12 @@ def jobs_of(robot, count=3, answer=unknown, begin=0.1):
 # ---- a session
 
 
-def test_pose_hint_goes_with_one_frame(robot):
-    robot.session.offer(LastPlace(SHA, 5, BEFORE))
-    first, *others = jobs_of(robot)
-    assert first is BEFORE
-    assert others == [None, None]
-
-
-def test_calibration_goes_with_the_pose_hint_alone(robot):
+def test_pose_hint_goes_with_one_frame_and_so_does_its_calibration(robot):
     known = Calibration(pitch=0.05)
     robot.session.offer(LastPlace(SHA, 5, BEFORE, calibration=known))
-    jobs = [robot.frame(0.1 + 0.1 * k, unknown) for k in range(2)]
-    assert [job.calibration for job in jobs] == [known, None]
+    jobs = [robot.frame(0.1 + 0.1 * k, unknown) for k in range(3)]
+    assert [job.hint for job in jobs] == [BEFORE, None, None]
+    assert [job.calibration for job in jobs] == [known, None, None]
     robot.session.restart_search("asked to search again", forget=True)
     assert robot.frame(0.5, unknown).calibration is None
 
@@ -109,17 +103,6 @@ def test_pose_hint_is_ignored_while_tracking(robot):
     assert jobs_of(robot, 2, tracking, 0.2) == [None, None]
     robot.session.engine_restarted()
     np.testing.assert_allclose(jobs_of(robot, 1, begin=0.4)[0], T_MAP_ODOM @ pose(0.6), atol=1e-9)
-
-
-def test_odometry_jump_hints_the_last_pose(robot):
-    robot.localized(0.1)
-    place = T_MAP_ODOM @ pose(0.2)
-    robot.moved(0.3, x=500.0)
-    assert robot.counters.odometry_jumps == 1
-    robot.moved(0.35, x=500.1)
-    robot.saw(0.4, now=robot.now)
-    robot.moved(0.45, x=500.2)
-    np.testing.assert_allclose(robot.session.take_job("track").hint, place, atol=1e-9)
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])

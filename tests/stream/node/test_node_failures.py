@@ -2,7 +2,6 @@
 
 import json
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -189,22 +188,6 @@ def test_robots_are_served_round_robin():
     assert served == list(names) * 10
 
 
-def test_search_engine_failure_is_reported(site):
-    def fail(job):
-        raise ValueError("the spectra are gone")
-
-    site.engine.answer = lambda job: unknown(job, ask=search_request())
-    site.search.engine = SimpleNamespace(run=fail, forget=site.engine.forget)
-    for k in range(5):
-        site.frame("r1", STEP * k)
-    status = site.status("r1")
-    assert (status["counters"]["searches"], status["counters"]["search_errors"]) == (0, 5)
-    assert any("the spectra are gone" in text for text in status["errors"])
-    site.search.engine = site.engine
-    site.frame("r1", 1.0)
-    assert site.status("r1")["counters"]["searches"] == 1
-
-
 @pytest.mark.slow
 def test_repeated_failures_are_rate_limited_in_the_log(site, caplog):
     site.engine.failing["r1"] = ValueError("bad frame")
@@ -275,24 +258,6 @@ def test_failing_status_is_not_retried_in_a_loop():
     finally:
         site.node.close()
     assert asked[2] - asked[0] > 0.5
-
-
-def test_unexpected_engine_error_does_not_stop_the_node():
-    site = Site("r1")
-    run = site.track.run
-    errors = [RuntimeError("unforeseen")]
-    site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
-    site.node.start()
-    try:
-        clock = iter(range(100_000))
-
-        def localized():
-            site.sees("r1", 0.02 * next(clock))
-            return site.net.samples("coview/r1/out/pose")
-
-        until(localized, 3.0)
-    finally:
-        site.node.close()
 
 
 def test_unencodable_pose_of_one_robot_does_not_affect_others():

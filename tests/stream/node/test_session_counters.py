@@ -44,6 +44,7 @@ def test_out_of_order_and_duplicate_frames_are_counted(robot):
     robot.saw(0.5, now=1001.0)
     robot.saw(0.5, now=1001.0)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 0)
+    assert "with the stamp of another cloud" in robot.session.errors.texts[0]
     robot.saw(0.4, now=1001.0)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
     assert robot.session.take_job("track").stamp_ns == ns(0.5)

@@ -98,15 +98,6 @@ def test_correction_does_not_change_published_stamps(robot):
     assert stamps[-1] == ns(1.95)
 
 
-def test_doubted_state_has_no_pose(robot):
-    robot.localized(0.0)
-    robot.frame(0.1, doubted, reason="rays pass through the map")
-    assert robot.session.pose() is None
-    assert robot.session.state() == (State.DOUBTED, "rays pass through the map")
-    robot.frame(0.2)
-    assert state(robot) is State.TRACKING
-
-
 def test_odometry_timeout_ends_pose(robot):
     robot.localized(0.0)
     robot.session.tick(robot.now + 0.49)
@@ -145,14 +136,6 @@ def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     robot.session.tick(robot.now + 0.6)
     robot.session.handle_result(job, tracking(job), robot.now + 0.7)
     assert robot.session.pose() is None
-    assert state(robot) is State.LOST
-
-
-def test_duplicate_odometry_does_not_prevent_timeout(robot):
-    robot.localized(0.0)
-    for k in range(20):
-        robot.moved(0.01, now=1000.0 + 0.05 * k)
-        robot.session.tick(robot.now)
     assert state(robot) is State.LOST
 
 
@@ -201,6 +184,7 @@ def test_odometry_jump_restarts_search(robot):
     assert robot.session.state() == (State.LOST, "odometry jumped")
     robot.moved(0.2, x=900.1)
     job = robot.job_for(0.18)
+    np.testing.assert_allclose(job.hint, T_MAP_ODOM @ pose(0.2), atol=1e-9)  # the newest that was verified
     assert job.epoch != first.epoch
     assert not job.require_verification  # the engine begins anew as well
     assert job.search_result is None
@@ -218,13 +202,12 @@ def test_restarted_sender_clock_may_publish_older_stamps():
 
 
 def test_reason_of_a_lost_robot_is_the_newest_and_the_loss_stays_in_the_history():
-    robot = Robot().localized(100.0)
-    for k in range(30):
-        robot.moved(0.05 * k, now=1100.1 + 0.05 * k)
-        robot.session.tick(robot.now)
-    robot.saw(1.42, now=1102.0)
+    robot = Robot().localized(0.0)
+    loss = "odometry jumped"
+    robot.moved(1.0, x=900.0, now=1101.9)
+    robot.moved(1.1, x=900.0, now=1102.0)
+    robot.saw(1.05, now=1102.0)
     robot.answered(lambda job: unknown(job, reason="no place stands out"), 1102.0)
-    loss = "the sender's clock started anew"
     assert robot.session.state() == (State.LOST, f"no place stands out; before: {loss}")
     robot.session.tick(1142.0)
     silent, _, before = reason(robot).partition("; before: ")

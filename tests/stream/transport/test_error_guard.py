@@ -2,6 +2,8 @@
 
 import logging
 
+import pytest
+
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 LOGGER = logging.getLogger("test")
@@ -27,3 +29,15 @@ def test_keys_of_strangers_are_bounded_and_reach_no_terminal_raw(caplog):
     for number in range(5000):
         errors.report(f"coview/x{number}", ValueError("bad"))
     assert len(errors._last) < 1000
+
+
+def test_panics_of_rust_are_caught_and_interrupts_are_not():
+    class PanicException(BaseException):
+        pass
+
+    errors = RateLimitedErrors(LOGGER)
+    with errors.catch("k") as caught:
+        raise PanicException("rust")
+    assert "rust" in str(caught.error)
+    with pytest.raises(KeyboardInterrupt), errors.catch("k"):
+        raise KeyboardInterrupt

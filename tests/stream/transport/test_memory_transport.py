@@ -6,7 +6,6 @@ import pytest
 
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.messages.types import Encoded, Sample
-from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.transport import Transport
 
@@ -65,30 +64,3 @@ def test_invalid_zenoh_key_is_refused() -> None:
         MemoryTransport().subscribe("a//b", print, "all")
     with pytest.raises(ConfigError):
         MemoryTransport().publisher("a/*", "data")
-
-
-def test_rate_limited_errors_count_suppressed_messages(caplog: pytest.LogCaptureFixture) -> None:
-    now = [0.0]
-    guard = RateLimitedErrors(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
-
-    for now[0], place in ((0.0, "a/key"), (1.0, "a/key"), (9.0, "a/key"), (11.0, "a/key"), (11.0, "b/key")):
-        with guard.catch(place):
-            raise ValueError("no")
-    lines = [record.getMessage() for record in caplog.records]
-    assert lines == [
-        "a/key: ValueError: no",
-        "a/key: ValueError: no (2 more since the last line)",
-        "b/key: ValueError: no",
-    ]
-
-
-def test_rate_limited_errors_catch_panics_but_not_interrupts() -> None:
-    class PanicException(BaseException):
-        pass
-
-    guard = RateLimitedErrors(logging.getLogger("guard"))
-    with guard.catch("k") as caught:
-        raise PanicException("rust")
-    assert "rust" in str(caught.error)
-    with pytest.raises(KeyboardInterrupt), guard.catch("k"):
-        raise KeyboardInterrupt
