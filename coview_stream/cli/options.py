@@ -65,15 +65,6 @@ def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mappin
         )  # fmt: skip
 
 
-def fill_from_file(
-    args: argparse.Namespace, path: Path, parser: argparse.ArgumentParser, tables: Collection[str]
-) -> dict[str, dict[str, Any]]:
-    """As :func:`fill_from_settings`, from a TOML file."""
-    from coview_stream.config.settings_file import read_settings
-
-    return fill_from_settings(args, read_settings(path), path, parser, tables)
-
-
 def fill_from_settings(
     args: argparse.Namespace, settings: Mapping[str, Any], path: Path | str, parser: argparse.ArgumentParser,
     tables: Collection[str],

@@ -27,7 +27,6 @@ from coview_stream.cli.options import (
     add_state,
     blaming_file,
     check_codec,
-    fill_from_file,
     fill_from_settings,
     hide_rare,
     host_port,
@@ -205,7 +204,9 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     parameters: dict[str, dict[str, Any]] = _ros_parameters(args, declared) if args.ros2 else {}
     in_file: set[str] = args.in_file if args.ros2 else set()
     if args.config is not None:
-        tables |= fill_from_file(args, args.config, declared, TABLES)
+        from coview_stream.config.settings_file import read_settings
+
+        tables |= fill_from_settings(args, read_settings(args.config), args.config, declared, TABLES)
         in_file |= args.in_file
     if args.ros2 and args.ros_node is None:  # the file says so
         parameters = _ros_parameters(args, declared)

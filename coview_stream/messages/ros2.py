@@ -54,7 +54,8 @@ def _check_encapsulation(payload: bytes, name: str) -> None:
         raise MessageError(f"not a {name} in CDR: {encoding}; publish plain CDR")
 
 
-def _read(payload: bytes, name: str) -> Any:
+def read(payload: bytes, name: str) -> Any:
+    """Read a message of the type ``name`` in CDR; MessageError if it is none."""
     _check_encapsulation(payload, name)
     try:
         return store().deserialize_cdr(memoryview(payload), name)
@@ -113,7 +114,7 @@ def decode_cloud(sample: Sample) -> CloudMessage:
     if livox.is_custom(sample.payload):
         return livox.decode(sample.payload)
     _refuse_many_fields(sample.payload)
-    cloud = _read(sample.payload, CLOUD)
+    cloud = read(sample.payload, CLOUD)
     order = ">" if cloud.is_bigendian else "<"
     fields = tuple((f.name, order + _KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in _KINDS)
     table = Table(cloud.data, fields, cloud.point_step, cloud.width, cloud.height, cloud.row_step)
@@ -122,13 +123,13 @@ def decode_cloud(sample: Sample) -> CloudMessage:
 
 def decode_odometry(sample: Sample) -> OdometryMessage:
     """Read an Odometry; its frames and covariances are ignored."""
-    message = _read(sample.payload, ODOMETRY)
+    message = read(sample.payload, ODOMETRY)
     return OdometryMessage(_stamp(message), _pose(message))
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
     """Read a PoseWithCovarianceStamped; fields that the type lacks are NaN or empty."""
-    message = _read(sample.payload, POSE)
+    message = read(sample.payload, POSE)
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     return bare_pose(_stamp(message), _pose(message), message.header.frame_id, covariance)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 
 import numpy as np
 
 from coview_stream.errors import MessageError
 from coview_stream.geometry.transforms import Pose, inverse
+from coview_stream.messages import ros2
 from coview_stream.messages.validation import checked_pose, stamp_join
 
 TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -23,35 +23,13 @@ _MAX_FRAMES = 1000  # a hostile recording could name millions
 
 def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
     """Yield stamp in ns, parent, child and T_parent_child (4, 4) of a TFMessage in CDR; MessageError if damaged."""
-    if payload[:2] not in (b"\0\0", b"\0\1"):
-        raise MessageError("not a message in CDR")
-    order, at = (">", "<")[payload[1]], 4
-
-    def take(kinds: str, align: int) -> tuple[float, ...]:
-        nonlocal at
-        at = 4 + (at - 4 + align - 1 & -align)
-        values = struct.unpack_from(order + kinds, payload, at)
-        at += struct.calcsize(order + kinds)
-        return values
-
-    def name() -> str:
-        nonlocal at
-        length = int(take("I", 4)[0])
-        at += length
-        return payload[at - length : at].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
-
-    try:
-        for _ in range(int(take("I", 4)[0])):
-            sec, nanosec = take("iI", 4)
-            parent, child = name(), name()
-            numbers = take("7d", 8)
-            try:
-                T = checked_pose(numbers[:3], numbers[3:])
-            except MessageError:  # a rotation of zeros, say; the other transforms are valid
-                continue
-            yield stamp_join(int(sec), int(nanosec)), parent, child, T
-    except struct.error as error:
-        raise MessageError("the message is truncated") from error
+    for row in ros2.read(payload, TYPES[0]).transforms:
+        t, q, stamp = row.transform.translation, row.transform.rotation, row.header.stamp
+        try:
+            T = checked_pose((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+        except MessageError:  # a rotation of zeros, say; the other transforms are valid
+            continue
+        yield stamp_join(stamp.sec, stamp.nanosec), row.header.frame_id.lstrip("/"), row.child_frame_id.lstrip("/"), T
 
 
 class FrameTree:
