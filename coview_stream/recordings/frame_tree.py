@@ -85,12 +85,12 @@ class FrameTree:
 
         It is the highest transform above the lidar that moves, or is called odometry, but not in the map.
         """
-        moving = [child for child in self.above(self.lidar)[:-1] if child in self._samples and self._is_odometry(child)]
+        moving = [
+            child for child in self.above(self.lidar)[:-1]
+            if child in self._samples and (child in self._moved or "odom" in self._parents[child][0])
+        ]  # fmt: skip
         moving = [child for child in moving if self._parents[child][0] not in _WORLDS] or moving[:1]
         return (self._parents[moving[-1]][0], moving[-1], self._samples[moving[-1]]) if moving else None
-
-    def _is_odometry(self, child: str) -> bool:
-        return child in self._moved or "odom" in self._parents[child][0]
 
     def above(self, name: str) -> list[str]:
         """Return a frame and those above it, upward."""

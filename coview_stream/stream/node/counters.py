@@ -63,9 +63,9 @@ class Counters:
     poses: int = 0  # poses published
     engine_restarts: int = 0  # times an engine was started again
 
-    def count(self, name: str, more: int = 1) -> None:
-        """Add to one counter."""
-        setattr(self, name, getattr(self, name) + more)
+    def count(self, name: str) -> None:
+        """Add one to a counter."""
+        setattr(self, name, getattr(self, name) + 1)
 
     def to_json(self) -> dict[str, int]:
         """Plain data for the status."""

@@ -278,29 +278,6 @@ class Inputs:
         self.odometry.continue_from(other.odometry)
         self._newest, self._mount = other._newest, other._mount
 
-    # ---- lidar odometry: none here
-
-    @property
-    def has_job(self) -> bool:
-        """Whether a frame waits for the odometry engine, without the lock."""
-        return False
-
-    def take_job(self) -> OdometryJob | None:
-        """Hand the oldest frame to the odometry engine."""
-        return None
-
-    def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
-        """Add the odometry of a frame, and the frame; each break has to be applied before the iteration goes on."""
-        return iter(())
-
-    def job_failed(self, job: OdometryJob, reason: str, rejected: bool) -> Break | None:
-        """Count a frame without odometry; return the break if the engine has forgotten the robot."""
-        return None
-
-    def restart_odometry(self, reason: str) -> Break | None:
-        """Begin the lidar odometry again."""
-        return None
-
     def waiting_for(self) -> str:
         """Return the missing input of a robot of which no frame has been processed."""
         keys, counters = self.keys, self.counters
@@ -384,11 +361,11 @@ class LidarInputs(Inputs):
 
     @property
     def has_job(self) -> bool:
-        """As of :class:`Inputs`."""
+        """Whether a frame waits for the odometry engine, without the lock."""
         return self._under_way is None and len(self._waiting) > 0
 
     def take_job(self) -> OdometryJob | None:
-        """As of :class:`Inputs`; None while one is under way."""
+        """Hand the oldest frame to the odometry engine; None while one is under way."""
         if not self.has_job:
             return None
         self._under_way = self._waiting.popleft()
@@ -397,7 +374,10 @@ class LidarInputs(Inputs):
         return OdometryJob(self.keys.robot, self._epoch, message.stamp_ns, message.points, times, self.lidar)
 
     def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
-        """As of :class:`Inputs`; jobs from before a reset are ignored."""
+        """Add the odometry of a frame, and the frame; each break has to be applied before the iteration goes on.
+
+        Jobs from before a reset are ignored.
+        """
         if job.epoch < self._first_epoch:
             return
         frame, self._under_way = self._under_way, None
@@ -413,7 +393,7 @@ class LidarInputs(Inputs):
         self._frames.add(replace(frame.message, points=points, times=None, rings=None), frame.received)
 
     def job_failed(self, job: OdometryJob, reason: str, rejected: bool) -> Break | None:
-        """As of :class:`Inputs`."""
+        """Count a frame without odometry; return the break if the engine has forgotten the robot."""
         if job.epoch < self._first_epoch:
             return None
         self._under_way = None
@@ -424,8 +404,8 @@ class LidarInputs(Inputs):
             return None
         return self.restart_odometry("lidar odometry failed on a frame")
 
-    def restart_odometry(self, reason: str) -> Break | None:
-        """As of :class:`Inputs`."""
+    def restart_odometry(self, reason: str) -> Break:
+        """Begin the lidar odometry again."""
         self._epoch += 1
         self.odometry.clear()
         return Break(reason)

@@ -143,9 +143,9 @@ class Session:
             self._now = float("-inf")  # local time of the newest tick
             self.counters, self.errors, self.history = Counters(), ErrorLog(), StateHistory()
             given = (self.keys, self.config, self._codecs, self.counters, self.errors)
-            self.inputs: Inputs = (
-                Inputs(*given) if self._lidar is None else LidarInputs(*given, self._lidar, self._epoch)
-            )
+            # how the clouds become odometry; None if the robot sends it
+            self._odometry = None if self._lidar is None else LidarInputs(*given, self._lidar, self._epoch)
+            self.inputs: Inputs = self._odometry or Inputs(*given)
             self.queue = EngineQueue(self.keys.robot, self._epoch, self.counters, self.errors)
             self.robot_state: RobotState = RobotState(self.keys.robot, self.map_sha256, self.counters, self.hints)
 
@@ -217,14 +217,18 @@ class Session:
         """Whether there is a job for ``track``, ``search`` or ``odometry``; without the lock: perhaps no more."""
         if engine == "track":
             return self.queue.has_frame
-        return self.inputs.has_job if engine == "odometry" else self.queue.search_demand is not None
+        if engine == "odometry":
+            return self._odometry is not None and self._odometry.has_job
+        return self.queue.search_demand is not None
 
     def take_job(self, engine: str) -> Job | None:
         """Hand the newest frame or keyframe to ``track`` or ``search``, the oldest frame to ``odometry``."""
         with self.lock:
             if engine == "track":
                 return self.queue.take_frame(self.robot_state.requires_verification, self.hints)
-            return self.inputs.take_job() if engine == "odometry" else self.queue.take_search_request()
+            if engine == "odometry":
+                return None if self._odometry is None else self._odometry.take_job()
+            return self.queue.take_search_request()
 
     def handle_result(self, job: Job, result: Result, now: float) -> None:
         """Apply the result of a job at local time ``now``: a fix at once, that of a search with the next frame."""
@@ -237,8 +241,8 @@ class Session:
                     self._record_state()
             elif isinstance(job, SearchJob) and isinstance(result, SearchResult):
                 self.queue.search_done(job, result, now)
-            elif isinstance(job, OdometryJob) and isinstance(result, OdometryResult):
-                for interruption in self.inputs.job_done(job, result, now):
+            elif isinstance(job, OdometryJob) and isinstance(result, OdometryResult) and self._odometry is not None:
+                for interruption in self._odometry.job_done(job, result, now):
                     self._proceed(interruption, now)
                 self._proceed(None, now)
                 self._record_state()
@@ -258,7 +262,7 @@ class Session:
                     self.restart_search("the engine failed on a frame")
             elif isinstance(job, SearchJob):
                 self.queue.search_failed(job, reason)
-            elif (interruption := self.inputs.job_failed(job, reason, rejected)) is not None:
+            elif self._odometry is not None and (interruption := self._odometry.job_failed(job, reason, rejected)):
                 self.restart_search(interruption.reason)
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
@@ -271,10 +275,9 @@ class Session:
                 reason = f"the engine was started again: {why}"
                 self.robot_state.explain_loss(reason)
                 self.restart_search(reason)
-            elif engine == "odometry" and (
-                interruption := self.inputs.restart_odometry(f"lidar odometry was started again: {why}")
-            ):
-                self.restart_search(interruption.reason)
+            elif self._odometry is not None and engine == "odometry":
+                again = self._odometry.restart_odometry(f"lidar odometry was started again: {why}")
+                self.restart_search(again.reason)
 
     # ---- published
 

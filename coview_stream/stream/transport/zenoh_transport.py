@@ -323,7 +323,10 @@ class ZenohTransport:
         session.close()
 
     def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
-        _require_key(key)
+        import zenoh
+
+        with zenoh_errors(f"key {key!r}"):
+            zenoh.KeyExpr(key)  # refuses what is no key expression
         with self._lock:
             if self._closing.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")
@@ -367,11 +370,3 @@ class ZenohTransport:
             name_of_thread = f"coview {name} {number + 1}" if count > 1 else f"coview {name}"
             self._threads.append(threading.Thread(target=target, args=args, name=name_of_thread, daemon=True))
             self._threads[-1].start()
-
-
-def _require_key(key: str) -> None:
-    """Raise TransportError unless ``key`` is a key expression."""
-    import zenoh
-
-    with zenoh_errors(f"key {key!r}"):
-        zenoh.KeyExpr(key)
