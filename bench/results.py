@@ -6,27 +6,32 @@ own.
 
 ``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one code, for a release: a table is
 kept in DIR as soon as it is there, a second call goes on with those that are missing, and the page is written once all
-are of one code (in DIR, if they are quick). Tables without times run side by side, one on each core, then the others
-alone. It says what is left, and about how long that takes: a release is to end in 12 hours on two cores. For that,
-``integrity`` ends after three hours, with as many of its 3,000 runs as are there: run it alone with ``--work
-DIR/worlds`` before, on as many days as it takes. Tables of the page that no command makes are kept below the others.
+are of one code (in DIR, if they are quick). The most valuable tables come first. Those without times run side by side,
+one on each core, the others alone; most keep the results of each drive or site in ``DIR/worlds`` as well, so that an
+interruption costs minutes (``soak``, an hour in one piece, begins anew). It says what is left, and about how long that
+takes: at most 12 hours on two cores. What a table leaves out for that stands behind ``thinned``. Tables of the page
+that no command makes are kept below the others.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import traceback
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
-from bench.__main__ import BENCHMARKS, BUSY, parser_of, tables_of
+from bench.__main__ import BUSY, parser_of, tables_of
 from bench.harness.files import ROOT, commit, environment, fingerprint
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
@@ -35,58 +40,71 @@ from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
 
-ABLATION = ("channels", "registration", "localizer", "elsewhere")
-COMMANDS = {
-    **{name: name for name in BENCHMARKS if name not in ("ground", "ablation", "challenge")},
-    "integrity": "integrity --minutes 180",
-    "changed ground": "ground",
-    "throughput": "engine --throughput",
-    "city": "city --side 2 4",
-    **{f"ablation, {group}": f"ablation --only {group}" for group in ABLATION},
-    "ablation, spacing": "ablation --only spacing --picture docs/images/spacing.png",
-    "accuracy": "accuracy --only worlds",
-    "dirt": "accuracy --only dirt",
-    "conditions beside the paper": "conditions --conditions base --paper",
-    "airborne-like maps": "conditions --conditions base --densities 4 8 20 --paper",
-    "overlap": "conditions --overlaps 5 20 35 50 65 85 "
-    "--sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
-    "lidars": "stream lidars",
-    "forest_drives": "forest_drives --plots docs/images",
-    "fuzz": "fuzz --seconds 60",
-    "soak": "soak --minutes 60",
-}
-"""Name of each table, and the command that prints it."""
 
-QUICK = {
-    "integrity": "integrity --count 12 --minutes 2",
-    "conditions": "conditions --conditions base pitch:3 --sets kitti04 handheld_livox",
-    "conditions beside the paper": "conditions --conditions base --sets kitti04 --paper",
-    "airborne-like maps": "conditions --conditions base --densities 8 --sets kitti04",
-    "overlap": "conditions --overlaps 35 --sets kitti04",
-    **{f"ablation, {group}": f"ablation --only {group} --sites kitti04" for group in (*ABLATION, "spacing")},
-    "protection": "protection --worlds 1",
-    "covariance": "covariance --sets kitti04",
-    "smooth": "smooth kitti04",
-    "memory": "memory --km2 0.05",
-    "fuzz": "fuzz --seconds 5",
-    "soak": "soak --minutes 2",
-}
-"""Commands that are other ones with ``--quick``, beside that option."""
+class Table(NamedTuple):
+    """How a table is made."""
 
-SIDE_BY_SIDE = {
-    "accuracy", "dirt", "conditions", "conditions beside the paper", "airborne-like maps", "overlap", "changed ground",
-    "faults", "tracking", "smooth", "covariance", "protection", "forest", "forest_drives", "changes",
-    *(f"ablation, {group}" for group in ABLATION),
+    command: str
+    minutes: float  # about, on quiet cores, until the folder of a release says how long it took here
+    beside: bool = False  # runs beside others, on a core of its own: no time in it has a target
+    quick: str = ""  # the command beside --quick, if it is another one
+    thinned: str = ""  # what is left out, so that all ends in twelve hours
+
+
+SETS_OF_TWO = "--sets kitti04 handheld_livox --conditions base pitch:3"
+
+TABLES = {
+    "integrity": Table("integrity", 290, quick="integrity --count 12 --minutes 2"),
+    "accuracy": Table("accuracy --only worlds", 30, True),
+    "conditions": Table("conditions", 15, True, f"conditions {SETS_OF_TWO}"),
+    "forest": Table("forest", 30, True),
+    "tracking": Table("tracking", 40, True),
+    "dirt": Table("accuracy --only dirt --drives 2", 30, True, "accuracy --only dirt", "two of the four drives"),
+    "protection": Table(
+        "protection --worlds 26", 70, True, "protection --worlds 1",
+        "26 of 30 worlds of each family; 999 blocks, which a risk of 1e-3 needs, are in 25",
+    ),
+    "exposure": Table("exposure --worlds 26", 1, True, f"exposure --worlds 1 {SETS_OF_TWO}"),
+    "faults": Table("faults", 15, True),
+    "conditions beside the paper": Table(
+        "conditions --conditions base --paper", 5, True, "conditions --conditions base --sets kitti04 --paper"
+    ),
+    "forest_drives": Table("forest_drives --plots docs/images", 30, True, "forest_drives"),
+    "challenge": Table("challenge --count 40", 20, True, "challenge", "the first 40 runs, 3 GB"),
+    "peers": Table("peers --places 12 --limit 90", 40, quick="peers --limit 60", thinned="12 places of each world"),
+    "search": Table("search", 5),
+    "engine": Table("engine", 5),
+    "memory": Table("memory", 10, quick="memory --km2 0.05"),
+    "start": Table("start", 5),
+    "soak": Table("soak --minutes 60", 62, quick="soak --minutes 1 --every 10"),
+    "city": Table("city --side 2 4", 30),
+    "stream": Table("stream raw cdr protobuf jitter robots", 8, quick="stream jitter"),
+    "lidars": Table("stream lidars", 5),
+    "throughput": Table("engine --throughput", 7),
+    "registration": Table("registration", 10),
+    "fleet": Table("fleet", 4),
+    "fuzz": Table("fuzz --seconds 60", 18, quick="fuzz --seconds 5"),
+    "ablation, spacing": Table(
+        "ablation --only spacing --picture docs/images/spacing.png", 5, False, "ablation --only spacing --sites kitti04"
+    ),
+    **{
+        f"ablation, {group}": Table(f"ablation --only {group}", 8, True, f"ablation --only {group} --sites kitti04")
+        for group in ("channels", "registration", "localizer", "elsewhere")
+    },
+    "changed ground": Table("ground", 30, True),
+    "overlap": Table(
+        "conditions --overlaps 5 20 35 50 65 85 --sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
+        13, True, "conditions --overlaps 35 --sets kitti04",
+    ),
+    "airborne-like maps": Table(
+        "conditions --conditions base --densities 4 8 20 --paper", 12, True,
+        "conditions --conditions base --densities 8 --sets kitti04",
+    ),
+    "covariance": Table("covariance", 10, True, "covariance --sets kitti04"),
+    "smooth": Table("smooth", 20, True, "smooth kitti04"),
+    "changes": Table("changes", 10, True),
 }  # fmt: skip
-"""Tables that run side by side, one on each core: no time in them has a target."""
-
-MINUTES = {
-    "integrity": 180, "soak": 61, "accuracy": 30, "dirt": 60, "tracking": 40, "protection": 80, "conditions": 15,
-    "forest": 30, "forest_drives": 30, "changed ground": 30, "city": 30, "smooth": 20, "stream": 15,
-    "faults": 15, "overlap": 13, "airborne-like maps": 12, "covariance": 10, "peers": 15, "memory": 10, "lidars": 10,
-    "fleet": 10, "registration": 10, "throughput": 7,
-}  # fmt: skip
-"""About how long a table takes on two quiet cores, the others five minutes, until DIR says how long it took here."""
+"""All tables by name, the most valuable first. ``transports`` is in none: it needs ROS 2."""
 
 HEAD = """# Results
 
@@ -97,9 +115,9 @@ measured code. `python -m bench results --only NAME...` measures again and repla
 
 def chosen(names: Sequence[str]) -> list[str]:
     """Return the names of the tables to make; InputError for an unknown one."""
-    if unknown := [name for name in names if name not in COMMANDS]:
-        raise InputError(f"no table {', '.join(unknown)}; there are {', '.join(COMMANDS)}")
-    return list(names) or list(COMMANDS)
+    if unknown := [name for name in names if name not in TABLES]:
+        raise InputError(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    return list(names) or list(TABLES)
 
 
 def block(name: str, command: str, text: str, date: str, version: str, machine: str = "2 shared cores") -> str:
@@ -115,6 +133,9 @@ def replaced(page: str, name: str, part: str) -> str:
     return new if count else f"{page.rstrip()}\n{part}"
 
 
+_RUNNING: set[subprocess.Popen[bytes]] = set()
+
+
 def measured(command: str, threads: int | None = None) -> str:
     """Run a benchmark in a process of its own; return its tables, then its targets or all rows, without padding.
 
@@ -123,17 +144,17 @@ def measured(command: str, threads: int | None = None) -> str:
     name, *words = command.split()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows.json"
-        code = subprocess.run(
-            [sys.executable, "-m", "bench", name, *words, "--json", str(file)],
-            env=environment(threads),
-            stdout=sys.stderr,
-        ).returncode
+        line = [sys.executable, "-m", "bench", name, *words, "--json", str(file)]
+        process = subprocess.Popen(line, env=environment(threads), stdout=sys.stderr)
+        _RUNNING.add(process)
+        code = process.wait()
+        _RUNNING.discard(process)
         if code not in (0, 1) or not file.is_file():
             return ""
         rows = [Row.from_dict(values) for values in json.loads(file.read_text())]
     own = tables_of(name, rows, parser_of(name).parse_args(words))
     parts = [f"{title}\n\n{text}".strip() for title, text in own.items()]
-    shown = [row for row in rows if row.target] if own else rows
+    shown = [row for row in rows if row.target or not own]
     if shown:
         cells = [[row.name.removeprefix(name).lstrip("/,: "), *row.cells()[1:]] for row in shown]
         parts.append(table(COLUMNS, cells))
@@ -147,7 +168,7 @@ def main(arguments: Sequence[str], *, release: bool = False) -> int:
     if release:
         parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of worlds and tables")
         parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="cores (all)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(COMMANDS))
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(TABLES))
     parser.add_argument("--quick", action="store_true", help="smaller sizes, in tables of their own")
     parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE.relative_to(ROOT)})")
     asked = parser.parse_args(arguments)
@@ -173,16 +194,18 @@ def main(arguments: Sequence[str], *, release: bool = False) -> int:
 
 def _part(name: str, asked: Namespace, threads: int | None = None) -> str:
     """Measure a table; return its part of the page, empty if it failed."""
-    command = f"{QUICK.get(name, COMMANDS[name])} --quick" if asked.quick else COMMANDS[name]
+    of = TABLES[name]
+    command = f"{of.quick or of.command} --quick" if asked.quick else of.command
     print(f"=== {command}", file=sys.stderr, flush=True)
     load, begin = os.getloadavg()[0], time.monotonic()
     text = measured(command, threads)
     took = (time.monotonic() - begin) / 60
-    print(f"=== {command}: {took:.1f} min", file=sys.stderr, flush=True)
+    print(f"=== {command}: {took:.1f} min{'' if text else ', FAILED'}", file=sys.stderr, flush=True)
     title = f"{name}, quick" if asked.quick else name
     busy = load > BUSY and threads is None
     machine = f"{os.cpu_count()} shared cores{f', load {load:.0f} from other work' * busy}"
-    version = f"{commit()}, code {_code()}, {took:.1f} min"
+    thinned = f"; thinned: {of.thinned}" if of.thinned and not asked.quick else ""
+    version = f"{commit()}, code {_code()}, {took:.1f} min{thinned}"
     return text and block(title, command, text, time.strftime("%Y-%m-%d"), version, machine)
 
 
@@ -192,21 +215,33 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
     code = _code()
     tables = asked.work / f"tables-{code}{'-quick' * asked.quick}"
     tables.mkdir(parents=True, exist_ok=True)
-    files = {name: tables / f"{name.replace(' ', '_')}.md" for name in COMMANDS}
+    files = {name: tables / f"{name.replace(' ', '_')}.md" for name in TABLES}
+
+    stopped = threading.Event()
 
     def make(name: str, threads: int | None) -> None:
-        if _code() == code and (part := _part(name, asked, threads)) and _code() == code:
+        part = ""
+        if _code() == code and not stopped.is_set():
+            try:
+                part = _part(name, asked, threads)
+            except Exception:  # the other tables go on
+                traceback.print_exc()
+        if part and _code() == code and not stopped.is_set():  # an interrupted soak tells of what it did
             with atomic_path(files[name]) as file:
                 file.write_text(part)
 
     left = [name for name in names if not files[name].is_file()]
     print(f"code {code}: {len(left)} of {len(names)} tables to make{_about(left, asked)}", file=sys.stderr, flush=True)
-    beside = sorted(SIDE_BY_SIDE.intersection(left), key=lambda name: -MINUTES.get(name, _MINUTES))
-    with ThreadPoolExecutor(max(1, asked.jobs)) as pool:
-        list(pool.map(make, beside, [1] * len(beside)))
-    for name in left:
-        if name not in beside:
-            make(name, None)
+    for beside, some in itertools.groupby(left, lambda name: TABLES[name].beside):
+        with ThreadPoolExecutor(max(1, asked.jobs) if beside else 1) as pool:
+            try:
+                list(pool.map(make, some, itertools.repeat(1 if beside else None)))
+            except BaseException:  # interrupted, or told to end
+                stopped.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in list(_RUNNING):
+                    process.terminate()
+                raise
     if _code() != code:
         print("bench release: the code changed meanwhile; begin again", file=sys.stderr)
         return 2
@@ -221,29 +256,31 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
     return int(bool(missing))
 
 
-_MINUTES = 5.0
-
-
 def _about(names: Sequence[str], asked: Namespace) -> str:
-    """Say how long tables will take, as earlier ones in the folder took, or else by :data:`MINUTES`."""
-    took = {} if asked.quick else dict[str, float](MINUTES)
+    """Say how long tables will take, as earlier ones in the folder took, or else as :data:`TABLES` says."""
+    minutes = {name: 0.5 if asked.quick else TABLES[name].minutes for name in names}
     for file in sorted(asked.work.glob("tables-*/*.md"), key=os.path.getmtime):
-        found = re.match(r"(?s)\n<!-- results: ([^\n]*?)(, quick)? -->.*?, ([\d.]+) min\n", file.read_text())
-        if found and bool(found[2]) == asked.quick:
-            took[found[1]] = float(found[3])
-    usual = 0.5 if asked.quick else _MINUTES
-    minutes = {name: took.get(name, usual) for name in names}
-    beside = sum(value for name, value in minutes.items() if name in SIDE_BY_SIDE)
-    return f", about {(sum(minutes.values()) - beside + beside / max(1, asked.jobs)) / 60:.1f} h"
+        found = re.match(
+            r"(?s)\n<!-- results: ([^\n]*?)(, quick)? -->[^`]*`[^`]*`[^\n]*, ([\d.]+) min", file.read_text()
+        )
+        if found and found[1] in minutes and bool(found[2]) == asked.quick:
+            minutes[found[1]] = float(found[3])
+    hours = [value / 60 / (asked.jobs if TABLES[name].beside else 1) for name, value in minutes.items()]
+    return f", about {sum(hours):.1f} h"
 
 
 def without(page: Path) -> str:
-    """Return a page's tables that no command makes, or that need files of others; they name their own commit."""
-    parts = (
-        re.findall(r"(?s)\n<!-- results: ([^\n]+) -->\n(.*?)<!-- end -->\n", page.read_text()) if page.is_file() else []
-    )
-    kept = [(name, text) for name, text in parts if name not in COMMANDS and not name.endswith(", quick")]
-    return "".join(f"\n<!-- results: {name} -->\n{text}<!-- end -->\n" for name, text in kept)
+    """Return a page's tables that no command of :data:`TABLES` makes; they name their own commit."""
+    text = page.read_text() if page.is_file() else ""
+    made = {entry.command.split()[0] for entry in TABLES.values()}
+
+    def outdated(name: str, part: str) -> bool:
+        by = re.search(r"`python -m bench (\w+)([^`]*)`", part.partition("\n|")[0])
+        return name in TABLES or name.endswith(", quick") or bool(by and by[1] in made and "FILE" not in by[2])
+
+    parts = re.findall(r"(?s)\n<!-- results: ([^\n]+) -->\n(.*?)<!-- end -->\n", text)
+    kept = [(name, part) for name, part in parts if not outdated(name, part)]
+    return "".join(f"\n<!-- results: {name} -->\n{part}<!-- end -->\n" for name, part in kept)
 
 
 def _code() -> str:

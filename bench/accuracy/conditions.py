@@ -418,7 +418,7 @@ def _bin(percent: float, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """All runs; with ``--paper`` they stand beside the paper's, with ``--overlaps`` below a summary."""
-    runs = [row.details for row in rows if row.details]
+    runs = [row.details for row in rows if "set" in row.details]
     if asked.overlaps:
         bins = listed(BINS, [_bin(percent, runs) for percent in asked.overlaps])
         return {"by overlap": bins, "": listed((COLUMNS[0], OVERLAP, *COLUMNS[3:5], *COLUMNS[6:]), runs)}

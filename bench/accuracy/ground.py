@@ -13,7 +13,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,18 +21,21 @@ from typing import Any
 import numpy as np
 
 from bench.accuracy.scores import FALSE_DEGREES, FALSE_METRES, Track, errors
+from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.ground import ground_mask
 from coview_stream.clouds import read_cloud, write_cloud
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Poses
 from coview_stream.sim import SimulationConfig
 from coview_stream.sim.dirt.scene import drawn_parts
 from coview_stream.sim.mesh import EMPTY
 from coview_stream.sim.odometry import drifting_odometry
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
+from coview_stream.sim.simulate import base_map, frames, scene_of, trajectories
 
 METHODS = ("cloth", "morphological")
 _GROUND_CLASS = 2
@@ -95,34 +98,37 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def _changed(asked: Namespace) -> Iterator[Row]:
-    from coview_stream.sim.simulate import base_map, scene_of, trajectories
-
+    metres, every = (25.0, 4) if asked.quick else (asked.metres, 1)
     for number, (kind, sensor) in enumerate(_SITES[: 1 if asked.quick else asked.sites]):
-        config = SimulationConfig(kind, sensor, seed=asked.seed + number, size=200.0, length=asked.metres)
-        scene = scene_of(config)
-        level = trajectories(scene, config)[1]
-        gone, new, _ = np.split(
-            np.random.default_rng([config.seed, 37]).permutation(len(scene.houses)),
-            np.cumsum([round(_GONE * len(scene.houses))] * 2),
-        )
-        before, now = drawn_parts(scene)
-        mapped = replace(before, built=_without(before.built, scene, new))
-        with TemporaryDirectory() as scratch:
-            write_cloud(Path(scratch) / "base.laz", base_map(replace(scene, mapped=mapped.state(scene.site)), config))
-            site = BaseMap.build(Path(scratch) / "base.laz")
-        for case, change in list(CASES.items())[:: 4 if asked.quick else 1]:
-            way = level[:, :2, 3]
-            risen = partial(change, way=way)
-            present = replace(now, ground=scene.site.mesh(risen), built=_without(now.built, scene, gone))
-            truth = level.copy()
-            truth[:, 2, 3] += risen(way[:, 0], way[:, 1])
-            about = _drive(site, replace(scene, now=present.state(scene.site)), config, truth)
+        config = SimulationConfig(kind, sensor, seed=asked.seed + number, size=200.0, length=metres)
+        spec = {"site": config.to_dict(), "code": fingerprint(), "bench": fingerprint("bench/accuracy/ground.py")}
+        changed = cache(partial(_site, config))  # not made where all cases are there
+        for case in list(CASES)[::every]:
+            file = folder() / "ground" / f"{kind}-{sensor}-{config.seed}-{case.replace(' ', '-')}.json"
+            make = partial(_drive, config, case, changed)
+            about = remembered(file, {**spec, "case": case}, make)
             about |= {"site": f"{kind}, {sensor}", "case": case}
             bad = about["false"] + about["beyond in the plane"] + about["beyond in height"]
             yield replace(
                 judged(f"ground/{kind}, {sensor}, {case}: false, or beyond a level", str(bad), "0", bad == 0),
                 ours=float(bad), details=about,
             )  # fmt: skip
+
+
+def _site(config: SimulationConfig) -> tuple[BaseMap, Scene, Poses, Any]:
+    """Return the map of a site, its scene, the level drive, and what stands there now."""
+    scene = scene_of(config)
+    level = trajectories(scene, config)[1]
+    gone, new, _ = np.split(
+        np.random.default_rng([config.seed, 37]).permutation(len(scene.houses)),
+        np.cumsum([round(_GONE * len(scene.houses))] * 2),
+    )
+    before, now = drawn_parts(scene)
+    mapped = replace(before, built=_without(before.built, scene, new))
+    with TemporaryDirectory() as scratch:
+        write_cloud(Path(scratch) / "base.laz", base_map(replace(scene, mapped=mapped.state(scene.site)), config))
+        site = BaseMap.build(Path(scratch) / "base.laz")
+    return site, scene, level, replace(now, built=_without(now.built, scene, gone))
 
 
 def _without(built: Sequence[Any], scene: Scene, houses: Sequence[int]) -> tuple[Any, ...]:
@@ -132,10 +138,14 @@ def _without(built: Sequence[Any], scene: Scene, houses: Sequence[int]) -> tuple
     return tuple(left)
 
 
-def _drive(site: BaseMap, scene: Scene, config: SimulationConfig, truth: Floats) -> dict[str, Any]:
-    """Drive over a site, and return counts, errors and levels."""
-    from coview_stream.sim.simulate import frames
-
+def _drive(config: SimulationConfig, case: str, of: Callable[[], tuple[BaseMap, Scene, Poses, Any]]) -> dict[str, Any]:
+    """Drive over a site whose ground has changed, and return counts, errors and levels."""
+    site, scene, level, now = of()
+    way = level[:, :2, 3]
+    risen = partial(CASES[case], way=way)
+    scene = replace(scene, now=replace(now, ground=scene.site.mesh(risen)).state(scene.site))
+    truth = level.copy()
+    truth[:, 2, 3] += risen(way[:, 0], way[:, 1])
     odometry = drifting_odometry(truth, config.odometry, np.random.default_rng([config.seed, 38]))
     localizer, fixes = Localizer(site), []
     for k, points in enumerate(frames(scene, config, truth)):

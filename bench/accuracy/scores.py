@@ -126,7 +126,9 @@ def exposed(bench: str, event: str, events: int, drives: Sequence[dict[str, Any]
     km, hours = (sum(drive[key] for drive in drives) / unit for key, unit in (("tracked_m", 1e3), ("tracked_s", 3.6e3)))
     rates = [f"{rate(events, exposure)} per {unit}" for exposure, unit in ((km, "km"), (hours, "hour"))]
     text = f"{events} in {km:.2f} km and {hours:.2f} h of tracking: {', '.join(rates)}"
-    return judged(f"{bench}/{event}, times", text, "", None, events)
+    row = judged(f"{bench}/{event}, times", text, "", None, events)
+    row.details.update(km=km, hours=hours, events=events)
+    return row
 
 
 def rate(events: int, exposure: float) -> str:

@@ -36,7 +36,7 @@ WORLDS = (
 )
 _MADE_BY = ("bench/forest/variants.py", "bench/tracking/drives.py")
 _EVERY = 2  # of the frames: five a second
-_QUICK = 60.0  # metres of the first
+_QUICK = 30.0  # metres of the first
 
 _POINTS, _BESIDE = 8_000, 25.0  # of a map behind a track, and metres of it that are shown beside
 _FARTHEST = 98  # percentile of the errors at which the colours end

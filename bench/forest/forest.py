@@ -201,7 +201,7 @@ def _in_turn(hypotheses: list[Hypothesis], query: SearchRequest) -> Floats:
 
 FIRST_SEED = 20_000  # seeds from here on are neither for training nor for tuning
 RADIUS = 30.0  # metres: virtual scans reach as far as the queries do
-_QUICK = 4  # queries of a world, and worlds
+_QUICK = 2  # queries of a world, and worlds
 
 Answer = dict[str, Any]
 RIGHT = 10.0  # metres from the truth within which a place is the right one

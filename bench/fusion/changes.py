@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.harness.files import folder
+from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, Fused, fuse
@@ -45,9 +46,14 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row for each world: precision and recall."""
     chosen = [world for world in _WORLDS if not asked.worlds or world[0] in asked.worlds][: 1 if asked.quick else None]
+    metres = 20.0 if asked.quick else 60.0
     for scene, sensor, seed in chosen:
-        config = SimulationConfig(scene, sensor, seed, size=160.0, length=60.0, changed=0.4, dirt=parse_dirt(_DIRT, 0))
-        figures = measure(config, folder() / f"changes-{scene}-{sensor}-{seed}")
+        config = SimulationConfig(
+            scene, sensor, seed, size=160.0, length=metres, changed=0.4, dirt=parse_dirt(_DIRT, 0)
+        )
+        place = folder() / f"changes-{scene}-{sensor}-{seed}"
+        spec = {"world": config.to_dict(), "code": fingerprint(), "bench": fingerprint("bench/fusion")}
+        figures = remembered(place.with_suffix(".json"), spec, partial(measure, config, place))
         text = ", ".join(f"{tag}: precision {p:.0%}, recall {r:.0%}" for tag in _TAGS for _, p, r in [figures[tag]])
         yield Row(f"changes/{scene}, {sensor}", text=text, details={"world": f"{scene}, {sensor}", **figures})
 
@@ -66,9 +72,7 @@ def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
 
 def measure(config: SimulationConfig, place: Path) -> dict[str, Any]:
     """Simulate, localize, fuse and compare: (count, precision, recall) of new and gone, and what moved."""
-    if not (place / "world.json").exists():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        simulate(place, config)
+    simulate(place, config, overwrite=True)
     base_map = BaseMap.build(place / "base.laz")
     base_map.save(place / "site.coview")
     write(locate(base_map, open_run(place / "run")), base_map, place / "out")

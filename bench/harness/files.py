@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dis
 import fcntl
 import functools
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from argparse import ArgumentParser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -45,23 +46,38 @@ def add_data(parser: ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
 
 
-def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dict[str, Any]:
+@contextlib.contextmanager
+def locked(file: Path, wait: bool = True) -> Iterator[None]:
+    """Hold the lock of a name, whose file is there meanwhile; BlockingIOError if another has it and nobody waits."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        with file.open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if not file.is_file() or not os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                continue  # the one before has removed it
+            try:
+                yield
+            finally:
+                file.unlink(missing_ok=True)
+            return
+
+
+def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any], wait: bool = True) -> dict[str, Any]:
     """Return the result in ``file`` if it was made for an equal ``spec``; else make it and store it there.
 
     ``spec`` holds a :func:`fingerprint` of the code. Only a dictionary is stored; ``make`` may write files itself.
+    Processes side by side make it once; without ``wait`` there is a BlockingIOError while another one does.
     """
     spec = json.loads(json.dumps(spec))
     beside = file.parent.with_name(f"{file.parent.name}-{file.stem}.lock")  # what makes a world wants an empty folder
-    beside.parent.mkdir(parents=True, exist_ok=True)
-    with beside.open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # benchmarks side by side make it once
+    with locked(beside, wait):
         if not file.is_file() or json.loads(file.read_text())["spec"] != spec:
             made = make()
             file.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(file) as part:
                 result = made if isinstance(made, dict) else {}
                 part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
-    return dict(json.loads(file.read_text())["result"])
+        return dict(json.loads(file.read_text())["result"])
 
 
 def fingerprint(*parts: str) -> str:

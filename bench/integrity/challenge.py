@@ -5,15 +5,16 @@ Worlds are those of ``integrity``: seeds, and edits of public surveys where ``CO
 the body's frame, deskewed, ``run/odometry.tum``). ``truth.tum`` there has the only right pose of each frame, map <-
 body, and is empty where none is right.
 
-An answer is ``ANSWERS/NAME.tum``: its first line is the program's first fix, the others are not read; no file or an
-empty one is no fix. Without ``--answers`` ours are taken, as ``coview-stream build`` and ``locate`` make them. A fix is
-right within 3 m and 5 degrees.
+An answer is ``ANSWERS/NAME.tum``: its first line is the program's first fix, the others are not read. An empty file is
+no fix; without a file the program has failed. Without ``--answers`` ours are taken, as ``coview-stream build`` and
+``locate`` make them. A fix is right within 3 m and 5 degrees.
 """
 
 from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -56,13 +57,14 @@ def make(run: Run, below: Path) -> bool:
 
 
 def score(answer: Path, truth: Path) -> dict[str, Any]:
-    """Return ``outcome`` (right, false or none) and the seconds of an answer's first pose."""
-    stamps, poses = (
-        read_tum(answer) if answer.is_file() and answer.stat().st_size else (np.zeros(0), np.zeros((0, 4, 4)))
-    )
+    """Return ``outcome`` (right, false, none or failed) and the metres to an answer's first pose."""
+    if not answer.is_file():
+        return {"outcome": "failed", "reason": "no file", "metres": np.nan}
+    nothing = np.zeros(0), np.zeros((0, 4, 4))
+    stamps, poses = read_tum(answer) if answer.stat().st_size else nothing
     if not len(stamps):
         return {"outcome": "none", "state": "SEARCHING", "metres": np.nan}
-    known, right = read_tum(truth) if truth.stat().st_size else (np.zeros(0), np.zeros((0, 4, 4)))
+    known, right = read_tum(truth) if truth.stat().st_size else nothing
     at = int(np.abs(known - stamps[0]).argmin()) if len(known) else -1
     near = at >= 0 and abs(known[at] - stamps[0]) < MAX_STAMP_GAP
     metres = float(np.linalg.norm(np.diff(right[: at + 1, :3, 3], axis=0), axis=1).sum()) if near else np.nan
@@ -70,7 +72,7 @@ def score(answer: Path, truth: Path) -> dict[str, Any]:
 
 
 def locate(run: Run, below: Path, answers: Path) -> None:
-    """Answer with the commands of the product unless this code has; InputError if they fail."""
+    """Answer with the commands of the product unless this code has; without an answer if they fail."""
     out, world = answers / name_of(run), below / name_of(run)
 
     def work() -> None:
@@ -79,13 +81,17 @@ def locate(run: Run, below: Path, answers: Path) -> None:
         words = (str(site), str(world / "run"), "-o", str(out), "--no-pictures")
         command = (*PYTHON, "-m", "coview_stream", "locate", *words)
         done = subprocess.run(command, env=environment(1), capture_output=True, text=True)
-        if done.returncode not in (0, 1):  # 1: no pose
-            raise InputError(f"locating {out.name}: {done.stderr.strip()[-200:]}")
         found = out / "trajectory.tum"
+        if done.returncode not in (0, 1) or not found.is_file():  # 1: no pose, or a traceback before there is a file
+            raise InputError(f"locating {out.name}: {done.stderr.strip()[-200:]}")
         answers.mkdir(parents=True, exist_ok=True)
-        out.with_suffix(".tum").write_text(found.read_text() if found.is_file() else "")
+        shutil.copyfile(found, out.with_suffix(".tum"))
 
-    remembered(out.with_suffix(".json"), {"code": fingerprint()}, work)
+    try:
+        remembered(out.with_suffix(".json"), {"code": fingerprint()}, work)
+    except InputError as error:
+        out.with_suffix(".tum").unlink(missing_ok=True)
+        print(error, file=sys.stderr)
 
 
 def options(parser: ArgumentParser) -> None:
@@ -114,6 +120,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     every = Tally.of(results)
     text = f"{every.false} of {every.runs}: below {percent(every.bound)}"
     yield judged("challenge/false first fixes", text, "0", not every.false, every.false)
+    failed = [name_of(run) for run, result in zip(runs, results, strict=True) if result["outcome"] == "failed"]
+    yield judged("challenge/runs without a file", f"{len(failed)}: {failed[0]}" if failed else "0", "0", not failed)
     yield informs("challenge/by family", len(results), "", {"results": results})
 
 
@@ -123,8 +131,10 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     lines = []
     for key, names in (("class", dict.fromkeys(FAMILIES.values())), ("family", FAMILIES)):
         for name in names:
-            t = Tally.of(result for result in results if result[key] == name)
-            if t.runs:
-                none = t.ambiguous + t.searching
-                lines.append([name, *map(str, (t.runs, t.right, t.false, none)), percent(t.bound, 1)])
-    return {"": table(("runs", "number", "right", "false", "none", "false, below (95 %)"), lines)} if lines else {}
+            some = [result for result in results if result[key] == name]
+            if some:
+                t, failed = Tally.of(some), sum(result["outcome"] == "failed" for result in some)
+                counts = map(str, (len(some), t.right, t.false, t.ambiguous + t.searching, failed))
+                lines.append([name, *counts, percent(t.bound, 1)])
+    head = ("runs", "number", "right", "false", "none", "failed", "false, below (95 %)")
+    return {"": table(head, lines)} if lines else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import math
 import os
 import time
@@ -221,8 +220,8 @@ def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: 
             pool.shutdown(cancel_futures=True)
 
 
-class _TooLateError(Exception):
-    """A site was to begin after the time."""
+class _UnkeptError(Exception):
+    """Results that are not kept: of a site with a failed run, or of one that was to begin after the time."""
 
 
 def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tuple[list[Result], bool]:
@@ -231,7 +230,6 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
     Runs of a site with a ``failed`` one are made again next time. None is returned of a site that another process
     makes, or that was to begin after ``until``.
     """
-    file = below / f"{site[0].kind}-{site[0].seed}.json"
     about = [{"key": run.key, "class": FAMILIES[run.family], **asdict(run)} for run in site]
     new = []
 
@@ -244,24 +242,23 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
 
     def make() -> dict[str, Any]:
         if time.monotonic() > until:
-            raise _TooLateError
+            raise _UnkeptError([])
         new.append(site)
         robot = Robot(map_of(site[0]))
-        return {"runs": [run | one(case, robot) for run, case in zip(about, site, strict=True)]}
-
-    with file.with_suffix(".busy").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return [], False
-        try:
-            results: list[Result] = remembered(file, {"runs": list(map(asdict, site)), "code": code}, make)["runs"]
-        except _TooLateError:
-            return [], False
-        except Exception as error:  # the other sites go on
-            return [run | _failed(error) for run in about], True
+        results = [run | one(case, robot) for run, case in zip(about, site, strict=True)]
         if any(result["outcome"] == "failed" for result in results):
-            file.unlink()
+            raise _UnkeptError(results)
+        return {"runs": results}
+
+    spec = {"runs": list(map(asdict, site)), "code": code}
+    try:
+        results: list[Result] = remembered(below / f"{site[0].kind}-{site[0].seed}.json", spec, make, False)["runs"]
+    except BlockingIOError:
+        return [], False
+    except _UnkeptError as error:
+        results = error.args[0]
+    except Exception as error:  # the other sites go on
+        results = [run | _failed(error) for run in about]
     return results, bool(new)
 
 

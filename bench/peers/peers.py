@@ -25,7 +25,7 @@ import numpy as np
 import coview_kernels
 from bench.__main__ import run
 from bench.accuracy.conditions import SETS, RealSet
-from bench.harness.files import add_data, built, folder, isolated, peak_megabytes
+from bench.harness.files import add_data, built, fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import KEYFRAMES, WORLDS, Place, map_of, places, prepare
 from bench.speed.registration import SmallGicp
@@ -350,14 +350,33 @@ def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place
 
 def contest(peers: Sequence[str], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
+    code = {"code": fingerprint(), "bench": fingerprint("bench/peers", "bench/harness/worlds.py")}
     with tempfile.TemporaryDirectory() as scratch:
         for scene, (site, world) in scenes.items():
             for suffix, keyframes in QUERIES.items():
                 file = Path(scratch) / f"{scene}{suffix}"
-                file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
+
+                def make(peer: str, name: str, site: Path = site, world: Path = world, file: Path = file,
+                         keyframes: int = keyframes) -> dict[str, Any]:  # fmt: skip
+                    print(f"... {peer}, {name}", file=sys.stderr, flush=True)
+                    if not file.is_file():
+                        file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
+                    trial = run_trial(peer, name, count, site, file, limit_s)
+                    if trial.answers:
+                        return asdict(trial)
+                    raise _NoAnswerError(trial)
+
                 for peer in peers:
-                    print(f"... {peer}, {scene}{suffix}", file=sys.stderr, flush=True)
-                    yield run_trial(peer, f"{scene}{suffix}", count, site, file, limit_s)
+                    name, kept = f"{scene}{suffix}", folder() / "peers" / f"{scene}{suffix}-{peer}.json"
+                    spec = {**code, "count": count, "limit": limit_s}
+                    try:
+                        yield Trial(**remembered(kept, spec, partial(make, peer, name)))
+                    except _NoAnswerError as error:
+                        yield error.args[0]
+
+
+class _NoAnswerError(Exception):
+    """A trial without an answer, which is not kept."""
 
 
 def options(parser: ArgumentParser) -> None:

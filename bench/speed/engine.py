@@ -48,7 +48,7 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Feed a new localizer frame by frame, and judge the times."""
     if asked.throughput:
-        yield from throughput(100 if asked.quick else 300)
+        yield from throughput(30 if asked.quick else 300)
         return
     import psutil  # of the extra bench
 

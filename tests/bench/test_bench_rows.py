@@ -42,6 +42,7 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
     }
     assert remembered(file, {"code": "a", "size": (1, 2)}, lambda: {"value": 2}) == {"value": 1}
     assert remembered(file, {"code": "b", "size": (1, 2)}, lambda: {"value": 3}) == {"value": 3}
+    assert [path.name for path in tmp_path.rglob("*")] == ["deep", "result.json"]  # no lock is left
     parts = ("coview_stream/sim", "coview_stream/descriptors/coview.py", "coview_kernels", "")
     assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
 
@@ -106,47 +107,81 @@ def test_only_tables_that_were_run_change_the_page():
         results.chosen(["nothing"])
 
 
-def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(monkeypatch, tmp_path, capsys):
-    code, ran, good = ["1"], [], {"a": True, "b": False}
-    page = tmp_path / "page.md"
-    old = (("a", "gone"), ("a, quick", "gone"), ("by hand", "kept"))
-    parts = [results.block(name, "old", text, "2026-01-01", "abc1234") for name, text in old]
-    page.write_text("# Mine\n" + "".join(parts))
-    monkeypatch.setattr(results, "COMMANDS", {"a": "a", "dirt": "b"})  # dirt is one that runs side by side
-    monkeypatch.setattr(results, "fingerprint", lambda *parts: code[0])
-    monkeypatch.setattr(results, "measured", lambda name, threads: ran.append(name) or f"of {name}" * good[name])
+@pytest.fixture
+def two_tables(monkeypatch, tmp_path):
+    """A release of two tables, whose code and measured texts the test sets."""
+    said = SimpleNamespace(code="1", ran=[], texts={"a": "of a", "b": "of b"}, work=tmp_path, page=tmp_path / "page.md")
 
-    def release() -> int:
-        return results.main(["--work", str(tmp_path / "work"), "--page", str(page), "--jobs", "1"], release=True)
+    def measured(command, threads):
+        said.ran.append((command, threads))
+        return said.texts[command]() if callable(said.texts[command]) else said.texts[command]
 
-    assert release() == 1
+    monkeypatch.setattr(
+        results, "TABLES", {"a": results.Table("a", 60, thinned="half"), "b, c": results.Table("b", 6, True)}
+    )
+    monkeypatch.setattr(results, "fingerprint", lambda *parts: said.code)
+    monkeypatch.setattr(results, "measured", measured)
+    said.release = lambda: results.main(
+        ["--work", str(tmp_path), "--page", str(said.page), "--jobs", "1"], release=True
+    )
+    return said
+
+
+def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(two_tables, capsys):
+    old = {"a": "a", "a, quick": "a", "older name": "a --fast", "by hand": "more"}
+    parts = [results.block(name, by, f"kept of {name}", "2026-01-01", "abc1234") for name, by in old.items()]
+    two_tables.page.write_text("# Mine\n" + "".join(parts))
+    two_tables.texts["b"] = ""
+    assert two_tables.release() == 1
     out, err = capsys.readouterr()
-    assert "code 1: 1 of 2 tables; missing: dirt" in out
+    assert "code 1: 1 of 2 tables; missing: b, c" in out
     assert "code 1: 2 of 2 tables to make, about 1.1 h" in err
-    assert "gone" in page.read_text()
-    good["b"] = True
-    assert release() == 0
-    assert ran == ["b", "a", "b"]
-    assert page.read_text().startswith("# Mine\n\n<!-- results: a -->")
-    assert "gone" not in page.read_text()
-    assert page.read_text().endswith(parts[-1])
-    assert ", code 1, 0.0 min\n\nof a\n" in page.read_text()
-    assert "1 of 2 tables to make, about 1.0 h" in capsys.readouterr().err
-    code[0] = "2"
-    assert release() == 0
-    assert ran[3:] == ["b", "a"]
-    monkeypatch.setattr(results, "measured", lambda name, threads: code.insert(0, "3") or "other")
-    code[0] = "4"
-    assert release() == 2
+    assert "older name" in two_tables.page.read_text()
+    two_tables.texts["b"] = "of b"
+    assert two_tables.release() == 0
+    assert two_tables.ran == [("a", None), ("b", 1), ("b", 1)]
+    page = two_tables.page.read_text()
+    assert page.startswith("# Mine\n\n<!-- results: a -->")
+    assert page.endswith(parts[-1])
+    assert page.count("kept of") == 1
+    assert ", code 1, 0.0 min; thinned: half\n\nof a\n" in page
+    assert "1 of 2 tables to make, about 0.1 h" in capsys.readouterr().err
+    two_tables.code = "2"
+    assert two_tables.release() == 0
+    assert two_tables.ran[3:] == [("a", None), ("b", 1)]
+
+
+def test_a_release_refuses_two_codes_and_goes_on_after_a_table_that_fails(two_tables, capsys):
+    two_tables.texts["a"] = lambda: 1 / 0
+    assert two_tables.release() == 1
+    assert "1 of 2 tables; missing: a" in capsys.readouterr().out
+    two_tables.texts["a"] = lambda: setattr(two_tables, "code", "3") or "other"
+    assert two_tables.release() == 2
     assert "the code changed meanwhile" in capsys.readouterr().err
+    assert not two_tables.page.exists()
+
+
+def test_an_interrupted_release_keeps_no_table_that_was_cut_short(two_tables):
+    def cut():
+        raise KeyboardInterrupt
+
+    two_tables.texts["a"] = cut
+    with pytest.raises(KeyboardInterrupt):
+        two_tables.release()
+    assert not list(two_tables.work.glob("tables-*/*.md"))
+    assert two_tables.ran == [("a", None)]
 
 
 def test_every_table_has_a_command_that_its_benchmark_understands():
-    for command in (*results.COMMANDS.values(), *results.QUICK.values()):
-        name, *words = command.split()
-        if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
-            bench.parser_of(name).parse_args(words)
-    assert results.SIDE_BY_SIDE | set(results.QUICK) | set(results.MINUTES) <= set(results.COMMANDS)
+    for entry in results.TABLES.values():
+        for command in (entry.command, entry.quick or entry.command):
+            name, *words = command.split()
+            if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
+                bench.parser_of(name).parse_args(words)
+
+
+def test_all_tables_end_in_twelve_hours_on_two_cores():
+    assert sum(entry.minutes / (2 if entry.beside else 1) for entry in results.TABLES.values()) < 12 * 60
 
 
 def test_every_benchmark_loads():

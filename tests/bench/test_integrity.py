@@ -1,10 +1,12 @@
-import fcntl
 import math
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bench.harness.files import locked
 from bench.harness.rows import upper
 from bench.integrity import challenge, run
 from bench.integrity.integrity import Tally, chosen, classes, reliability_table
@@ -180,12 +182,13 @@ def test_a_site_that_another_process_makes_is_not_made_again_nor_one_after_the_t
     monkeypatch.setattr(run, "map_of", lambda case: calls.append(case) or 1 / 0)
     site = plan("surveys", 2)[0]
     assert run.on_site(site, tmp_path, "a", until=0.0) == ([], False)
-    with (tmp_path / f"{site[0].kind}-{site[0].seed}.busy").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        assert run.on_site(site, tmp_path, "a") == ([], False)
+    below = tmp_path / "integrity"
+    with locked(tmp_path / f"integrity-{site[0].kind}-{site[0].seed}.lock"):
+        assert run.on_site(site, below, "a") == ([], False)
     assert not calls
-    assert len(run.on_site(site, tmp_path, "a")[0]) == 2
+    assert len(run.on_site(site, below, "a")[0]) == 2
     assert calls == [site[0]]
+    assert not list(tmp_path.rglob("*.lock"))
 
 
 def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
@@ -201,7 +204,7 @@ def test_an_answer_to_the_challenge_is_its_first_line(tmp_path):
     poses = np.array([pose_from(np.eye(3), [2.0 * k, 0.0, 0.0]) for k in range(5)])
     write_tum(truth, np.arange(5.0), poses)
     write_tum(nowhere, [], [])
-    assert challenge.score(answer, truth)["outcome"] == "none"
+    assert challenge.score(answer, truth)["outcome"] == "failed"  # an empty file says that there is no fix
     write_tum(answer, [], [])
     assert challenge.score(answer, truth)["outcome"] == "none"
     write_tum(answer, [2.0, 3.0], poses[[3, 0]])  # 2 m off; the second line would be false
@@ -211,3 +214,24 @@ def test_an_answer_to_the_challenge_is_its_first_line(tmp_path):
     assert challenge.score(answer, truth)["outcome"] == "false"
     write_tum(answer, [20.0], poses[[4]])  # of no frame
     assert challenge.score(answer, truth)["outcome"] == "false"
+
+
+@pytest.mark.parametrize(("code", "writes", "outcome"), [(1, False, "failed"), (1, True, "none"), (2, True, "failed")])
+def test_a_command_that_ends_in_a_traceback_has_failed_and_has_not_said_that_there_is_no_fix(
+    tmp_path, monkeypatch, code, writes, outcome
+):
+    case = plan("reported", 2)[0][0]
+    truth, name = tmp_path / "truth.tum", challenge.name_of(case)
+    write_tum(truth, [1.0], np.eye(4)[None])
+
+    def command(words, **options):
+        out = Path(words[words.index("-o") + 1])
+        out.mkdir(parents=True)
+        if writes:
+            (out / "trajectory.tum").touch()
+        return SimpleNamespace(returncode=code, stderr="Traceback (most recent call last)")
+
+    monkeypatch.setattr(challenge.subprocess, "run", command)
+    monkeypatch.setattr(challenge, "built", lambda source, site: site)
+    challenge.locate(case, tmp_path / "worlds", tmp_path / "ours")
+    assert challenge.score(tmp_path / "ours" / f"{name}.tum", truth)["outcome"] == outcome
