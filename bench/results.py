@@ -252,6 +252,8 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
         text = introduction(asked.page) + "".join(file.read_text() for file in files.values()) + without(asked.page)
         with atomic_path(page) as file:
             file.write_text(text)
+        if page == PAGE:  # figures of other pages
+            subprocess.run([sys.executable, PAGE.with_name("write_reference.py")], env=environment(), check=True)
         print(page)
     return int(bool(missing))
 

@@ -26,7 +26,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 
 HERE = Path(__file__).resolve().parent
-_FIGURE = re.compile(r"(<!-- (\w+), ([^>]+?) -->).*?(?=<!-- end -->)")
+_FIGURE = re.compile(r"(<!-- ([\w ]+), ([^>]+?)(?: @ ([^>]+?))? -->).*?(?=<!-- end -->)")
 _NAMES = re.compile(r"(?<=<!-- names -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
@@ -177,12 +177,19 @@ def python_page(text: str) -> str:
 
 
 def limits_page(text: str, results: str) -> str:
-    """Return docs/limits.md with its figures, ``<!-- table, row -->``, as docs/results.md has them."""
+    """Return docs/limits.md with its figures, ``<!-- table, row @ column -->``, as docs/results.md has them.
+
+    Without a column it is the second one; a figure that the table does not have yet stays as it is.
+    """
 
     def figure(found: re.Match[str]) -> str:
-        part = results.split(f"\n## {found[2]}\n")[1].split("<!-- end -->")[0]
-        row = next(line for line in part.splitlines() if line.startswith(f"|{found[3]}|"))
-        return found[1] + row.split("|")[2]
+        part, head = results.partition(f"\n## {found[2]}\n")[2].partition("<!-- end -->")[0], list[str]()
+        for line in part.splitlines():
+            cells = line.strip("|").split("|") if line.startswith("|") else []
+            head = (head or cells) if cells else []
+            if cells and cells[0] == found[3] and (found[4] or head[1]) in head:
+                return found[1] + cells[head.index(found[4] or head[1])]
+        return found[0]
 
     return _FIGURE.sub(figure, text)
 

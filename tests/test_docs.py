@@ -220,7 +220,11 @@ def test_generated_pages_are_those_of_the_code():
     assert text_of("options.md") == reference.options_page(), "run python docs/write_reference.py"
     limits = reference.limits_page(text_of("limits.md"), text_of("results.md"))
     assert text_of("limits.md") == limits, "run python docs/write_reference.py"
-    assert limits.count("<!-- faults, ") == 3
+    marked = "\n## all faults\n\n|a|b|c|\n|-|-|-|\n|x, y|1|2|\n\n|d|c|\n|x|3|\n<!-- end -->"
+    figures = (
+        "<!-- all faults, x, y @ c -->0<!-- end --><!-- all faults, x -->0<!-- end --><!-- none, x -->0<!-- end -->"
+    )
+    assert re.findall(r"-->(\d)<", reference.limits_page(figures, marked)) == ["2", "3", "0"]
     assert text_of("python.md") == reference.python_page(text_of("python.md")), "run python docs/write_reference.py"
     fields = text_of("options.md").partition("## Configuration in Python")[2]
     assert re.findall(r"^\|`(\w+)`\|.*\|\|$", fields, re.MULTILINE) == []  # each says its meaning

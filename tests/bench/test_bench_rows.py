@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -178,6 +179,11 @@ def test_every_table_has_a_command_that_its_benchmark_understands():
             name, *words = command.split()
             if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
                 bench.parser_of(name).parse_args(words)
+
+
+def test_pages_take_figures_from_tables_that_a_release_makes():
+    text = results.PAGE.with_name("limits.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"<!-- ([\w ]+), ", text)) <= set(results.TABLES)
 
 
 def test_all_tables_end_in_twelve_hours_on_two_cores():
