@@ -46,16 +46,3 @@ def test_engines_do_not_import_from_the_current_directory(trap, world_file):
             process.kill()
     assert "ready" in said
     assert not (trap / "executed").exists()
-
-
-@pytest.mark.slow
-def test_processes_of_the_demo_do_not_import_from_the_current_directory(trap):
-    """As its first process does not, by the same command; its map is made before any of the others starts."""
-    from coview_stream.clouds.python_child import python_command, python_environment
-
-    done = subprocess.run(
-        python_command("coview_stream", "watch", "--json", "--seconds", "0.5"),
-        env=python_environment(), capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert not (trap / "executed").exists()

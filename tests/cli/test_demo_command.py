@@ -55,17 +55,6 @@ def test_demo_localizes_and_writes_the_promised_files(demo):
 
 
 @pytest.mark.slow
-def test_demo_files_work_with_other_commands(demo, capsys):
-    _, out = demo
-    assert main(["info", str(out / "site.coview")]) == 0
-    assert "stations" in capsys.readouterr().out
-    assert main(["eval", str(out / "trajectory.tum"), str(out / "world" / "truth.tum"), "--json"]) == 0
-    verdict = json.loads(capsys.readouterr().out)
-    report = json.loads((out / "report.json").read_text())
-    assert {key: report[key] for key in verdict} == verdict
-
-
-@pytest.mark.slow
 def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, capsys, monkeypatch):
     out = tmp_path / "again"
     shutil.copytree(demo[1], out)

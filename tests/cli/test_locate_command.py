@@ -75,20 +75,6 @@ def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path,
 
 
 @pytest.mark.slow
-def test_odometry_from_another_file(world_file, world_run, world_drive, tmp_path):
-    bare = tmp_path / "run"
-    shutil.copytree(world_run, bare)
-    (bare / "odometry.tum").rename(tmp_path / "wheel.tum")
-    out = tmp_path / "out"
-    command = ["locate", str(world_file), str(bare), "-o", str(out), "--no-pictures"]
-    code = main([*command, "--odometry", str(tmp_path / "wheel.tum")])
-    assert code == 0
-    for stamp, T in zip(*read_tum(out / "trajectory.tum"), strict=True):
-        truth = world_drive.T_map_body[round((stamp - 100.0) / 0.5)]
-        assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.1
-
-
-@pytest.mark.slow
 def test_clouds_of_identical_bytes_are_named_in_the_summary(world_file, world_run, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(world_run, run)

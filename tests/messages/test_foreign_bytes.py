@@ -41,7 +41,7 @@ def check_place(T):
 
 
 @pytest.mark.parametrize("encoding", ["", CLOUD])
-@named("cloud_*.bin")
+@named("cloud_*.bin", "js_PointCloud2.bin")
 def test_cloud_in_cdr(path, encoding):
     read = decode_cloud(sample(path, encoding))
     np.testing.assert_array_equal(read.points, POINTS)
@@ -100,12 +100,6 @@ def test_messages_of_foxglove():
         read = decode_odometry(sample(FOREIGN / f"{name}.raw", f"application/protobuf;foxglove.{schema}"))
         assert read.stamp_ns == POSE_NS
         check_place(read.T_odom_body)
-
-
-def test_cloud_of_javascript():
-    read = decode_cloud(sample(FOREIGN / "js_PointCloud2.bin", CLOUD))
-    np.testing.assert_array_equal(read.points, POINTS)
-    assert read.stamp_ns == CLOUD_NS
 
 
 def test_keelson_reads_our_envelope():

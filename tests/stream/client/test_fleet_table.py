@@ -65,21 +65,13 @@ def test_what_the_node_says_of_the_sensor_stands_behind_the_reason(fleet):
         assert fleet.table(9.1)[1].endswith("all well")
 
 
-def test_stale_pose_is_hidden(fleet):
-    fleet.add_pose(POSE, 10.0)
-    assert "412000.12" in fleet.table(10.0 + STALE - 0.1)[1]
-    fleet.add_status("r1", {"state": "LOST"}, 10.0 + STALE)
-    line = fleet.table(10.0 + STALE + 0.1)[1]
-    assert "412000.12" not in line
-    assert line.split()[:3] == ["r1", "LOST", "-"]
-
-
-def test_lost_robot_shows_no_pose(fleet):
+def test_lost_robot_shows_no_pose_and_none_that_is_stale(fleet):
     fleet.add_pose(POSE, 10.0)
     fleet.add_status("r1", {"state": "LOST"}, 10.1)
-    assert "412000.12" not in fleet.table(10.2)[1]
+    assert fleet.table(10.2)[1].split()[:3] == ["r1", "LOST", "-"]
     fleet.add_pose(POSE, 10.3)  # found again; the status that says so comes later
-    assert "412000.12" in fleet.table(10.4)[1]
+    assert "412000.12" in fleet.table(10.3 + STALE - 0.1)[1]
+    assert "412000.12" not in fleet.table(10.3 + STALE + 0.1)[1]
 
 
 def test_silent_robot_is_marked(fleet):

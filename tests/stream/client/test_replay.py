@@ -1,7 +1,6 @@
 """Replays: what is sent, when and in which order, on a clock of the test's own."""
 
 import dataclasses
-import json
 import shutil
 from dataclasses import replace
 
@@ -227,11 +226,3 @@ def test_odometry_spacing(run, run_folder):
         enough = ReplayConfig(sparse.rate, sparse.speed, enough_odometry(run, sparse))
         assert odometry_spacing(run, enough) == pytest.approx(0.05)
     assert odometry_spacing(open_run(run_folder / "frames" / "000000.ply"), ReplayConfig()) == 0.0
-
-
-def test_json_odometry_is_small_enough_for_a_microcontroller(run):
-    net = MemoryTransport()
-    sender = Sender(net, KEYS)
-    message = sender.odometry(run.poses[3], nanoseconds(1.7e9))
-    assert set(json.loads(message.payload)) == {"stamp_ns", "position", "orientation"}
-    assert len(message.payload) < 400
