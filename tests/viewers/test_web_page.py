@@ -160,11 +160,6 @@ def test_an_address_that_cannot_be_listened_on_is_refused_with_a_remedy(address)
         WebPage(address)
 
 
-def test_a_port_that_is_taken_is_refused(served):
-    with pytest.raises(ConfigError, match="in use"):
-        WebPage(f"127.0.0.1:{port(served)}")
-
-
 def test_an_address_that_others_reach_is_warned_of(caplog):
     with caplog.at_level("WARNING"):
         WebPage("0.0.0.0:0").close()

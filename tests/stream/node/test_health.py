@@ -1,8 +1,9 @@
-"""Health of a node: live, ready and why not; metrics that Prometheus can read; slow readers hold up nobody."""
+"""Health of a node: live, ready and why not; metrics, notices to systemd; slow readers hold up nobody."""
 
 import contextlib
 import http.client
 import json
+import os
 import re
 import socket
 import threading
@@ -12,7 +13,7 @@ import pytest
 from sockets import until
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.node.health import NodeHealth, metrics_server, prometheus_text
+from coview_stream.stream.node.health import NodeHealth, Notifier, metrics_server, prometheus_text
 from coview_stream.stream.transport.http_server import MAX_CONNECTIONS
 from coview_stream.stream.transport.keys import matches, node_keys
 from coview_stream.stream.transport.transport import Connection
@@ -139,16 +140,6 @@ def test_slow_endless_and_vanishing_readers_are_cut_off(server):
     flood.close()
 
 
-def test_page_of_another_site_whose_name_points_here_reads_nothing(server):
-    made, _ = server
-    connection = http.client.HTTPConnection(made.url[7:-1], timeout=10.0)
-    for page in ("/health", "/metrics"):
-        connection.request("GET", page, headers={"Host": "rebound.evil.example:9464"})
-        answer = connection.getresponse()
-        assert b"ready" not in answer.read()
-        assert answer.status == 421
-
-
 @pytest.mark.slow
 def test_slow_readers_elsewhere_leave_room_for_the_health_check_of_this_machine():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -197,3 +188,75 @@ def test_a_page_that_cannot_be_made_is_reported(caplog):
     with running(made.run), contextlib.suppress(http.client.HTTPException, OSError):
         asked(made, "GET", "/health")
     until(lambda: "metrics" in caplog.text and "engines" in caplog.text)
+
+
+@pytest.fixture
+def manager(tmp_path):
+    if not hasattr(socket, "AF_UNIX"):
+        pytest.skip("no such sockets")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(10.0)
+        yield listening
+
+
+def test_notices_reach_the_manager(manager):
+    notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname()})
+    assert notifier.watchdog_period is None
+    notifier.ready("serves r1")
+    assert manager.recv(500) == b"READY=1\nSTATUS=serves r1"
+    notifier.reloading(True, "changing the map")
+    first, second, _ = manager.recv(500).decode().splitlines()
+    assert first == "RELOADING=1"
+    assert int(second.removeprefix("MONOTONIC_USEC=")) > 0
+    notifier.reloading(False, "serves r1")
+    assert manager.recv(500).startswith(b"READY=1")
+    notifier.stopping()
+    assert manager.recv(500) == b"STOPPING=1"
+    notifier.ready("too late")
+    notifier.reloading(True, "too late")
+    notifier.reloading(False, "too late")
+    manager.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        manager.recv(500)
+
+
+def test_watchdog_is_fed_while_the_node_is_live(manager):
+    given = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "40000", "WATCHDOG_PID": str(os.getpid())}
+    notifier = Notifier(given)
+    assert notifier.watchdog_period == pytest.approx(0.02)
+    stopping, asked, live = threading.Event(), [], [True]
+    thread = threading.Thread(target=notifier.run, args=(stopping, lambda: asked.append(1) or live[0]))
+    thread.start()
+    assert manager.recv(500) == b"WATCHDOG=1"
+    live[0] = False
+    manager.setblocking(False)
+    count = len(asked)
+    until(lambda: len(asked) > count + 1)
+    with contextlib.suppress(BlockingIOError):
+        while True:  # those from before
+            manager.recv(500)
+    count = len(asked)
+    until(lambda: len(asked) > count + 3)
+    with pytest.raises(BlockingIOError):
+        manager.recv(500)
+    stopping.set()
+    thread.join(10.0)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"WATCHDOG_USEC": "1000"},
+        {"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"},
+        {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "soon"},
+        {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "0"},
+    ],
+)
+def test_nothing_happens_elsewhere(given):
+    notifier = Notifier(given)
+    assert notifier.watchdog_period is None
+    notifier.ready("x")
+    notifier.stopping()
+    notifier.run(threading.Event(), lambda: True)
