@@ -156,38 +156,6 @@ def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine,
 
 
 @pytest.mark.slow
-def test_idle_engine_that_cannot_open_its_map_says_why(engine, world_file):
-    process = engine("track", world_file, sha256="0" * 64)
-    process.start()
-    with pytest.raises(DiedError, match="replaced by another map"):
-        until(process.watch, 60.0)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_stopped_engine_is_ended_during_a_job(engine, world_file, world_drive):
-    process = engine("track", world_file)
-    process.start()
-    process.wait_prepared()
-    process.end_stopped()
-    process.end_stopped()
-    assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
-    os.kill(process.pid, signal.SIGSTOP)
-    failed = []
-
-    def run():
-        with pytest.raises(DiedError) as caught:
-            process.run(job(world_drive.clouds[0]))
-        failed.append(str(caught.value))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    until(lambda: process.end_stopped() or failed, 10.0)  # not thirty seconds
-    thread.join(10.0)
-    assert process.run(job(world_drive.clouds[0])).request is not None
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("adopted", [False, True])
 def test_child_without_a_map_ends_when_it_is_closed(engine, adopted):
     child = EngineChild("search")
