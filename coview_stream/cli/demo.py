@@ -178,7 +178,7 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
 ROBOT = "demo"
 
 # seconds
-_MAX_START = 300.0  # until the node publishes something and can search; a first run compiles its kernels
+_MAX_START = 300.0  # until the node publishes something: a first run compiles its kernels; the robot waits for the rest
 _MAX_SHUTDOWN = 5.0  # for a process after a signal
 _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
@@ -226,7 +226,6 @@ def record_live(
             _check_running(logs, serve=node, watch=watcher)
             if time.monotonic() > deadline:
                 raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
-        _await_engines(endpoint, logs)
         robot = start("replay", str(run_path), "--robot", ROBOT, "--connect", endpoint)
         while robot.poll() is None or not lines.empty():
             with contextlib.suppress(queue.Empty):
@@ -272,24 +271,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _await_engines(endpoint: str, logs: Path) -> None:
-    """Wait until the node's engines can search: on a busy machine the drive would be over before."""
-    from coview_stream.stream.transport.keys import node_keys
-    from coview_stream.stream.transport.zenoh_transport import open_client
-
-    transport = open_client([endpoint], None, None)
-    try:
-        deadline = time.monotonic() + _MAX_START
-        while time.monotonic() < deadline:
-            with contextlib.suppress(TransportError):
-                if transport.query(node_keys("coview", ROBOT).ask_health, timeout=2.0)["ready"]["ok"]:
-                    return
-            time.sleep(0.2)
-        raise TransportError(f"the node is not ready after {_MAX_START:g} s; see {logs / 'serve.log'}")
-    finally:
-        transport.close()
 
 
 def _check_running(logs: Path, **processes: subprocess.Popen[bytes]) -> None:
