@@ -1,7 +1,5 @@
 """One small world for all tests of the engine: built once, never changed."""
 
-from __future__ import annotations
-
 import os
 import signal
 from contextlib import contextmanager

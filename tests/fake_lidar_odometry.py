@@ -1,7 +1,5 @@
 """Registrations that need no kiss-icp, and frames whose motion is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import small_world
 

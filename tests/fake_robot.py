@@ -1,7 +1,5 @@
 """A robot on a fake clock: its messages, and an engine's answers without an engine."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Mark of tests that take longest: ``COVIEW_NIGHTLY=1`` runs them, and so does ``COVIEW_SOAK_MINUTES=10 .ci/run``."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """The Dockerfile copies what there is and asks for extras that exist. There is no engine here to build it."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Links, names, commands and code in the pages: each leads somewhere, exists, parses, runs."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import importlib.util

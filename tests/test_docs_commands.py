@@ -1,7 +1,5 @@
 """Every command in the bash blocks of docs/ is run, page by page, on a simulated world with the names of the page."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """A missing library is named with what installs it; one that is there but broken, with what is wrong with it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

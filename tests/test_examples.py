@@ -1,7 +1,5 @@
 """The examples and the README's own code run, on small simulated worlds, and do what they say."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An installation without extras: the robot's side works, the rest names the extra that it needs."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,7 +1,5 @@
 """Fixtures of the tests of base maps."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -1,7 +1,5 @@
 """A base map made of arrays, what it tells of itself, its picture, and how it is pickled."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 import sys

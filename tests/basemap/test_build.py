@@ -1,7 +1,5 @@
 """Building: tiles equal one file, storeys are apart, absurd input is refused in one line, parameters survive."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

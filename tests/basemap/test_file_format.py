@@ -1,7 +1,5 @@
 """The ``.coview`` file: saved content comes back, and damaged or foreign files are refused."""
 
-from __future__ import annotations
-
 import json
 import os
 

@@ -1,7 +1,5 @@
 """Several maps as one: placed side by side, searched together, and loaded under their names."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

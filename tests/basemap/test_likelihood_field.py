@@ -1,7 +1,5 @@
 """The likelihood field of a map: what its rasters say of a known scene, and that a file keeps them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Learned features that cannot be used: ``auto`` goes without them and says so once, ``learned`` refuses."""
 
-from __future__ import annotations
-
 import json
 import logging
 import shutil

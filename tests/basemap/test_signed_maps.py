@@ -1,7 +1,5 @@
 """Signed maps: any changed byte is one MapError, whenever the file is changed; and the files of keys."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Station index: z-scores near the exact ones, the same from a map's file, and made anew where the file lacks it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Stations: on ground and floors, their descriptors against brute force, and their look-up by position."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Facts about a map, its warnings, and its view on the wire."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

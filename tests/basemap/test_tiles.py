@@ -1,7 +1,5 @@
 """Tiles: a crop is what a search of all points would find."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

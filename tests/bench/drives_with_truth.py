@@ -1,7 +1,5 @@
 """A drive and a track on it, small enough to know the score."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bench.accuracy.scores import Track

@@ -1,7 +1,5 @@
 """Scores of ``bench changes``: what a tag is held against."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Faults of runs: each begins where it should, and changes only what it should."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

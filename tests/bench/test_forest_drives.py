@@ -1,7 +1,5 @@
 """Drives in forests: statistics, the simulated GNSS and its fusion with odometry, and parts of the method alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

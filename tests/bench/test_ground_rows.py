@@ -1,7 +1,5 @@
 """Changes of the ground in ``bench ground``: where they are, and how deep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Memory of processes by what it holds."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The first paper's method: ring keys, distances at all shifts, trimmed ICP, its table."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

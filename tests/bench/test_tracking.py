@@ -1,7 +1,5 @@
 """Scores of a tracked drive: errors, events, coverage of the covariance, protection levels."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 
 import numpy as np

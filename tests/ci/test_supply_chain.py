@@ -1,7 +1,5 @@
 """The locks and the list of advisories that CI uses."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

@@ -1,7 +1,5 @@
 """Files that cannot be one site are named, both, before their points are read."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

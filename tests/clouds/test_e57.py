@@ -1,7 +1,5 @@
 """E57: scans by their poses, spherical and cartesian, invalid points left out; damaged files cost one error."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 

@@ -1,7 +1,5 @@
 """LAS and LAZ: headers, reference systems, dropped points; LASzip 1.0 is refused."""
 
-from __future__ import annotations
-
 import re
 import struct
 

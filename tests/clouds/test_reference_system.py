@@ -1,7 +1,5 @@
 """Reference systems: units, heights, scales, equality; and places on Earth, against pyproj and geometry."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

@@ -1,7 +1,5 @@
 """Rows of numbers: text in the forms that programs write, and ``.bin`` files of any number of columns."""
 
-from __future__ import annotations
-
 import gzip
 
 import numpy as np

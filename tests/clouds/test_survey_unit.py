@@ -1,7 +1,5 @@
 """Surveys in feet: their unit, the same system in metres, and maps of them."""
 
-from __future__ import annotations
-
 import laspy
 import numpy as np
 import pytest

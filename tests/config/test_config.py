@@ -1,7 +1,5 @@
 """Configurations refuse what makes no sense, by name, and the presets are the paper's."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass
 

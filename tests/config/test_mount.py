@@ -1,7 +1,5 @@
 """Mounting of a lidar: what its numbers mean, and what is refused."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

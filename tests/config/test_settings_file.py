@@ -1,7 +1,5 @@
 """Settings from TOML: every field by its name, errors that name file, table, key and remedy."""
 
-from __future__ import annotations
-
 import pytest
 
 from coview_stream.config import LocalizerConfig

@@ -1,7 +1,5 @@
 """Descriptors: bins where they belong, one zero for both sides, and equal scans described equally."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A map's learned features: made in windows that leave no trace, stored in tiles, read back where they belong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """Fusing runs with a map: what is added, what is new, what is gone, what moved."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

@@ -1,7 +1,5 @@
 """Joint adjustment: what it brings where the map is blind, and that it keeps what it cannot better."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

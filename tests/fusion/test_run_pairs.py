@@ -1,7 +1,5 @@
 """Runs and their results: how they are named, and which are refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

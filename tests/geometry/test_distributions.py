@@ -1,7 +1,5 @@
 """Distributions against those of SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import special

@@ -1,7 +1,5 @@
 """Planar motions are those of poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline

@@ -1,7 +1,5 @@
 """Protection levels: quantiles of the error's norm under a Student-t with the covariance's shape."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rigid transforms: conventions, precision, and what counts as a pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Checks of clouds, poses and covariances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Crops: exactly those of the NumPy twin, in the same order."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

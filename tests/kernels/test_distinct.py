@@ -1,7 +1,5 @@
 """Distinct poses: the kernel equals its twin, and every pose left out has a better one near it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

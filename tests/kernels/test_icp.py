@@ -1,7 +1,5 @@
 """Registration kernel against its NumPy twin: same pose, evidence and end for many scenes, starts and priors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

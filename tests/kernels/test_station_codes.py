@@ -1,7 +1,5 @@
 """Coded stations: kernels equal their twins, scores are near the exact correlations, files and copies give the same."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle

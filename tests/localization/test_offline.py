@@ -1,7 +1,5 @@
 """Offline localization: what is written is what the localizer said, and damaged frames are skipped."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

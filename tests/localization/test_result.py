@@ -1,7 +1,5 @@
 """Evidence as plain data and back."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

@@ -1,7 +1,5 @@
 """A program that starts again goes on from the place and the calibration that it saved."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """States of a localizer: the transition table, its page, and DOUBTED and LOST on real frames."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Deskew against a sweep over known walls, measured at once and while driving."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_robot import ns, pose

@@ -1,7 +1,5 @@
 """Where down is: from the ground, from a vector, and when it is not said."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_lidar_odometry import frame

@@ -1,7 +1,5 @@
 """Lidar odometry with any registration and with kiss-icp: gravity, prediction, deskewing, refusal."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The odometry buffer: poses between samples, and which samples continue it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_robot import message, ns, pose

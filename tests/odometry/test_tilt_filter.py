@@ -1,7 +1,5 @@
 """Who is believed about the tilt: registration, walls, or the ground, and how fast the odometry frame turns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

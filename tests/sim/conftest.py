@@ -1,7 +1,5 @@
 """One small town, scanned once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Distance of points from the surfaces of a scene."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

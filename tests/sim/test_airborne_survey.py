@@ -1,7 +1,5 @@
 """The airborne-like survey: roofs and ground remain, facades and what is under roofs go, density as asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Odometry: its own frame, gravity aligned, and drift of the promised size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

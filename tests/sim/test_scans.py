@@ -1,7 +1,5 @@
 """Scans: points lie on surfaces, the aircraft sees roofs, the robot sees facades."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from surface_distance import distance_to_surfaces

@@ -1,7 +1,5 @@
 """Scenes: free roads, things on the ground, and changes that leave the map alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

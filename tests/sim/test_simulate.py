@@ -1,7 +1,5 @@
 """Worlds on disk: the layout of the contract, equal seeds equal bytes, all or nothing."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A site of four tiles, for the modules here that do not build one of their own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

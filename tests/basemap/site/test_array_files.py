@@ -1,7 +1,5 @@
 """Arrays in files: what was written is read back, a full disk is an error, and nothing is left behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

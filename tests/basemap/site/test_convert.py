@@ -1,7 +1,5 @@
 """Conversion of sites: light copies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from trackers import follow

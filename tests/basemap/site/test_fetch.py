@@ -1,7 +1,5 @@
 """Mirrors of sites: fetched, checked, kept; what is damaged or swapped on the way is refused and named."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Layers of tiles: exact bytes, bounded errors of points and normals, hostile input."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import tracemalloc

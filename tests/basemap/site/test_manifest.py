@@ -1,7 +1,5 @@
 """Manifest of a site: written, read, signed; what does not belong there is refused by name."""
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """A site built of clouds: the same bytes whatever the order and the workers, resumed, as good a map as one file."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cache keeps to its bound, and what is in use."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Working files made out of earlier ones: the same tiles are taken, others are made; a bad file is as good as none."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

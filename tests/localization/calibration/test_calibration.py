@@ -1,7 +1,5 @@
 """Calibration of a localizer: leaning sensor, odometry of another scale, known values, late results, resets."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

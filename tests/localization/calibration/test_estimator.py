@@ -1,7 +1,5 @@
 """Calibration: tilt, scale and turn that are estimated from registrations, and what they correct."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from se3 import exp_se3

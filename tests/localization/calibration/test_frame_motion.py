@@ -1,7 +1,5 @@
 """Motion from frame to frame: what two scans of one place say of the sensor's tilt and of odometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from small_world import boxes, scan

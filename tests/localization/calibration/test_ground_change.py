@@ -1,7 +1,5 @@
 """Changed ground is left out, the height goes on without it, and the variance covers the heights that are possible."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

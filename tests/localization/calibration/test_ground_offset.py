@@ -1,7 +1,5 @@
 """The ground offset follows what structure shows of the height, and is nothing where structure shows none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

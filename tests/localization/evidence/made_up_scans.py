@@ -1,7 +1,5 @@
 """Scans at chance places, drawn from shares and an effective number of observations that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coview_stream.localization.evidence.observation import Share

@@ -1,7 +1,5 @@
 """Background: the share that chance explains, and how many independent observations a scan is, from chance places."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation, places_of_their_own, what_was_seen_before

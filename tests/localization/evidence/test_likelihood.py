@@ -1,7 +1,5 @@
 """Likelihood ratio and posterior: a plain sum, calibration against chance, and probabilities in words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Observations: shares of a scan that the map explains at a pose, looked up and counted by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Open places: how rare they are, among scored places and all over a map, and what another one is worth then."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sources: thin, near, repeatable, and told apart by their height above the ground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Registration: finds a known offset through outliers, states its covariance, lets a prior decide the rest."""
 
-from __future__ import annotations
-
 import weakref
 
 import numpy as np

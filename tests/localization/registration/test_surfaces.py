@@ -1,7 +1,5 @@
 """Surfaces of clouds."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coview_stream.localization.registration.surfaces import surface_points

@@ -1,7 +1,5 @@
 """The decision on a search: the probability of an error decides, and nothing else does."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

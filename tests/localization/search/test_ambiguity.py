@@ -1,7 +1,5 @@
 """Ambiguity of a map: identical rows are ambiguous, distinct buildings are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

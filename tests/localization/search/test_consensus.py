@@ -1,7 +1,5 @@
 """Consensus: the places on which all keyframes agree beat the smallest single distance, also far from the origin."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

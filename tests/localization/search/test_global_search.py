@@ -1,7 +1,5 @@
 """Global search on the small world: what it accepts, what it withholds, and what it keeps between keyframes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Hints and guesses: judged like every other place, never trusted, harmless when wrong; when they are tried."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

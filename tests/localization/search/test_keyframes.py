@@ -1,7 +1,5 @@
 """Keyframes every few metres, with all points since, in fixed memory; and the check that frames continue each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

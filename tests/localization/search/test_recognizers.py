@@ -1,7 +1,5 @@
 """Place recognizers side by side: which are used, what each names, and that acceptance treats them alike."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

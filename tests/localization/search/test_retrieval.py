@@ -1,7 +1,5 @@
 """Retrieval: distances equal brute force, votes nearly so; squares and circles of stations."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Places of a search: what the keyframes observe there, what they keep of the hypotheses that came to them."""
 
-from __future__ import annotations
-
 import weakref
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A graph solved at once gives gtsam's poses and covariances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What pairs say of a registration's error by disagreeing sector by sector."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from courtyard import courtyard, source_of

@@ -1,7 +1,5 @@
 """Updates of a tracker: which registrations are believed, what they do to the belief, and the others' verdicts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Between registrations: when the next is needed, what it will use, and how the covariance grows meanwhile."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from trackers import Ride, add_frame, match_and_update, registration, tracker_of

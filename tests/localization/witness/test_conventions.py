@@ -1,7 +1,5 @@
 """Units and axes by motions: which reading of clouds and odometry explains them, and how it is said."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

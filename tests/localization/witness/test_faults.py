@@ -1,7 +1,5 @@
 """Faults of clouds and odometry: synthetic drives with one fault each, and the probabilities that they get."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Conventions by clouds of a small world: named within ten metres, and not where there is nothing to name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import small_world

@@ -1,7 +1,5 @@
 """Stamps of clouds: what they say about a lag of the clouds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The witness on drives through a world: clouds that lie end the poses, and their cause is named."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kinds of dirt by name: off by default, each with its own numbers, and the truth stays the truth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 

@@ -1,7 +1,5 @@
 """Faults of the light: wide beams, rain, dust, blooming signs, windows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from yard import fan, standing, vlp16, yard

@@ -1,7 +1,5 @@
 """A leaning sensor, and faults of odometry: each of the stated size, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from surface_distance import distance_to_surfaces

@@ -1,7 +1,5 @@
 """Traffic, changes since the survey, snow and grass, and faults of the survey."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from yard import standing, vlp16, yard

@@ -1,7 +1,5 @@
 """A flat yard with what a test puts into it: no trees, no cars, a road along x."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coview_stream.sim.layout import Layout, Site

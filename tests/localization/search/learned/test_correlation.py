@@ -1,7 +1,5 @@
 """Dense correlation equals direct sums, finds planted places, and is honest about what lies off the map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

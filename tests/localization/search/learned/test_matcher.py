@@ -1,7 +1,5 @@
 """Learned re-localization with planted features: the right place and heading win with any weights."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
