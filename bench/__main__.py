@@ -67,7 +67,6 @@ BENCHMARKS = {
     "forest_drives": Benchmark("forest.drives", "400 m and 2 km in forests: odometry, GNSS, the map alone, ours"),
     "changes": Benchmark("fusion.changes", "precision and recall of fuse --changes"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays; sixteen robots on one node"),
-    "transports": Benchmark("stream.transports", "a cloud of 65,000 points over ROS 2 beside zenoh"),
     "fleet": Benchmark("stream.fleet", "hundreds of robots on a fleet of nodes, of which one is killed"),
     "fuzz": Benchmark("fuzz.fuzz", "untrusted bytes into every decoder and reader, within limits"),
     "soak": Benchmark("soak.soak", "hours with a fault every minute: false poses, stuck states, recovery, leaks"),

@@ -104,7 +104,7 @@ TABLES = {
     "smooth": Table("smooth", 20, True, "smooth kitti04"),
     "changes": Table("changes", 10, True),
 }  # fmt: skip
-"""All tables by name, the most valuable first. ``transports`` is in none: it needs ROS 2."""
+"""All tables by name, the most valuable first."""
 
 HEAD = """# Results
 

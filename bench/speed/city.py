@@ -2,13 +2,11 @@
 
 The towns lie side by side in one reference system, each with a survey and a drive. The product's command builds them
 with two workers, without features. A process then opens the site and searches for robots that were just switched on.
-Votes of keyframes are compared: all stations, squares of stations (the product's way on large maps), squares in the
-circle of a prior. In a wrong circle no robot may come to a pose.
+In a wrong circle no robot may come to a pose.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import resource
 import shutil
@@ -17,48 +15,34 @@ import sys
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import coview_kernels as kernels
-from bench.accuracy.choices import KeyframeView, Site, right
 from bench.harness.files import PYTHON, environment, fingerprint, folder, isolated, peak_megabytes, remembered
-from bench.harness.rows import Row, against, bounded, informs, judged, reached
+from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.worlds import MAPPER, prepared_run, world_name
-from bench.speed.search import bind_to_one_core
 from coview_stream import BaseMap, Localizer
 from coview_stream.basemap.site.manifest import Manifest
 from coview_stream.basemap.site.working_file import working_file, working_path
 from coview_stream.clouds import read_tum
-from coview_stream.config import Channel, ConsensusConfig, KeyframeConfig
-from coview_stream.descriptors.coview import describe, on_ground
-from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Circle
-from coview_stream.localization.search.global_search import coview_peaks
 from coview_stream.localization.search.hints import PlaceGuess
-from coview_stream.localization.search.retrieval import Retrieval, SearchStations, StationConsensus
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 SIDE, EDGE, FIRST_SEED = 4, 500.0, 9001
 OPEN_S, SEARCH_S = 0.5, 1.0  # targets: to open a site that has its working file, and to find a robot
 MEGABYTES, PER_KM2, WORKER_MEGABYTES = 500.0, 40.0, 2000.0  # targets: MB of memory, of disk, of a building process
-VOTE_MS, LEAST_KEPT = 30.0, 99.0  # targets: a vote within the circle on one core, % of right places that squares keep
 GROWING = (
     "build, two workers", "memory of a worker, peak", "working file made, the first time", "memory for that, peak",
     "memory, resident at the end",
 )  # fmt: skip
-RADIUS, ELSEWHERE = 1000.0, (50.0, 240.0)  # metres of the prior's circle, and of those in another town
+ELSEWHERE = (50.0, 240.0)  # metres of circles in another town
 _CORNER = (400_000.0, 5_600_000.0, 100.0)
 _FRAMES, _DRIVES = 60, 6
 _FALSE = 1.0  # metres
 _SEARCHING = 0.05  # seconds: a shorter step did not search
-
-Keyframe = tuple[KeyframeView, Floats, dict[Channel, Floats32]]
-"""A keyframe, its centre (3,) in the odometry frame on the ground, and its descriptors by channel."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -120,7 +104,6 @@ def _figures(side: int) -> Iterator[Row]:
     yield informs(f"{title}: memory, peak", found["VmHWM"], "MB")
     yield informs(f"{title}: robots found in their first {_FRAMES} frames", found["found"], f"of {found['drives']}")
     if side > 1:
-        yield from _vote_rows(title, isolated(voted, site, worlds))
         for radius in ELSEWHERE:
             posed, frames = isolated(elsewhere, site, worlds, radius)
             name = f"{title}: robots posed in a circle of {radius:g} m that they are not in, {frames} frames"
@@ -174,75 +157,6 @@ def _searched(site: Path, worlds: list[Path]) -> dict[str, Any]:
     memory = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
     kept = {name: int(memory[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon", "VmHWM")}
     return {"first": np.nan} | figures | kept | {"found": posed, "poses": total, "false": wrong}
-
-
-class _AllCompared(Retrieval):
-    """Retrieval that compares every station, however many they are."""
-
-    def compared(self, area: Circle | None = None) -> SearchStations:
-        return SearchStations(self.base_map.station_index, self.base_map.station_grid)
-
-
-def described(world: Path, site: BaseMap) -> list[Keyframe]:
-    """Return the keyframes of a world's drive, without their scans."""
-    config, out = site.descriptor_config, list[Keyframe]()
-    for seen in Site(world, math.inf).keyframes(KeyframeConfig().distance):
-        centre = on_ground(seen.scan, seen.position)
-        described = describe(seen.scan, centre, config)
-        out.append((replace(seen, scan=seen.scan[:0], submap=seen.submap[:0]), centre, described))
-    return out
-
-
-def timed(consensus: StationConsensus, keyframes: Sequence[Keyframe], area: Circle | None) -> dict[str, Any]:
-    """Let keyframes vote: milliseconds of each vote with its places, and the rank of the right place, or None."""
-    times, ranks = list[float](), list[int | None]()
-    for seen, centre, descriptors in keyframes:
-        begin = time.perf_counter()
-        consensus.vote(centre, descriptors, area)
-        places = consensus.hypotheses()
-        times.append(1e3 * (time.perf_counter() - begin))
-        ranks.append(next((k for k, place in enumerate(places) if right(place.T_map_odom, seen)), None))
-    return {"ms": times, "ranks": ranks}
-
-
-def place_of(seen: KeyframeView) -> Floats:
-    """Place of a keyframe (3,) in the map."""
-    return np.asarray((seen.T_map_odom @ np.append(seen.position, 1.0))[:3])
-
-
-def voted(site: Path, worlds: Sequence[Path]) -> dict[str, Any]:
-    """Milliseconds of votes on one core, and the ranks of the right places, by the stations that are compared."""
-    bind_to_one_core()
-    base_map, config = BaseMap.load(site), ConsensusConfig()
-    config = replace(config, peaks=coview_peaks(config.peaks, len(base_map)))
-    middle = 0.5 * (base_map.stations.min(axis=0) + base_map.stations.max(axis=0))
-    circle = Circle(float(middle[0]), float(middle[1]), RADIUS)
-    drives = [described(world, base_map) for world in worlds]
-    kernels.warm_up()
-    out: dict[str, Any] = {"in_circle": int(circle.holds(base_map.stations).sum())}
-    for name, kind, area in (("all", _AllCompared, None), ("squares", Retrieval, None), ("circle", Retrieval, circle)):
-        consensus = StationConsensus(kind(base_map), config)
-        out[name] = {"ms": [], "ranks": []}
-        for drive in drives:
-            if area is None or area.holds(np.array([place_of(seen)[:2] for seen, *_ in drive])).all():
-                consensus.clear()
-                for key, values in timed(consensus, drive, area).items():
-                    out[name][key] += values
-    return out
-
-
-def _vote_rows(title: str, votes: dict[str, Any]) -> Iterator[Row]:
-    whole, squares, circle = (votes[name] for name in ("all", "squares", "circle"))
-    ours, all_ms, near = (float(np.median(side["ms"])) for side in (squares, whole, circle))
-    yield against(f"{title}: a vote and its places, beside all stations compared", ours, all_ms, "ms", None)
-    name = f"{title}: a vote and its places in a circle of {RADIUS:g} m, {votes['in_circle']} stations"
-    yield bounded(name, near, "ms", VOTE_MS)
-    good = [k for k, rank in enumerate(whole["ranks"]) if rank is not None]
-    kept = 100.0 * float(np.mean([squares["ranks"][k] is not None for k in good]))
-    yield reached(f"{title}: right places kept, of {len(good)} that all stations name", kept, "%", LEAST_KEPT)
-    for most in (1, 10):
-        shares = [100.0 * float(np.mean([r is not None and r < most for r in v["ranks"]])) for v in (squares, whole)]
-        yield Row(f"{title}: right place among the first {most}, beside all stations compared", *shares, "%")
 
 
 def elsewhere(site: Path, worlds: Sequence[Path], radius: float) -> tuple[int, int]:
