@@ -205,17 +205,21 @@ def judged(T_map_body: Pose, truth: Pose | None) -> Result:
 def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: float) -> Iterator[tuple[Result, bool]]:
     """Yield results as they come, each with whether it was made now; those of a site stay ``below``.
 
-    ``jobs`` processes with one thread each begin no further site after ``until`` (``time.monotonic``), nor one that
-    another call has begun.
+    ``jobs`` processes with one thread each begin no further site after ``until`` (``time.monotonic``). Sites that
+    another call has begun come last, as it leaves them.
     """
     os.environ.update(thread_settings(1))  # processes that start from now on inherit it
     below.mkdir(parents=True, exist_ok=True)
+    left = list(sites)
     with ProcessPoolExecutor(max(1, min(jobs, len(sites))), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(on_site, site, below, code, until) for site in sites]
         try:
-            for done in as_completed(waiting):
-                results, new = done.result()
-                yield from ((result, new) for result in results)
+            for wait in (False, True):
+                waiting = {pool.submit(on_site, site, below, code, until, wait): site for site in left}
+                left = []
+                for done in as_completed(waiting):
+                    results, new = done.result()
+                    yield from ((result, new) for result in results)
+                    left += [] if results else [waiting[done]]
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -224,11 +228,13 @@ class _UnkeptError(Exception):
     """Results that are not kept: of a site with a failed run, or of one that was to begin after the time."""
 
 
-def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tuple[list[Result], bool]:
+def on_site(
+    site: Site, below: Path, code: str, until: float = math.inf, wait: bool = False
+) -> tuple[list[Result], bool]:
     """Make all runs on one map unless they are there; return them, and whether they were made now.
 
     Runs of a site with a ``failed`` one are made again next time. None is returned of a site that another process
-    makes, or that was to begin after ``until``.
+    makes, unless we ``wait``, or that was to begin after ``until``.
     """
     about = [{"key": run.key, "class": FAMILIES[run.family], **asdict(run)} for run in site]
     new = []
@@ -252,7 +258,7 @@ def on_site(site: Site, below: Path, code: str, until: float = math.inf) -> tupl
 
     spec = {"runs": list(map(asdict, site)), "code": code}
     try:
-        results: list[Result] = remembered(below / f"{site[0].kind}-{site[0].seed}.json", spec, make, False)["runs"]
+        results: list[Result] = remembered(below / f"{site[0].kind}-{site[0].seed}.json", spec, make, wait)["runs"]
     except BlockingIOError:
         return [], False
     except _UnkeptError as error:

@@ -1,4 +1,5 @@
 import math
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -235,3 +236,38 @@ def test_a_command_that_ends_in_a_traceback_has_failed_and_has_not_said_that_the
     monkeypatch.setattr(challenge, "built", lambda source, site: site)
     challenge.locate(case, tmp_path / "worlds", tmp_path / "ours")
     assert challenge.score(tmp_path / "ours" / f"{name}.tum", truth)["outcome"] == outcome
+
+
+class Now:
+    """Does the work of a pool at once."""
+
+    def __init__(self, jobs, mp_context):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def submit(self, work, *args):
+        done = Future()
+        done.set_result(work(*args))
+        return done
+
+    def shutdown(self, cancel_futures):
+        pass
+
+
+def test_sites_that_another_call_makes_come_last(tmp_path, monkeypatch):
+    sites, calls = plan("reported", 20), []
+    monkeypatch.setattr(run, "ProcessPoolExecutor", Now)
+
+    def on_site(site, below, code, until, wait):
+        calls.append((site, wait))
+        return ([], False) if site == sites[0] and not wait else ([{"key": case.key} for case in site], True)
+
+    monkeypatch.setattr(run, "on_site", on_site)
+    found = list(run.everywhere(sites, tmp_path, "a", 1, math.inf))
+    assert {result["key"] for result, _ in found} == {case.key for site in sites for case in site}
+    assert [wait for _, wait in calls] == [False] * len(sites) + [True]
