@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.accuracy.scores import Errors, Track, errors, losses, rms
-from bench.forest.variants import VARIANTS, by_lidar
+from bench.forest.variants import VARIANTS
 from bench.forest.worlds import say, weights
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, listed
-from bench.tracking.drives import Drive, start
-from bench.tracking.worlds import Recorded, World, map_of, open_world
+from bench.tracking.drives import start
+from bench.tracking.worlds import World, map_of, open_world
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
@@ -87,29 +87,17 @@ class Result(NamedTuple):
         }
 
 
-def drive_of(world: World, recorded: Recorded, odometry: str) -> Drive:
-    """Return the drive with odometry from its own lidar, or of wheels that drift by the world's share."""
-    drive = start(recorded.truth, world.drift, world.seed)
-    drive = replace(drive.picked(drive.frames[::_EVERY]), stamps=drive.stamps[::_EVERY])
-    if odometry == "wheels":
-        return drive
-    out = folder() / world.name
-    spec = {"code": fingerprint("coview_stream/odometry", "coview_stream/sim"), "world": repr(world)}
-    made = out / "lidar_odometry.npy"
-    remembered(out / "lidar_odometry.json", spec, lambda: np.save(made, by_lidar(recorded, drive)))
-    return replace(drive, odometry=np.load(made))
-
-
-def followed(world: World, name: str, odometry: str) -> Result:
+def followed(world: World, name: str) -> Result:
     """Return a variant's answers in a world; kept until the code changes."""
     recorded, site = open_world(folder(), world), map_of(folder(), world)
-    drive, out = drive_of(world, recorded, odometry), folder() / "forest-drives" / world.name
-    file = out / f"{name.replace(' ', '-')}-{odometry}.npz"
+    drive = start(recorded.truth, world.drift, world.seed)
+    drive = replace(drive.picked(drive.frames[::_EVERY]), stamps=drive.stamps[::_EVERY])
+    file = folder() / "forest-drives" / world.name / f"{name.replace(' ', '-')}.npz"
     spec = {"code": fingerprint(), "bench": fingerprint(*_MADE_BY), "world": repr(world), "weights": weights()}
 
     def work() -> None:
         begin = time.perf_counter()
-        track = VARIANTS[name](site, recorded, drive, config_for(odometry))
+        track = VARIANTS[name](site, recorded, drive, LocalizerConfig())
         file.parent.mkdir(parents=True, exist_ok=True)
         np.savez(file, poses=track.poses, states=np.array(track.states))
         say(f"{world.name}, {name}: {time.perf_counter() - begin:.0f} s")
@@ -122,11 +110,6 @@ def followed(world: World, name: str, odometry: str) -> Result:
             np.full((count, 2), np.nan),
         )  # fmt: skip
     return Result(track, drive.truth, drive.driven)
-
-
-def config_for(odometry: str) -> LocalizerConfig:
-    """Return the product's settings as ``locate`` has them: odometry from the lidar leans with it."""
-    return LocalizerConfig(sensor_leans=odometry == "wheels")
 
 
 def draw_errors(drives: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
@@ -180,8 +163,6 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--variants", nargs="+", default=names, choices=names, metavar="V", help=f"some of {', '.join(names)}"
     )
-    about = "of wheels that drift by 1 %%, or of the lidar's own frames by kiss-icp (wheels)"
-    parser.add_argument("--odometry", choices=("wheels", "lidar"), default="wheels", help=about)
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw forest_errors.png and forest_tracks.png there")
 
 
@@ -198,7 +179,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for world in worlds:
         found = results.setdefault(world.kind, {})
         for name in asked.variants:
-            found[name] = followed(world, name, asked.odometry)
+            found[name] = followed(world, name)
             figures = {"drive": world.kind, "variant": name, **found[name].figures()}
             rmse = figures["rmse_m"]
             yield informs(f"forest_drives/{world.kind}, {name}: rmse", np.nan if rmse is None else rmse, "m", figures)

@@ -20,15 +20,12 @@ from bench.tracking.drives import Drive, follow
 from bench.tracking.worlds import Recorded
 from coview_stream import BaseMap
 from coview_stream.config import KeyframeConfig, LocalizerConfig, RegistrationConfig, TrackingConfig
-from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, inverse, orthonormal, pose_from, rot_z, to_local, yaw_of
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import PoseGraph
-from coview_stream.odometry.lidar_odometry import LidarOdometry
 
 _COMPASS, _TILT = np.radians(5.0), np.radians(0.5)  # sigmas of the heading and tilt at the start
 _UNKNOWN = 100.0  # radians: sigma of what a fix says about the heading
@@ -170,20 +167,3 @@ VARIANTS: dict[str, Variant] = {
     "ours": follow,
 }
 """In the tables' order."""
-
-
-def lidar_odometry(truth: Floats) -> LidarOdometry:
-    """Return the product's lidar odometry; down is given, as an accelerometer does: a dense forest shows no plane."""
-    down = -truth[0, 2, :3]
-    return LidarOdometry(LidarOdometryConfig(gravity=(float(down[0]), float(down[1]), float(down[2]))))
-
-
-def by_lidar(recorded: Recorded, drive: Drive) -> Floats:
-    """Odometry (N, 4, 4) of the lidar's own frames; one that it refuses has the pose of the one before."""
-    odometry, poses = lidar_odometry(drive.truth), [np.eye(4)]
-    for frame, stamp in zip(drive.frames, drive.stamps, strict=True):
-        try:
-            poses.append(odometry.step(recorded.read(int(frame)), None, float(stamp)))
-        except CloudError:
-            poses.append(poses[-1])
-    return np.array(poses[1:])
