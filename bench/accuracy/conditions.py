@@ -27,7 +27,6 @@ rev180          the body turned around its z axis by 180 degrees, in clouds, odo
 from __future__ import annotations
 
 import shutil
-import subprocess
 import time
 import zlib
 from argparse import ArgumentParser, Namespace
@@ -43,7 +42,7 @@ from scipy.spatial.transform import Rotation
 from bench.accuracy import paper
 from bench.accuracy.scores import Track, errors, exposed, score
 from bench.harness import worlds
-from bench.harness.files import PYTHON, add_data, built, environment, fingerprint, folder, remembered
+from bench.harness.files import add_data, built, fingerprint, folder, remembered, trajectory
 from bench.harness.rows import Row, informs, judged, listed, number
 from coview_stream import BaseMap
 from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
@@ -168,7 +167,6 @@ _LESS = 5.0  # per cent
 _SQUARE = 8.0  # metres, of the map that is left out as one
 _NEAR = 0.5  # metres to a map point
 _SCANS, _POINTS = 12, 10_000  # of a run, of which the overlap is measured
-_NO_POSE = 1  # exit code of ``locate`` for a run that it could not place
 
 
 class RealSet:
@@ -259,12 +257,8 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
     remembered(run.parent / "spoilt.json", spec, lambda: real.spoil(condition, run.parent))
 
     def make() -> dict[str, Any]:
-        words = (*PYTHON, "-m", "coview_stream", "locate", str(site), str(run), "-o", str(out), "--no-pictures")
         begin = time.perf_counter()
-        done = subprocess.run(words, env=environment(1), cwd=site.parent, capture_output=True, text=True)
-        if done.returncode not in (0, _NO_POSE):
-            raise InputError(f"{run.parent.name}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
-        scores = scored(read_tum(out / "trajectory.tum"), read_tum(run.parent / "truth.tum"))
+        scores = scored(read_tum(trajectory(site, run, out)), read_tum(run.parent / "truth.tum"))
         return {**scores, "locate_s": round(time.perf_counter() - begin, 1)}
 
     return remembered(out / "scores.json", spec | {"code": fingerprint()}, make)
@@ -295,11 +289,10 @@ def scored(estimate: tuple[Floats, Poses], truth: tuple[Floats, Poses]) -> dict[
         nearest = int(np.abs(stamps - stamp).argmin())
         if abs(stamps[nearest] - stamp) < MAX_STAMP_GAP:
             poses[nearest] = T
-    count, states = len(stamps), np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
-    track = Track(stamps, states, poses, np.full((count, 6, 6), np.nan), np.full((count, 2), np.nan))
+    track = Track.of_poses(stamps, poses)
     error, known = errors(track, true), track.tracking
     first = [float(values[known.argmax()]) if known.any() else None for values in (error.metres, error.degrees)]
-    about = {"frames": count, "posed": int(known.sum()), "first_m": first[0], "first_deg": first[1]}
+    about = {"frames": len(stamps), "posed": int(known.sum()), "first_m": first[0], "first_deg": first[1]}
     return about | score(track, true, driven(true), ())
 
 

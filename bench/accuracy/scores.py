@@ -44,6 +44,12 @@ class Track:
         states = ["SKIPPED" if fix is None else fix.state.reported for fix in fixes]
         return cls(stamps, states, poses, covariances, levels)
 
+    @classmethod
+    def of_poses(cls, stamps: Floats, poses: Floats) -> Track:
+        """Track of poses (N, 4, 4), NaN where there is none, without covariances."""
+        states = np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
+        return cls(stamps, states, poses, *(np.full((len(poses), *shape), np.nan) for shape in ((6, 6), (4,))))
+
     @property
     def tracking(self) -> Bools:
         """(N,) whether the frame has a pose."""

@@ -104,11 +104,7 @@ def followed(world: World, name: str) -> Result:
 
     remembered(file.with_suffix(".json"), spec, work)
     with np.load(file) as kept:
-        count = len(drive)
-        track = Track(
-            drive.stamps, kept["states"].tolist(), kept["poses"], np.full((count, 6, 6), np.nan),
-            np.full((count, 2), np.nan),
-        )  # fmt: skip
+        track = replace(Track.of_poses(drive.stamps, kept["poses"]), states=kept["states"].tolist())
     return Result(track, drive.truth, drive.driven)
 
 

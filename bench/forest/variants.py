@@ -114,20 +114,14 @@ class ForgetfulGraph(PoseGraph):
         self.start(T_map_body, covariance)
 
 
-def of_poses(stamps: Floats, poses: Floats) -> Track:
-    """Track of poses (N, 4, 4) that are always given, without a covariance."""
-    count = len(poses)
-    return Track(stamps, ["TRACKING"] * count, poses, np.full((count, 6, 6), np.nan), np.full((count, 2), np.nan))
-
-
 def by_odometry(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:
     """Take odometry alone, from the true start."""
-    return of_poses(drive.stamps, drive.truth[0] @ inverse(drive.odometry[0]) @ drive.odometry)
+    return Track.of_poses(drive.stamps, drive.truth[0] @ inverse(drive.odometry[0]) @ drive.odometry)
 
 
 def by_gnss(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:
     """Fuse GNSS and odometry."""
-    return of_poses(drive.stamps, fused(drive.stamps, drive.truth, drive.odometry, len(drive)))
+    return Track.of_poses(drive.stamps, fused(drive.stamps, drive.truth, drive.odometry, len(drive)))
 
 
 def by_map(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:
@@ -148,7 +142,7 @@ def by_map(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig
         poses.append(guess if found is None else orthonormal(found.T_map_source @ turn))
     out = np.array(poses[1:])
     out[:, :3, 3] += base_map.origin
-    return of_poses(drive.stamps, out)
+    return Track.of_poses(drive.stamps, out)
 
 
 def without_graph(site: Path, recorded: Recorded, drive: Drive, config: LocalizerConfig) -> Track:

@@ -137,13 +137,31 @@ def environment(threads: int | None = None) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, **(thread_settings(threads) if threads else {})}
 
 
+def command(*words: str | Path, threads: int) -> subprocess.CompletedProcess[str]:
+    """Run ``coview-stream WORDS``."""
+    line = (*PYTHON, "-m", "coview_stream", *map(str, words))
+    return subprocess.run(line, env=environment(threads), capture_output=True, text=True)
+
+
+def trajectory(site: Path, run: Path, out: Path) -> Path:
+    """Return the trajectory that ``coview-stream locate`` writes for a run, perhaps an empty one; InputError if none.
+
+    Its exit code is 1 where no frame has a pose, and after a traceback.
+    """
+    found = out / "trajectory.tum"
+    found.unlink(missing_ok=True)
+    done = command("locate", site, run, "-o", out, "--no-pictures", threads=1)
+    if done.returncode not in (0, 1) or not found.is_file():
+        raise InputError(f"{out.name}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+    return found
+
+
 def built(source: Path, site: Path) -> Path:
     """Return the map that ``coview-stream build`` makes of a cloud; build it unless it is there."""
 
     def build() -> None:
         site.parent.mkdir(parents=True, exist_ok=True)
-        words = (*PYTHON, "-m", "coview_stream", "build", str(source), "-o", str(site))
-        done = subprocess.run(words, env=environment(2), cwd=site.parent, capture_output=True, text=True)
+        done = command("build", source, "-o", site, threads=2)
         if done.returncode:
             raise InputError(f"building {site.name}: {done.stderr.strip().splitlines()[-1]}")
 

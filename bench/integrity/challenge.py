@@ -13,7 +13,6 @@ no fix; without a file the program has failed. Without ``--answers`` ours are ta
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import PYTHON, built, environment, fingerprint, folder, remembered
+from bench.harness.files import built, fingerprint, folder, remembered, trajectory
 from bench.harness.rows import Row, informs, judged, table
 from bench.integrity.integrity import Tally, percent, planned
 from bench.integrity.plan import FAMILIES, Run
@@ -77,13 +76,7 @@ def locate(run: Run, below: Path, answers: Path) -> None:
 
     def work() -> None:
         site = built(world / "map.laz", world / "site.coview")
-        shutil.rmtree(out, ignore_errors=True)
-        words = (str(site), str(world / "run"), "-o", str(out), "--no-pictures")
-        command = (*PYTHON, "-m", "coview_stream", "locate", *words)
-        done = subprocess.run(command, env=environment(1), capture_output=True, text=True)
-        found = out / "trajectory.tum"
-        if done.returncode not in (0, 1) or not found.is_file():  # 1: no pose, or a traceback before there is a file
-            raise InputError(f"locating {out.name}: {done.stderr.strip()[-200:]}")
+        found = trajectory(site, world / "run", out)
         answers.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(found, out.with_suffix(".tum"))
 

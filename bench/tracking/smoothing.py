@@ -151,9 +151,7 @@ def _levels(poses: Sequence[SmoothedPose | Fix | None]) -> Floats:
 
 def _errors(poses: Floats, truth: Floats) -> Floats:
     """Errors (N, 2), metres and degrees; NaN without a pose."""
-    count, states = len(truth), np.where(np.isnan(poses[:, 0, 0]), "LOST", "TRACKING").tolist()
-    track = Track(np.arange(count), states, poses, np.full((count, 6, 6), np.nan), np.full((count, 2), np.nan))
-    found = errors(track, truth)
+    found = errors(Track.of_poses(np.arange(len(truth)), poses), truth)
     return np.column_stack([found.metres, found.degrees])
 
 

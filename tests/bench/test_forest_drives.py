@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from drives_with_truth import way
 
-from bench.accuracy.scores import errors
+from bench.accuracy.scores import Track, errors
 from bench.forest.drives import statistics
-from bench.forest.variants import ForgetfulGraph, Receiver, fused, of_poses
+from bench.forest.variants import ForgetfulGraph, Receiver, fused
 from bench.tracking.drives import drifting
 from bench.tracking.worlds import World, winding_path
 from coview_stream.geometry.transforms import exp_so3, pose_from
@@ -47,7 +47,7 @@ def test_fusion_bounds_the_drift_of_odometry_and_is_bounded_by_the_receiver():
     odometry = drifting(truth, 0.05, 3)
     sharp = replace(Receiver(), horizontal=0.1, slow=0.0)
     alone, exact, under_canopy = (
-        errors(of_poses(stamps, poses), truth).metres
+        errors(Track.of_poses(stamps, poses), truth).metres
         for poses in (
             truth[0] @ np.linalg.inv(odometry[0]) @ odometry,
             fused(stamps, truth, odometry, 5, sharp),

@@ -1,12 +1,11 @@
 import math
-from concurrent.futures import Future
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bench.harness import files
 from bench.harness.files import locked
 from bench.harness.rows import upper
 from bench.integrity import challenge, run
@@ -217,57 +216,15 @@ def test_an_answer_to_the_challenge_is_its_first_line(tmp_path):
     assert challenge.score(answer, truth)["outcome"] == "false"
 
 
-@pytest.mark.parametrize(("code", "writes", "outcome"), [(1, False, "failed"), (1, True, "none"), (2, True, "failed")])
+@pytest.mark.parametrize(("code", "writes"), [(0, False), (1, False), (2, True)])
 def test_a_command_that_ends_in_a_traceback_has_failed_and_has_not_said_that_there_is_no_fix(
-    tmp_path, monkeypatch, code, writes, outcome
+    tmp_path, monkeypatch, code, writes
 ):
-    case = plan("reported", 2)[0][0]
-    truth, name = tmp_path / "truth.tum", challenge.name_of(case)
-    write_tum(truth, [1.0], np.eye(4)[None])
-
-    def command(words, **options):
-        out = Path(words[words.index("-o") + 1])
-        out.mkdir(parents=True)
+    def command(*words, threads):
         if writes:
-            (out / "trajectory.tum").touch()
-        return SimpleNamespace(returncode=code, stderr="Traceback (most recent call last)")
+            (tmp_path / "trajectory.tum").touch()
+        return SimpleNamespace(returncode=code, stderr="Traceback\nValueError: x\n")
 
-    monkeypatch.setattr(challenge.subprocess, "run", command)
-    monkeypatch.setattr(challenge, "built", lambda source, site: site)
-    challenge.locate(case, tmp_path / "worlds", tmp_path / "ours")
-    assert challenge.score(tmp_path / "ours" / f"{name}.tum", truth)["outcome"] == outcome
-
-
-class Now:
-    """Does the work of a pool at once."""
-
-    def __init__(self, jobs, mp_context):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
-
-    def submit(self, work, *args):
-        done = Future()
-        done.set_result(work(*args))
-        return done
-
-    def shutdown(self, cancel_futures):
-        pass
-
-
-def test_sites_that_another_call_makes_come_last(tmp_path, monkeypatch):
-    sites, calls = plan("reported", 20), []
-    monkeypatch.setattr(run, "ProcessPoolExecutor", Now)
-
-    def on_site(site, below, code, until, wait):
-        calls.append((site, wait))
-        return ([], False) if site == sites[0] and not wait else ([{"key": case.key} for case in site], True)
-
-    monkeypatch.setattr(run, "on_site", on_site)
-    found = list(run.everywhere(sites, tmp_path, "a", 1, math.inf))
-    assert {result["key"] for result, _ in found} == {case.key for site in sites for case in site}
-    assert [wait for _, wait in calls] == [False] * len(sites) + [True]
+    monkeypatch.setattr(files, "command", command)
+    with pytest.raises(InputError, match=": ValueError: x"):
+        files.trajectory(tmp_path / "site.coview", tmp_path / "run", tmp_path)
