@@ -54,10 +54,10 @@ class Table(NamedTuple):
 SETS_OF_TWO = "--sets kitti04 handheld_livox --conditions base pitch:3"
 
 TABLES = {
-    "integrity": Table("integrity", 290, quick="integrity --count 12 --minutes 2"),
-    "accuracy": Table("accuracy --only worlds", 30, True),
+    "integrity": Table("integrity", 220, quick="integrity --count 6", thinned="a frame every 0.8 m"),
+    "accuracy": Table("accuracy --only worlds", 60, True),
     "conditions": Table("conditions", 15, True, f"conditions {SETS_OF_TWO}"),
-    "forest": Table("forest", 30, True),
+    "forest": Table("forest", 12, True),
     "tracking": Table("tracking", 40, True),
     "dirt": Table("accuracy --only dirt --drives 2", 30, True, "accuracy --only dirt", "two of the four drives"),
     "protection": Table(
@@ -65,25 +65,25 @@ TABLES = {
         "26 of 30 worlds of each family; 999 blocks, which a risk of 1e-3 needs, are in 25",
     ),
     "exposure": Table("exposure --worlds 26", 1, True, f"exposure --worlds 1 {SETS_OF_TWO}"),
-    "faults": Table("faults", 15, True),
+    "faults": Table("faults", 25, True),
     "conditions beside the paper": Table(
-        "conditions --conditions base --paper", 5, True, "conditions --conditions base --sets kitti04 --paper"
+        "conditions --conditions base --paper", 3, True, "conditions --conditions base --sets kitti04 --paper"
     ),
-    "forest_drives": Table("forest_drives --plots docs/images", 30, True, "forest_drives"),
-    "challenge": Table("challenge --count 40", 20, True, "challenge", "the first 40 runs, 3 GB"),
+    "forest_drives": Table("forest_drives --plots docs/images", 50, True, "forest_drives"),
+    "challenge": Table("challenge --count 40", 20, True, "challenge", "40 of 100 runs"),
     "peers": Table("peers --places 12 --limit 90", 40, quick="peers --limit 60", thinned="12 places of each world"),
-    "search": Table("search", 5),
-    "engine": Table("engine", 5),
-    "memory": Table("memory", 10, quick="memory --km2 0.05"),
-    "start": Table("start", 5),
-    "soak": Table("soak --minutes 60", 62, quick="soak --minutes 1 --every 10"),
+    "search": Table("search", 4),
+    "engine": Table("engine", 3),
+    "memory": Table("memory", 15),
+    "start": Table("start", 3),
+    "soak": Table("soak --minutes 60", 62, quick="soak --minutes 0.5 --every 10"),
     "city": Table("city --side 2 4", 30),
     "stream": Table("stream raw cdr protobuf jitter robots", 8, quick="stream jitter"),
-    "lidars": Table("stream lidars", 5),
+    "lidars": Table("stream lidars", 7),
     "throughput": Table("engine --throughput", 7),
-    "registration": Table("registration", 10),
+    "registration": Table("registration", 5),
     "fleet": Table("fleet", 4),
-    "fuzz": Table("fuzz --seconds 60", 18, quick="fuzz --seconds 5"),
+    "fuzz": Table("fuzz --seconds 30", 10, quick="fuzz --seconds 2", thinned="half a minute for each target"),
     "ablation, spacing": Table(
         "ablation --only spacing --picture docs/images/spacing.png", 5, False, "ablation --only spacing --sites kitti04"
     ),
@@ -91,7 +91,7 @@ TABLES = {
         f"ablation, {group}": Table(f"ablation --only {group}", 8, True, f"ablation --only {group} --sites kitti04")
         for group in ("channels", "registration", "localizer", "elsewhere")
     },
-    "changed ground": Table("ground", 30, True),
+    "changed ground": Table("ground", 15, True),
     "overlap": Table(
         "conditions --overlaps 5 20 35 50 65 85 --sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
         13, True, "conditions --overlaps 35 --sets kitti04",
@@ -100,9 +100,9 @@ TABLES = {
         "conditions --conditions base --densities 4 8 20 --paper", 12, True,
         "conditions --conditions base --densities 8 --sets kitti04",
     ),
-    "covariance": Table("covariance", 10, True, "covariance --sets kitti04"),
-    "smooth": Table("smooth", 20, True, "smooth kitti04"),
-    "changes": Table("changes", 10, True),
+    "covariance": Table("covariance", 5, True, "covariance --sets kitti04"),
+    "smooth": Table("smooth", 12, True, "smooth kitti04"),
+    "changes": Table("changes", 8, True),
 }  # fmt: skip
 """All tables by name, the most valuable first."""
 

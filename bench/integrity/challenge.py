@@ -31,7 +31,7 @@ from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
 from coview_stream.report.evaluation import MAX_STAMP_GAP
 
-COUNT, QUICK = 100, 4  # runs
+COUNT, QUICK = 100, 2  # runs
 
 
 def name_of(run: Run) -> str:

@@ -35,7 +35,7 @@ from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Caster
 
 Result = dict[str, Any]
 
-SPEED = 4.0  # metres per second: a frame every 0.4 m
+SPEED = 8.0  # metres per second: a frame every 0.8 m
 HEIGHT = 1.5  # metres, of the sensor above the ground
 FIRST_STAMP = 1000.0  # seconds
 LENGTH = 60.0  # metres after which a run ends without a fix

@@ -9,7 +9,7 @@ from bench.harness import files
 from bench.harness.files import locked
 from bench.harness.rows import upper
 from bench.integrity import challenge, run
-from bench.integrity.integrity import Tally, chosen, classes, reliability_table
+from bench.integrity.integrity import RUNS, Tally, chosen, classes, planned, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, STATED, Run, plan
 from bench.integrity.run import altered, drive_of, judged
@@ -129,6 +129,18 @@ def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_rep
     real = every("surveys", 30)
     assert {run.family for run in (*runs, *real, *every("calibration"))} == set(FAMILIES)
     assert {run.family for run in every("reported", 60)} == {run.family for run in runs}
+
+
+def test_half_of_the_3000_runs_are_on_real_surveys_and_900_near_copies_and_900_outside(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_DATA", str(tmp_path))
+    (tmp_path / "surveys").mkdir()
+    (tmp_path / "surveys" / "town.laz").touch()
+    runs = [run for site in planned(RUNS) for run in site]
+    assert len({run.key for run in runs}) == len(runs) == 3000
+    assert sum(run.group == "surveys" for run in runs) == 1500
+    classes = [FAMILIES[run.family] for run in runs]
+    assert min(classes.count("near copies"), classes.count("outside")) >= 900
+    assert upper(0, len(runs)) < 1e-3
 
 
 ALTERED = (("mirrored", 0.0), ("scaled", 1.0), ("tilted", 0.5))  # by 5 %, by 3 degrees
