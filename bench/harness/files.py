@@ -40,10 +40,14 @@ def folder() -> Path:
     return Path(os.environ.get("COVIEW_BENCH") or Path(tempfile.gettempdir()) / "coview-bench")
 
 
+def data() -> Path:
+    """Folder of the real runs and surveys: the environment's ``COVIEW_DATA``, or one beside the checkout."""
+    return Path(os.environ.get("COVIEW_DATA") or ROOT.parent / "shared" / "data")
+
+
 def add_data(parser: ArgumentParser) -> None:
     """Add the option that names the folder of the real runs."""
-    here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the real runs (COVIEW_DATA)")
+    parser.add_argument("--data", type=Path, default=data(), metavar="DIR", help="holds the real runs (COVIEW_DATA)")
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ cells, and both halves are of one flight: errors below half a metre say little.
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +19,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from bench.harness.files import data
 from bench.integrity.sites import there_and_back
 from coview_stream.clouds.las import require_laspy
 from coview_stream.errors import InputError
@@ -62,7 +62,7 @@ class Survey(NamedTuple):
 
 def files() -> list[Path]:
     """Return the surveys that are there."""
-    return sorted(Path(os.environ.get("COVIEW_DATA") or "none").glob("surveys/*.laz"))
+    return sorted(data().glob("surveys/*.laz"))
 
 
 @lru_cache(maxsize=2)
