@@ -70,7 +70,7 @@ class WebHub:
         self._lock = threading.Lock()
         self._pages: list[Page] = []
         self._kept: OrderedDict[Slot, bytes] = OrderedDict()
-        self._first: list[Callable[[], list[bytes]]] = []
+        self.first: Callable[[], list[bytes]] = list  # events that a new page gets before all others
         self._closed = False
 
     @property
@@ -88,14 +88,10 @@ class WebHub:
         for page in pages:
             page.put(slot, event)
 
-    def tell_first(self, events: Callable[[], list[bytes]]) -> None:
-        """Send these events to every new page, before all others."""
-        self._first.append(events)
-
     def open_page(self) -> Page | None:
         """Return a new page with the first and the kept events; None if there are too many."""
         page = Page()
-        for number, event in enumerate(event for events in self._first for event in events()):
+        for number, event in enumerate(self.first()):
             page.put(("first", str(number)), event)
         with self._lock:
             if self._closed or len(self._pages) >= MAX_PAGES:
@@ -157,7 +153,7 @@ class WebSink(Sink):
         self._hub = hub
         self._trails: dict[str, deque[list[float] | None]] = {}
         self._last: dict[str, float] = {}  # local time of each robot's newest pose
-        hub.tell_first(self._trail_events)
+        hub.first = self._trail_events
 
     def map(self, view: MapView) -> None:
         """Keep the map for the pages to read, and tell them."""

@@ -131,7 +131,7 @@ def test_what_a_page_has_not_taken_is_replaced_by_newer(hub, page):
 
 
 def test_a_new_page_is_told_what_is_kept(hub):
-    hub.tell_first(lambda: [encode_event("trail", {"points": []})])
+    hub.first = lambda: [encode_event("trail", {"points": []})]
     hub.publish("status", "r1", {"state": "LOST"})
     hub.publish("scan", "r1", {}, keep=False)
     assert events(hub.open_page().take(0.0)) == [("trail", {"points": []}), ("status", {"state": "LOST"})]
