@@ -257,21 +257,6 @@ def test_searches_and_skipped_searches_are_counted(robot):
     assert robot.session.take_job("search") is None
 
 
-def test_fixes_poses_and_losses_are_counted(robot):
-    robot.localized()
-    assert (robot.counters.fixes, robot.counters.poses, robot.counters.losses) == (1, 1, 0)
-    robot.frame(0.1)
-    robot.session.pose()
-    assert (robot.counters.fixes, robot.counters.poses) == (1, 2)
-    robot.frame(0.2, unknown, state=State.LOST)
-    assert robot.session.pose() is None
-    assert (robot.counters.fixes, robot.counters.poses, robot.counters.losses) == (1, 2, 1)
-    robot.frame(0.3, unknown, state=State.LOST)
-    assert robot.counters.losses == 1
-    robot.frame(0.4)
-    assert robot.counters.fixes == 2
-
-
 def test_missing_frames_are_counted_by_sequence_number(robot):
     robot.moved(0.0, x=0.0)
     robot.job_for(0.0, attachment=numbered(1, 0.0))

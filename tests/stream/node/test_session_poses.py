@@ -163,20 +163,6 @@ def test_rejected_frames_do_not_extend_dead_reckoning():
     assert state(robot) is State.LOST
 
 
-def test_odometry_gap_ends_pose_until_a_frame_is_verified(robot):
-    robot.localized(0.0)
-    robot.moved(0.8, x=0.0, now=1000.1)
-    assert robot.counters.odometry_gaps == 1
-    assert robot.session.pose() is None
-    assert state(robot) is not State.TRACKING
-    assert "pause" in reason(robot)
-    robot.moved(0.9, x=0.0, now=1000.2)
-    robot.saw(0.85, now=1000.2)
-    job = robot.answered(tracking, 1000.3)
-    assert job.require_verification
-    assert robot.session.pose() is not None
-
-
 def test_odometry_jump_restarts_search(robot):
     first = robot.localized(0.0).frame(0.1)
     robot.moved(0.15, x=900.0)

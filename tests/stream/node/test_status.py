@@ -17,7 +17,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import Considered
 from coview_stream.messages.json_messages import decode_hypotheses
 from coview_stream.stream.node.robot_endpoints import MapViewAnswer
-from coview_stream.stream.node.status import MAX_STATUS, ConnectionMonitor, encode_status, hypotheses, status
+from coview_stream.stream.node.status import MAX_STATUS, ConnectionMonitor, encode_status, status
 from coview_stream.stream.transport.keys import NodeIdentity
 from coview_stream.stream.transport.transport import Connection
 
@@ -146,10 +146,6 @@ def published(site, all_robots=True):
     return [decode_hypotheses(s) for s in site.net.samples(site.keys["r1"].hypotheses)]
 
 
-def test_nothing_is_published_before_a_search(site):
-    assert published(site) == []
-
-
 def test_places_go_out_with_the_status_of_each_second(site, searched):
     assert published(site, all_robots=False) == []  # a change of state brings none
     (message,) = published(site)
@@ -157,17 +153,15 @@ def test_places_go_out_with_the_status_of_each_second(site, searched):
     assert (message.none, message.stamp_ns, message.map_sha256) == (0.2, 1_500_000_000, SHA)
 
 
-def test_of_a_robot_with_a_place_nothing_goes_out(site, searched):
-    site.engine.answer = tracking
-    site.frame("r1", 0.1)
-    assert searched.state()[0].has_place
+@pytest.mark.parametrize("how", ["found", "begun anew"])
+def test_of_a_robot_with_a_place_or_another_odometry_frame_no_places_go_out(site, searched, how):
+    if how == "found":
+        site.engine.answer = tracking
+        site.frame("r1", 0.1)
+    else:
+        searched.restart_search("asked to search again", forget=True)
+    assert searched.state()[0].has_place == (how == "found")
     assert published(site) == []
-
-
-def test_a_new_odometry_frame_forgets_them(site, searched):
-    assert hypotheses(searched) is not None
-    searched.restart_search("asked to search again", forget=True)
-    assert hypotheses(searched) is None
 
 
 def test_another_kind_of_reason_is_logged_but_not_each_number(site, caplog):
