@@ -140,15 +140,15 @@ class Reference:
         turn = rot_z(2.0 * np.pi * float(shift) / found.shape[1])
         return float(found[k, shift]), pose_from(turn, self.stations[stations[k]]) @ pose_from(np.eye(3), -scan.centre)
 
-    def refine(self, scan: LocalScan, T: Pose, facades: bool = False, overlap: float = OVERLAP) -> Pose:
-        """Register a VLS to the map around it from a coarse ``T_map_odom``; ``facades``: keep inconsistent points."""
+    def refine(self, scan: LocalScan, T: Pose) -> Pose:
+        """Register the consistent points of a VLS to the map around it from a coarse ``T_map_odom``."""
         radius, middle = self.config.radius, transform(T, scan.centre[None])[0]
         target = self.points[np.hypot(*(self.points[:, :2] - middle[:2]).T) < radius + 5.0]
         near = np.hypot(*(scan.points[:, :2] - scan.centre[:2]).T) < radius
         source = scan.points[near].astype(np.float64)
-        if not facades and len(target):
+        if len(target):
             source = source[consistent(transform(T, source), target)]
-        return trimmed_icp(source, target.astype(np.float64), T, overlap)
+        return trimmed_icp(source, target.astype(np.float64), T)
 
 
 def consistent(points: Floats, target: Points) -> Bools:
