@@ -98,21 +98,14 @@ def test_correction_does_not_change_published_stamps(robot):
     assert stamps[-1] == ns(1.95)
 
 
-def test_odometry_timeout_ends_pose(robot):
+def test_odometry_timeout_ends_the_pose_until_a_frame_is_verified(robot):
     robot.localized(0.0)
     robot.session.tick(robot.now + 0.49)
     assert robot.session.pose() is not None
-    robot.session.tick(robot.now + 0.51)
-    assert robot.session.pose() is None
+    silent = robot.now + 0.51
+    robot.session.tick(silent)
     assert age(robot) is None
     assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
-    assert robot.counters.losses == 1
-
-
-def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
-    robot.localized(0.0)
-    silent = robot.now + 0.6
-    robot.session.tick(silent)
     robot.moved(0.2, now=silent + 0.01)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
@@ -139,28 +132,18 @@ def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     assert state(robot) is State.LOST
 
 
-def test_dead_reckoning_ends_after_timeout():
+@pytest.mark.parametrize("rejected", [False, True])
+def test_dead_reckoning_ends_after_its_timeout_and_frames_of_no_use_do_not_extend_it(rejected):
     robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
-    for k in range(1, 39):
+    for k in range(1, 45):
         robot.moved(0.05 * k)
+        if rejected:
+            robot.session.handle_failure(robot.job_for(0.05 * k - 0.01), "too few points", rejected=True)
         robot.session.tick(robot.now)
-        assert robot.session.pose() is not None
-    for k in range(39, 45):
-        robot.moved(0.05 * k)
-        robot.session.tick(robot.now)
+        assert k >= 39 or robot.session.pose() is not None
     assert robot.session.pose() is None
-    assert robot.session.state() == (State.LOST, "no clouds for 2 s; before: no usable frame for 2 s")
-    assert robot.job_for(2.19).require_verification
-
-
-def test_rejected_frames_do_not_extend_dead_reckoning():
-    robot = Robot(NodeConfig(dead_reckoning_timeout=1.0)).localized(0.0)
-    for k in range(1, 30):
-        robot.moved(0.05 * k)
-        job = robot.job_for(0.05 * k - 0.01)
-        robot.session.handle_failure(job, "too few points", rejected=True)
-        robot.session.tick(robot.now)
-    assert state(robot) is State.LOST
+    assert reason(robot).endswith("no usable frame for 2 s")
+    assert robot.job_for(2.195).require_verification
 
 
 def test_odometry_jump_restarts_search(robot):
