@@ -155,6 +155,13 @@ def pose_error(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(gap[:3, 3])), float(angle)
 
 
+def assert_pose(T: np.ndarray, truth: np.ndarray, metres: float, degrees: float = 180.1) -> None:
+    """Fail unless the pose is within so many metres and degrees of the true one."""
+    off = pose_error(T, truth)
+    assert off[0] < metres, off
+    assert off[1] < degrees, off
+
+
 def in_map(drive: Drive, count: int) -> np.ndarray:
     """Return the first frames' points (N, 3) float32 where they truly are."""
     pairs = zip(drive.clouds[:count], drive.T_map_body, strict=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,25 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[file_format.Arrays,
     return built.arrays | {"descriptor.coview": built.descriptors("coview")}, built.parameters
 
 
-def test_whole_map_is_loaded(small: Any, tmp_path: Path) -> None:
-    file_format.save(tmp_path / "a.coview", *small)
-    assert len(BaseMap.load(tmp_path / "a.coview")) == len(small[0]["stations"])
+@pytest.fixture
+def load(small: Any, tmp_path: Path) -> Callable[..., BaseMap]:
+    """Loads a map of other arrays, and of other parameters, from a file."""
+
+    def loaded(arrays: file_format.Arrays, parameters: Any = small[1]) -> BaseMap:
+        file_format.save(tmp_path / "a.coview", arrays, parameters)
+        return BaseMap.load(tmp_path / "a.coview")
+
+    return loaded
+
+
+@pytest.fixture
+def undescribed(small: Any) -> file_format.Arrays:
+    """The arrays of a map whose stations are not described."""
+    return {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
+
+
+def test_whole_map_is_loaded(small: Any, load: Any) -> None:
+    assert len(load(*small)) == len(small[0]["stations"])
 
 
 NAMES = ["origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner", "descriptor.coview",
@@ -39,9 +56,7 @@ NAMES = ["origin", "stations", "points", "normals", "tile_index", "surveyed", "s
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("change", ["shorter", "flat", "type", "deeper", "wider"])
-def test_array_of_another_shape_or_type_is_refused_when_loading(
-    small: Any, tmp_path: Path, name: str, change: str
-) -> None:
+def test_array_of_another_shape_or_type_is_refused_when_loading(small: Any, load: Any, name: str, change: str) -> None:
     array = small[0][name]
     if change == "shorter" and name in ("surveyed", "tile_index"):
         pytest.skip("any size will do")
@@ -52,89 +67,77 @@ def test_array_of_another_shape_or_type_is_refused_when_loading(
         "deeper": lambda: array[None],
         "wider": lambda: np.repeat(array, 2, axis=-1) if name != "surveyed" else array.reshape(-1),
     }[change]()
-    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
     # the one it does not fit to may be named in its place
     with pytest.raises(MapError, match=r"the map's (\w|\.)+ (is|has)"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0] | {name: changed})
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [("origin", np.nan), ("stations", np.inf), ("surveyed_corner", np.nan), ("tile_index", 1 << 40),
                         ("tile_index", -1)]
 )  # fmt: skip
-def test_values_that_would_be_used_as_places_are_checked(small: Any, tmp_path: Path, name: str, value: float) -> None:
+def test_values_that_would_be_used_as_places_are_checked(small: Any, load: Any, name: str, value: float) -> None:
     changed = small[0][name].copy()
     changed[..., -1] = value
-    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
     with pytest.raises(MapError, match=f"the map's {name}"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0] | {name: changed})
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e30, 3e6, -5e3])
 @pytest.mark.parametrize("name", ["points", "stations"])
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_points_and_stations_are_finite_and_on_the_surveyed_cells(
-    small: Any, tmp_path: Path, value: float, name: str, column: int
+    small: Any, load: Any, value: float, name: str, column: int
 ) -> None:
     changed = small[0][name].copy()
     changed[-1, column] = value
-    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
     if column == 2 and abs(value) < 1e7:
-        BaseMap.load(tmp_path / "a.coview")  # a height alone makes no raster larger
+        load(small[0] | {name: changed})  # a height alone makes no raster larger
         return
     with pytest.raises(MapError, match=f"the map's {name} (is not finite|lies beside)"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0] | {name: changed})
 
 
-def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused(small: Any, tmp_path: Path) -> None:
+def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused(small: Any, load: Any) -> None:
     tiles = small[0]["field.tiles"].copy()
     tiles[0, 1] += 1400
-    file_format.save(tmp_path / "a.coview", small[0] | {"field.tiles": tiles}, small[1])
     with pytest.raises(MapError, match=r"field\.tiles lies beside"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0] | {"field.tiles": tiles})
     wide = np.zeros((1, 140_000_000), dtype=np.uint8)
     with pytest.raises(MapError, match="surveyed covers 560 km2"):
         file_format.check_arrays(small[0] | {"surveyed": wide}, BaseMap(*small).config)
 
 
 @pytest.mark.parametrize("rows", [[[0, 5], [0, 5]], [[0, 5], [4, 9]], [[5, 9], [0, 6]], [[0, 12], [3, 4], [4, 5]]])
-def test_points_are_named_once(small: Any, tmp_path: Path, rows: list[list[int]]) -> None:
+def test_points_are_named_once(small: Any, load: Any, rows: list[list[int]]) -> None:
     index = np.array([[0, k, *row] for k, row in enumerate(rows)])
-    file_format.save(tmp_path / "a.coview", small[0] | {"tile_index": index}, small[1])
     with pytest.raises(MapError, match="tile_index names points twice"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0] | {"tile_index": index})
 
 
-def test_empty_stretches_are_none_twice(small: Any, tmp_path: Path) -> None:
+def test_empty_stretches_are_none_twice(small: Any, load: Any) -> None:
     index = np.array([[0, 0, 3, 3], [0, 1, 0, 3], [0, 2, 3, 9], [0, 3, 0, 0], [0, 4, 3, 3]])
-    file_format.save(tmp_path / "a.coview", small[0] | {"tile_index": index}, small[1])
-    assert len(BaseMap.load(tmp_path / "a.coview").points) == len(small[0]["points"])
+    assert len(load(small[0] | {"tile_index": index}).points) == len(small[0]["points"])
 
 
-def test_stations_of_storeys_without_points_are_described_as_empty(small: Any, tmp_path: Path) -> None:
-    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
-    arrays["stations"] = arrays["stations"].copy()
-    arrays["stations"][1:, :2], arrays["stations"][:, 2] = arrays["stations"][:1, :2], 900.0
-    arrays["stations"][0, 2] = -900.0
-    file_format.save(tmp_path / "a.coview", arrays, small[1])
-    assert np.isfinite(BaseMap.load(tmp_path / "a.coview").descriptors("coview")).all()
+def test_stations_of_storeys_without_points_are_described_as_empty(undescribed: Any, load: Any) -> None:
+    undescribed["stations"] = undescribed["stations"].copy()
+    undescribed["stations"][1:, :2], undescribed["stations"][:, 2] = undescribed["stations"][:1, :2], 900.0
+    undescribed["stations"][0, 2] = -900.0
+    assert np.isfinite(load(undescribed).descriptors("coview")).all()
 
 
-def test_stations_on_a_thousand_storeys_are_refused(small: Any, tmp_path: Path) -> None:
-    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
-    places = np.repeat(arrays["stations"][:20], 100, axis=0)
+def test_stations_on_a_thousand_storeys_are_refused(undescribed: Any, load: Any) -> None:
+    places = np.repeat(undescribed["stations"][:20], 100, axis=0)
     places[:, 2] = 3.0 * np.arange(len(places))
-    file_format.save(tmp_path / "a.coview", arrays | {"stations": places}, small[1])
     with pytest.raises(MapError, match="storeys, 1024 at most"):
-        BaseMap.load(tmp_path / "a.coview").descriptors("coview")
+        load(undescribed | {"stations": places}).descriptors("coview")
 
 
-def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path) -> None:
-    arrays = {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
-    arrays["stations"] = np.repeat(arrays["stations"][:1], 200, axis=0)
-    file_format.save(tmp_path / "a.coview", arrays, small[1])
+def test_many_stations_above_one_another_are_refused(undescribed: Any, load: Any) -> None:
+    undescribed["stations"] = np.repeat(undescribed["stations"][:1], 200, axis=0)
     with pytest.raises(MapError, match="200 stations above one another"):
-        _ = BaseMap.load(tmp_path / "a.coview").station_grid
+        _ = load(undescribed).station_grid
 
 
 @pytest.mark.parametrize(
@@ -146,11 +149,10 @@ def test_many_stations_above_one_another_are_refused(small: Any, tmp_path: Path)
         {"config": {"descriptor": {"channels": ["coview"], "colour": 1}}},
     ],
 )  # fmt: skip
-def test_parameters_of_another_kind_are_refused(small: Any, tmp_path: Path, parameters: Any) -> None:
+def test_parameters_of_another_kind_are_refused(small: Any, load: Any, parameters: Any) -> None:
     whole = small[1] | parameters if isinstance(parameters, dict) and parameters else parameters
-    file_format.save(tmp_path / "a.coview", small[0], whole)
     with pytest.raises(MapError, match=r"a\.coview: the map.* (build it|copy or build it) again"):
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0], whole)
 
 
 @pytest.mark.parametrize(
@@ -162,14 +164,13 @@ def test_parameters_of_another_kind_are_refused(small: Any, tmp_path: Path, para
     ],
 )  # fmt: skip
 def test_counts_of_the_settings_are_those_of_the_arrays_and_within_bounds(
-    small: Any, tmp_path: Path, name: str, value: Any, flaw: str
+    small: Any, load: Any, name: str, value: Any, flaw: str
 ) -> None:
     parameters = json.loads(json.dumps(small[1]))
     parameters["config"]["descriptor"][name] = value
     arrays = {name: values for name, values in small[0].items() if not name.startswith("descriptor")}
-    file_format.save(tmp_path / "a.coview", arrays, parameters)
     with pytest.raises(MapError, match=flaw):
-        BaseMap.load(tmp_path / "a.coview")
+        load(arrays, parameters)
 
 
 @pytest.mark.parametrize(("name", "value"), [("learned.tiles", 30_000), ("learned.place_at", np.nan)])
@@ -180,12 +181,11 @@ def test_features_lie_on_the_surveyed_cells(small: Any, name: str, value: float)
         file_format.check_arrays(arrays, BaseMap(*small).config)
 
 
-def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, tmp_path: Path) -> None:
+def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, load: Any) -> None:
     parameters = json.loads(json.dumps(small[1]))
     parameters["config"]["descriptor"]["channels"].append("coview_strict")  # of maps from before November 2026
-    file_format.save(tmp_path / "a.coview", small[0], parameters)
     with pytest.raises(MapError, match=r"a\.coview: the map's .*'coview_strict'.*; build it again") as error:
-        BaseMap.load(tmp_path / "a.coview")
+        load(small[0], parameters)
     assert "\n" not in str(error.value)
 
 

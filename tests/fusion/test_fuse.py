@@ -3,23 +3,13 @@
 import numpy as np
 import pytest
 import small_world
+from localized_drives import localized
 from small_world import Box
 
-from coview_stream.clouds.trajectory import write_tum
 from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, fuse
-from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
 from coview_stream.geometry.transforms import transform
-from coview_stream.recordings.open_run import open_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*which map:UserWarning")]
-
-
-def localized(base_map, folder, drive):
-    """Write a drive, take its truth for what was localized, and open both."""
-    path = small_world.write_run(folder / "run", drive, len(drive.clouds))
-    stamps = [float(line.split()[0]) for line in (path / "odometry.tum").read_text().splitlines()]
-    write_tum(folder / "trajectory.tum", stamps, drive.T_map_body)
-    return LocalizedRun(parse_pair(f"{path}:{folder}"), base_map, lambda where, mount: open_run(where, mount=mount))
 
 
 def inside(points, box, grown=0.3):

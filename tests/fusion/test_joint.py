@@ -3,25 +3,13 @@
 import numpy as np
 import pytest
 import small_world
+from localized_drives import localized
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.trajectory import write_tum
 from coview_stream.fusion.constraints import path_of, spaced
 from coview_stream.fusion.joint import Joint, Judgement, adjust
-from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
-from coview_stream.recordings.open_run import open_run
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*which map:UserWarning")
-
-
-def located(base_map, folder, drive, off):
-    """Write a drive, take its truth, shifted by ``off`` (K, 3) metres, for what was localized, and open both."""
-    path = small_world.write_run(folder / "run", drive, len(drive.clouds))
-    stamps = [float(line.split()[0]) for line in (path / "odometry.tum").read_text().splitlines()]
-    poses = np.array(drive.T_map_body)
-    poses[:, :3, 3] += off
-    write_tum(folder / "trajectory.tum", stamps, poses)
-    return LocalizedRun(parse_pair(f"{path}:{folder}"), base_map, lambda where, mount: open_run(where, mount=mount))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +27,7 @@ def test_a_run_that_drifted_where_the_map_is_blind_is_drawn_to_the_other(map_poi
     blind = BaseMap.build(map_points[np.linalg.norm(map_points[:, :2] - way[-1, :2], axis=1) > 16.0], radius=30.0)
     off = np.zeros_like(way)
     off[:, 1] = 0.25 * np.clip(np.linspace(-1.0, 1.0, len(way)), 0.0, 1.0)
-    runs = [located(blind, tmp_path / "a", drives[0], 0.0), located(blind, tmp_path / "b", drives[1], off)]
+    runs = [localized(blind, tmp_path / "a", drives[0]), localized(blind, tmp_path / "b", drives[1], off)]
     joint = adjust(blind, runs)
     assert joint.between > 5
     assert joint.accepted
@@ -51,7 +39,7 @@ def test_a_run_that_drifted_where_the_map_is_blind_is_drawn_to_the_other(map_poi
 
 @pytest.mark.slow
 def test_without_overlaps_the_poses_stay(world_map, drives, tmp_path):
-    run = located(world_map, tmp_path, drives[1], 0.0)
+    run = localized(world_map, tmp_path, drives[1])
     joint = adjust(world_map, [run])
     assert (joint.between, joint.loops, joint.accepted) == (0, 0, False)
     assert np.array_equal(joint.poses[0], run.poses)

@@ -4,15 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from localized_drives import opened
 
-from coview_stream.clouds.trajectory import write_tum
+from coview_stream.clouds.trajectory import read_tum, write_tum
 from coview_stream.errors import InputError
 from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
-from coview_stream.recordings.open_run import open_run
-
-
-def opened(path, mount):
-    return open_run(path, mount=mount)
 
 
 def test_paths_with_colons_are_parted_where_both_are_there(tmp_path):
@@ -42,7 +38,7 @@ def test_two_ways_to_part_are_refused(tmp_path, monkeypatch):
 @pytest.fixture
 def results(world_run, world_drive, world_map, tmp_path):
     """Results of all frames but the first two."""
-    stamps = [float(line.split()[0]) for line in (world_run / "odometry.tum").read_text().splitlines()]
+    stamps, _ = read_tum(world_run / "odometry.tum")
     write_tum(tmp_path / "trajectory.tum", stamps[2:], world_drive.T_map_body[2 : len(stamps)])
     return tmp_path
 
@@ -57,7 +53,7 @@ def test_frames_without_a_pose_are_counted(world_run, world_map, results):
 
 def test_bridged_poses_are_left_out(world_run, world_map, results):
     """Of poses 2 to 6 the fourth and fifth are bridged; a stretch of another kind or without stamps changes nothing."""
-    stamps = [float(line.split()[0]) for line in (world_run / "odometry.tum").read_text().splitlines()]
+    stamps = read_tum(world_run / "odometry.tum")[0].tolist()
     stretches = [
         {"kind": "backward", "first_stamp": stamps[2], "last_stamp": stamps[3]},
         {"kind": "bridged", "first_stamp": stamps[4], "last_stamp": stamps[5]},

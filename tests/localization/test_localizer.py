@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_world
-from small_world import pose_error
+from small_world import assert_pose, pose_error
 from trackers import follow, garbage
 
 from coview_stream.basemap.basemap import BaseMap
@@ -38,9 +38,7 @@ def test_first_fix_and_later_poses_are_correct(world_fixes, world_drive):
     assert posed[0] <= 5  # 12 m
     assert posed == list(range(posed[0], len(world_fixes)))
     for k in posed:
-        metres, degrees = pose_error(world_fixes[k].T_map_body, world_drive.T_map_body[k])
-        assert metres < 0.08, k
-        assert degrees < 0.3, k
+        assert_pose(world_fixes[k].T_map_body, world_drive.T_map_body[k], 0.08, 0.3)
 
 
 def test_no_pose_unless_tracking(world_map, world_fixes, elsewhere):
@@ -151,9 +149,7 @@ def test_reset_and_relocalize_search_again_and_find(world_map, world_drive, worl
     T_other = pose_from(rot_z(-0.4), [1e5, -2e5, 3.0])
     again = follow(localizer, world_drive.seen_from(T_other), 6, 100.0)
     assert [fix.state for fix in again] == [fix.state for fix in world_fixes[:6]]
-    metres, degrees = pose_error(again[-1].T_map_body, world_drive.T_map_body[5])
-    assert metres < 0.08
-    assert degrees < 0.3
+    assert_pose(again[-1].T_map_body, world_drive.T_map_body[5], 0.08, 0.3)
 
 
 @pytest.fixture(scope="module")
@@ -223,9 +219,7 @@ def test_late_search_result_gives_the_current_pose(world_map, world_drive, resul
     localizer.apply_search_result(result)
     fix = localizer.fix()
     assert fix.state is State.TRACKING
-    metres, degrees = pose_error(fix.T_map_body, world_drive.T_map_body[k + 2])
-    assert metres < 0.08
-    assert degrees < 0.3
+    assert_pose(fix.T_map_body, world_drive.T_map_body[k + 2], 0.08, 0.3)
 
 
 def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, world_drive, results):
@@ -292,9 +286,7 @@ def test_standing_robot_keeps_tracking_without_shrinking_covariance(world_map, w
     frame = world_drive.clouds[5], world_drive.T_odom_body[5]
     fixes = [localizer.step(*frame, 3.0 + 0.1 * k) for k in range(200)]
     assert all(fix.state is State.TRACKING for fix in fixes)
-    metres, degrees = small_world.pose_error(fixes[-1].T_map_body, world_drive.T_map_body[5])
-    assert metres < 0.05
-    assert degrees < 0.3
+    small_world.assert_pose(fixes[-1].T_map_body, world_drive.T_map_body[5], 0.05, 0.3)
     early, late = (np.sqrt(np.diag(fixes[k].covariance))[:2].max() for k in (20, -1))
     assert late > 0.8 * early
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from tiny_world import TINY
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud, read_tum
@@ -17,15 +18,7 @@ from coview_stream.sim import Dirt, Simulated, SimulationConfig, simulate
 from coview_stream.sim.dirt.robot import Motion
 from coview_stream.sim.simulate import frames, scene_of, trajectories
 
-TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 ORIGIN = (412_000.0, 5_318_000.0, 240.0)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    out = tmp_path_factory.mktemp("worlds") / "a"
-    simulate(out, TINY)
-    return out
 
 
 def test_simulated_files_follow_the_run_layout(world):

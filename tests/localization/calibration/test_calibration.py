@@ -53,16 +53,6 @@ def test_leaning_sensor_is_levelled(world_map, world_drive, world_fixes, lean, k
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [0.93, 1.07])
-def test_scale_of_odometry_is_learnt(world_map, world_drive, world_fixes, scale):
-    odometry = [pose_from(T[:3, :3], scale * T[:3, 3]) for T in world_drive.T_odom_body]
-    errors, fix = follow(Localizer(world_map), world_drive.clouds, odometry, world_drive.T_map_body)
-    assert len(errors) >= 0.85 * sum(each.T_map_body is not None for each in world_fixes)
-    assert errors[:, 0].max() < 0.1
-    assert (1.0 + fix.calibration.scale) * scale == pytest.approx(1.0, abs=0.02)
-
-
-@pytest.mark.slow
 def test_search_result_that_comes_frames_later_levels_the_sensor(world_map, world_drive):
     """The keyframe's clouds were levelled by the calibration of then."""
     localizer, waiting, errors, clouds = Localizer(world_map), [], [], leaning(world_drive)
@@ -97,7 +87,7 @@ def test_calibration_outlives_the_odometry_frame_but_no_reset(world_map, world_d
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 1.05])
+@pytest.mark.parametrize("scale", [0.93, 1.0, 1.07])
 def test_odometry_in_utm_that_turns_is_corrected(world_map, world_drive, world_fixes, scale):
     """Far from its origin, a factor or a turn about that would be kilometres."""
     utm = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -154,17 +144,6 @@ def test_better_known_values_stay_group_by_group():
     estimator.learn(Calibration(pitch=-0.05, scale=0.03, sigma_scale=0.001).doubted())
     assert estimator.calibration.pitch == pytest.approx(0.03, abs=0.002)
     assert 0.008 < estimator.calibration.scale < 0.03
-
-
-def test_supposition_of_a_leader_ends_with_it():
-    estimator = CalibrationEstimator()
-    before = estimator.calibration
-    T = np.eye(4)
-    T[:3, :3] = exp_so3(np.radians([0.0, 4.0, 0.0]))
-    estimator.suppose_attitude(T, np.eye(4), np.radians(0.3) ** 2, 0.7)
-    assert abs(np.degrees(estimator.calibration.pitch)) > 1.0
-    estimator.forget_leader()
-    assert estimator.calibration == before
 
 
 def test_mixture_has_the_sigma_of_each_axis():

@@ -167,5 +167,7 @@ def test_lean_that_a_leading_place_has_told_costs_its_probability():
     spread = np.hypot(CalibrationEstimator().calibration.sigma_tilt, LEVEL)
     lean = estimator.calibration.leans_from(Calibration())
     assert estimator.lean_prior == pytest.approx(2 * np.log(LEVEL / spread) - 0.5 * (lean / spread) ** 2)
+    assert lean > np.radians(1.0)
     estimator.forget_leader()
     assert estimator.lean_prior == 0.0
+    assert estimator.calibration == CalibrationEstimator().calibration

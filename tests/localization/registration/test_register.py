@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
 from se3 import exp_se3
-from small_world import pose_error
+from small_world import assert_pose, pose_error
 from trackers import observed
 
 from coview_kernels import Prior, Registration
@@ -67,9 +67,7 @@ def with_outliers(scan, share):
 def test_known_six_dof_offset_is_found(target, scan, offset):
     start = TRUTH @ exp_se3(np.array(offset, float))
     result = register(scan, start, target, CONFIG, CONFIG.search)
-    metres, degrees = pose_error(result.T_map_source, TRUTH)
-    assert metres < 0.01
-    assert degrees < 0.05
+    assert_pose(result.T_map_source, TRUTH, 0.01, 0.05)
     assert result.converged
     assert result.rmse < 0.01
     assert result.pairs > 1000
@@ -81,9 +79,7 @@ def test_registration_with_forty_percent_outliers(target, scan, centre):
     start = TRUTH @ exp_se3(np.array([0.01, 0.0, 0.06, 0.8, -0.7, 0.1]))
     crowd = with_outliers(scan, 0.4)
     result = register(crowd, start, target, CONFIG, CONFIG.search, centre=centre)
-    metres, degrees = pose_error(result.T_map_source, TRUTH)
-    assert metres < 0.03
-    assert degrees < 0.15
+    assert_pose(result.T_map_source, TRUTH, 0.03, 0.15)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 import small_world
 from made_up_places import name_instead
 from se3 import exp_se3
-from small_world import pose_error
+from small_world import assert_pose, pose_error
 from trackers import follow, garbage
 
 from coview_stream.basemap.basemap import BaseMap
@@ -150,19 +150,7 @@ def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_d
         assert pose_error(fix.T_map_body, truth)[0] < 0.1
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        np.eye(3),
-        2 * np.eye(4),
-        np.diag([1.0, -1, 1, 1]),
-        np.full((4, 4), np.nan),
-        pose_from(np.eye(3), [1e8, 0, 0]),
-        "here",
-        None,
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("bad", [2 * np.eye(4), pose_from(np.eye(3), [1e8, 0, 0]), None], ids=str)
 def test_invalid_hint_pose_is_refused(world_map, bad):
     with pytest.raises(RunError, match="T_map_body"):
         Localizer(world_map).hint_pose(bad)
@@ -216,9 +204,7 @@ def test_continuous_odometry_is_the_only_hint_after_loss(world_map, world_drive)
     localizer, k = lost(world_map, world_drive)
     request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
     (T_map_odom,) = request.hints
-    metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[k])
-    assert metres < 0.3
-    assert degrees < 0.5
+    assert_pose(T_map_odom @ request.T_odom_body, world_drive.T_map_body[k], 0.3, 0.5)
 
 
 def test_odometry_frame_hint_is_kept_across_anchors():

@@ -5,18 +5,18 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from tiny_world import TINY
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud, read_tum
 from coview_stream.errors import ConfigError
 from coview_stream.recordings.open_run import open_run
-from coview_stream.sim import Dirt, SimulationConfig, parse_dirt, simulate
+from coview_stream.sim import Dirt, parse_dirt, simulate
 from coview_stream.sim.dirt import KINDS_OF_DIRT, real
 from coview_stream.sim.dirt.scan import Stream, stream
 from coview_stream.sim.dirt.survey import Density
 from coview_stream.sim.simulate import frames, scene_of, trajectories
 
-TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 BASE_POINTS, FRAME_POINTS = 12759, [24385, 24316, 24337, 24366]
 TRUTH = ["1000.300000", "-8.652942", "11.659302", "-0.467424"]
 ODOMETRY = ["1000.300000", "-274.298736", "240.661939", "-39.517563"]
@@ -24,22 +24,15 @@ THIN = Density(1.0, 5.0)  # a survey that is done quickly
 OFF_SENSOR = ("gravity", "odometry", "slip", "strips", "density", "seasons", "years")
 
 
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory):
-    out = tmp_path_factory.mktemp("worlds") / "clean"
-    simulate(out, TINY)
-    return out
-
-
 @pytest.mark.slow
-def test_a_clean_world_is_what_it_was_before_there_was_dirt(clean):
+def test_a_clean_world_is_what_it_was_before_there_was_dirt(world):
     """Figures of the code before dirt; a few points may differ where another processor rounds otherwise."""
-    assert len(read_cloud(clean / "base.laz")) == pytest.approx(BASE_POINTS, abs=3)
-    counts = [len(read_cloud(clean / "run" / "frames" / f"{k:06d}.pcd")) for k in range(4)]
+    assert len(read_cloud(world / "base.laz")) == pytest.approx(BASE_POINTS, abs=3)
+    counts = [len(read_cloud(world / "run" / "frames" / f"{k:06d}.pcd")) for k in range(4)]
     assert counts == pytest.approx(FRAME_POINTS, abs=3)
-    assert (clean / "truth.tum").read_text().splitlines()[-1].split()[:4] == TRUTH
-    assert (clean / "run" / "odometry.tum").read_text().splitlines()[-1].split()[:4] == ODOMETRY
-    assert "dirt" not in json.loads((clean / "world.json").read_text())
+    assert (world / "truth.tum").read_text().splitlines()[-1].split()[:4] == TRUTH
+    assert (world / "run" / "odometry.tum").read_text().splitlines()[-1].split()[:4] == ODOMETRY
+    assert "dirt" not in json.loads((world / "world.json").read_text())
 
 
 def test_every_kind_has_a_name_and_can_be_switched_on_alone():
@@ -95,16 +88,16 @@ def test_the_command_line_takes_dirt(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS_OF_DIRT)
-def test_each_kind_changes_what_it_should_and_never_the_truth(name, clean, tmp_path):
+def test_each_kind_changes_what_it_should_and_never_the_truth(name, world, tmp_path):
     simulate(tmp_path / "w", replace(TINY, dirt=parse_dirt(name, seed=1)))
     assert (tmp_path / "w" / "sweeps").exists() is (name == "motion")
-    assert (tmp_path / "w" / "truth.tum").read_bytes() == (clean / "truth.tum").read_bytes()
+    assert (tmp_path / "w" / "truth.tum").read_bytes() == (world / "truth.tum").read_bytes()
     odometry = (tmp_path / "w" / "run" / "odometry.tum").read_bytes()
-    assert (odometry != (clean / "run" / "odometry.tum").read_bytes()) is (name in ("gravity", "odometry", "slip"))
-    ours, theirs = (read_cloud(each / "base.laz").points for each in (tmp_path / "w", clean))
+    assert (odometry != (world / "run" / "odometry.tum").read_bytes()) is (name in ("gravity", "odometry", "slip"))
+    ours, theirs = (read_cloud(each / "base.laz").points for each in (tmp_path / "w", world))
     same_map = ours.shape == theirs.shape and bool((ours == theirs).all())
     assert same_map is (name not in ("strips", "density", "seasons", "years"))
-    ours, theirs = (read_cloud(each / "run" / "frames" / "000003.pcd").points for each in (tmp_path / "w", clean))
+    ours, theirs = (read_cloud(each / "run" / "frames" / "000003.pcd").points for each in (tmp_path / "w", world))
     same_frame = ours.shape == theirs.shape and bool((ours == theirs).all())
     assert same_frame is (name in OFF_SENSOR and name != "years")
 
