@@ -337,8 +337,8 @@ def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
         reason = _text(status, "reason")
         if "waiting for" in reason or reason.startswith("no clouds"):
             remedy = "its data does not come: see clouds and odometry above"
-        elif "two places" in reason or "several places" in reason or "leads" in reason:
-            remedy = "drive on, to where these places differ; `info --ambiguity` shows where that takes long"
+        elif "places fit" in reason or "leads" in reason:
+            remedy = "drive to where these places differ; `info --ambiguity` shows where that takes long"
         else:
             remedy = "drive ten metres; if all else here is ok: is it on this map? `coview-stream help reasons`"
         return Finding("warn", "node", found, remedy, robot)

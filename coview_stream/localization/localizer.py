@@ -21,6 +21,7 @@ from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.advice import AdvisedSearch
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.search.recognizers import SearchIndex
@@ -69,7 +70,7 @@ class Localizer(SavedState):
         """
         self.base_map, self.config = checked_arguments(base_map, config)
         self._local_maps = local_maps or LocalMaps(self.base_map, self.config.registration.source_range)
-        self.search = GlobalSearch(self.base_map, self.config, self._local_maps, index)
+        self.search = AdvisedSearch(self.base_map, self.config, self._local_maps, index)
         self._restarts = itertools.count(1)
         self.reset()
 

@@ -27,6 +27,7 @@ from coview_stream.localization.backward import RecordedFrame, RecordingLocalize
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence, calibration_json, calibration_says
+from coview_stream.localization.search.acceptance import Considered
 from coview_stream.localization.search.hints import PlaceGuess
 from coview_stream.localization.smoothing import PoseKind, SmoothedPose, smooth_run
 from coview_stream.localization.state import State
@@ -108,6 +109,7 @@ class RunResult:
         driven: metres that odometry had driven at the first fix; None if not known.
         mount: of the run's lidar; None for the body itself.
         smoothed: poses by the whole run, in order; None unless they were asked for.
+        considered: places of the newest search, if no frame has a pose; else None.
         node_reason: why there was no pose, as a node said; empty if none was asked.
     """
 
@@ -122,6 +124,7 @@ class RunResult:
     driven: float | None = None
     mount: Mount | None = None
     smoothed: list[SmoothedPose] | None = None
+    considered: Considered | None = None
     node_reason: str = ""
 
     @property
@@ -294,6 +297,8 @@ def locate(
             progress(index + 1, len(run), fix)
     if not located.fixes:
         raise InputError(f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}")
+    if not located.posed:
+        located.considered = localizer.search.considered
     if isinstance(localizer, RecordingLocalizer):
         located.smoothed = smooth_run(localizer, run, recorded)
     return located

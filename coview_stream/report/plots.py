@@ -168,8 +168,9 @@ def _even_marks(legend: Any) -> None:
 
 
 def plot_trajectory(
-    base: Reals, positions: Reals, states: Sequence[str], path: str | os.PathLike[str], truth: Reals | None = None
-) -> None:
+    base: Reals, positions: Reals, states: Sequence[str], path: str | os.PathLike[str], truth: Reals | None = None,
+    places: Reals | None = None,
+) -> None:  # fmt: skip
     """Draw a trajectory over the grey base map, coloured by state.
 
     Args:
@@ -179,6 +180,7 @@ def plot_trajectory(
         states: K states, SEARCHING, AMBIGUOUS, TRACKING or LOST.
         path: picture to write.
         truth: (T, 3) true positions, if known.
+        places: (P, 6) that may be right, as :class:`~coview_stream.localization.search.acceptance.Considered` has them.
 
     Raises:
         InputError: as many states as positions are needed; or the picture cannot be written.
@@ -193,7 +195,9 @@ def plot_trajectory(
             line = np.asarray(truth, dtype=np.float64) - shift
             axes.plot(line[:, 0], line[:, 1], color=TRUTH, linewidth=1.0, linestyle=(0, (4, 2)), label="truth")
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
-        if not drawn.any():
+        if places is not None:
+            _draw_places(axes, np.asarray(places, dtype=np.float64), shift)
+        elif not drawn.any():
             draw_notice(axes, "not localized: no frame has a pose")
         axes.set_title("Trajectory")
         legend_below(drawing, axes)
@@ -213,6 +217,15 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
     if drawn.any():
         x, y = positions[int(np.argmax(drawn)), :2]
         axes.scatter(x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
+
+
+def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
+    """Draw places (P, 6) as discs, the larger the more probable, with a line ahead, as long as 3 % of the picture."""
+    x, y, yaw, probability = places[:, 0] - shift[0], places[:, 1] - shift[1], places[:, 3], places[:, 4]
+    label = f"places that the last frame may be at, the first with {probability[0]:.0%}"
+    style = {"color": STATE_COLOURS["AMBIGUOUS"], "zorder": 4}
+    axes.scatter(x, y, s=20.0 + 200.0 * probability, edgecolors=TRUTH, linewidths=0.6, label=label, **style)
+    axes.quiver(x, y, np.cos(yaw), np.sin(yaw), scale=30, width=0.004, headwidth=3, **style)
 
 
 def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike[str]) -> None:
@@ -316,7 +329,8 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
         str(smoothed[fix.stamp].kind) if fix.T_map_body is None and fix.stamp in smoothed else fix.state.reported
         for fix in result.fixes
     ]
-    plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth)
+    places = None if result.considered is None else result.considered.places
+    plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth, places)
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:
         channel = next(iter(result.query))

@@ -21,6 +21,7 @@ from coview_stream.errors import InputError, MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.advice import AdvisedSearch
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.odometry.deskew import deskew
@@ -133,7 +134,7 @@ class SearchEngine(Engine):
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
-        self._searches: dict[str, GlobalSearch] = {}
+        self._searches: dict[str, AdvisedSearch] = {}
         self._index = SearchIndex.of(base_map, self.config)
 
     def run(self, job: Job) -> SearchResult:
@@ -142,7 +143,7 @@ class SearchEngine(Engine):
             raise TypeError(f"{type(job).__name__}: the search engine does searches")
         search = self._searches.get(job.robot)
         if search is None:
-            search = GlobalSearch(self.base_map, self.config, self._local_maps, self._index)
+            search = AdvisedSearch(self.base_map, self.config, self._local_maps, self._index)
             self._searches[job.robot] = search
         return search.update(job.request)
 
