@@ -59,7 +59,6 @@ _FADE = 1.0 - 1.0 / 60.0  # memory per frame
 _PRIOR = 2.0  # degrees of freedom of the prior: one frame's
 
 _EYE, _ZERO = np.eye(2), np.zeros((2, 2))
-_WALLS, _GROUND = slice(0, 2), slice(2, 4)  # rows of the measurement
 _MAP, _BIAS, _SLOPES = slice(0, 2), slice(2, 4), slice(4, 6)  # rows of the state
 _OF_STATE = np.block([[_EYE, _EYE, _ZERO], [_EYE, _ZERO, _EYE], [_ZERO, _ZERO, _ZERO]])
 _OF_FRAME = np.vstack([_EYE, _EYE, _EYE])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -125,18 +125,21 @@ def simulate(
     """
     config = config or SimulationConfig()
     out = Path(out)
-    with _staging(out, overwrite) as staging, _Bar(progress) as bar:
+    with _staging(out, overwrite) as staging:
         scene = scene_of(config)
-        base = base_map(scene, config, bar)
+        with _bar("airborne scan", 100, progress) as bar:
+            base = base_map(scene, config, bar.update)
         write_cloud(staging / "base.laz", base, origin=config.origin)
         stamps, truth, odometry = trajectories(scene, config)
         (staging / "run" / "frames").mkdir(parents=True)
-        bar.begin("drive", len(truth))
         still = config.dirt.motion is None or SENSORS[config.sensor]().stop
-        with nullcontext() if still else Recording(staging / "sweeps") as recording:
+        with (
+            nullcontext() if still else Recording(staging / "sweeps") as recording,
+            _bar("drive", len(truth), progress) as bar,
+        ):
             for k, points in enumerate(frames(scene, config, truth, odometry, recording)):
                 write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
-                bar.advance(1)
+                bar.update()
         write_tum(staging / "run" / "odometry.tum", stamps, odometry)
         in_map = truth.copy()
         in_map[:, :3, 3] += config.origin
@@ -154,10 +157,12 @@ def scene_of(config: SimulationConfig) -> Scene:
     return scene if years is None else aged(scene, years, _dirt_stream(config, Stream.YEARS))[0]
 
 
-def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) -> Floats:
-    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added)."""
-    bar, dirt = bar or _Bar(False), config.dirt
-    bar.begin("airborne scan", 100)
+def base_map(scene: Scene, config: SimulationConfig, step: Callable[[int], object] | None = None) -> Floats:
+    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added).
+
+    ``step`` is called with the per cent that were flown since the last call.
+    """
+    dirt = config.dirt
     caster: MeshCaster = Caster(scene.mapped)
     if dirt.seasons is not None:
         caster = seasonal_caster(drawn_parts(scene)[0], scene, dirt.seasons)
@@ -170,7 +175,8 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
     strips, before = [], 0
     for done, points in scanned:
         strips.append(points)
-        bar.advance(int(100 * done) - before)
+        if step is not None:
+            step(int(100 * done) - before)
         before = int(100 * done)
     if scene.passage is not None:
         strips.append(_indoors(scene, scene.passage, _stream(config, _INDOORS)))
@@ -276,28 +282,9 @@ def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
         shutil.rmtree(staging, ignore_errors=True)
 
 
-class _Bar:
-    """Progress bars on stderr, one per phase; none unless ``shown``."""
+def _bar(phase: str, total: int, shown: bool) -> Any:
+    """Return a progress bar on stderr, a context manager; none unless ``shown``."""
+    from tqdm import tqdm
 
-    def __init__(self, shown: bool) -> None:
-        self._shown = shown
-        self._bar: Any = None
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def begin(self, phase: str, total: int) -> None:
-        self.__exit__()
-        if self._shown:
-            from tqdm import tqdm
-
-            layout = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left"
-            self._bar = tqdm(total=total, desc=phase, leave=False, bar_format=layout)
-
-    def advance(self, steps: int) -> None:
-        if self._bar is not None:
-            self._bar.update(steps)
+    layout = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left"
+    return tqdm(total=total, desc=phase, leave=False, disable=not shown, bar_format=layout)

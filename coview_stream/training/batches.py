@@ -9,6 +9,7 @@ import numpy as np
 
 from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image
 from coview_stream.geometry.arrays import Floats, Indices, Ints
+from coview_stream.geometry.transforms import rot_z
 from coview_stream.training.worlds import QUERY_CELLS, WorldViews
 
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
@@ -96,7 +97,7 @@ def draw_batch(
         images.append(augmented(piece, True, rng) if augment else piece)
         for index in chosen:
             x, y, yaw = world.poses[index]
-            at = _rotated(np.array([x, y]) - centre, -turn)
+            at = rot_z(-turn)[:2, :2] @ (np.array([x, y]) - centre)
             view = world.queries[index]
             if rng.random() < _FROM_MAP:
                 view = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
@@ -153,8 +154,3 @@ def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Imag
     image[-1][hidden] = 128
     # rot90 turns towards lower rows, i.e. clockwise as seen from above: the heading compensates
     return image, 0.5 * np.pi * quarters
-
-
-def _rotated(vector: Floats, angle: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])

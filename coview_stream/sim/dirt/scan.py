@@ -78,7 +78,7 @@ def stream(world_seed: int, seed: int, purpose: Stream) -> np.random.Generator:
     return np.random.default_rng([world_seed, _DIRT, seed, int(purpose)])
 
 
-GROUND, SOLID, GLAZED, SIGN, LEAVES = range(5)
+GROUND, _, GLAZED, SIGN, LEAVES = range(5)
 """Indices of the meshes of :class:`Surfaces`."""
 
 _CONIFER = vegetation.TREE_COLUMNS.index("conifer")
