@@ -1,7 +1,8 @@
 """Share of false first fixes, over families of sites that nothing was fitted on, with exact bounds.
 
 A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. Half
-of the runs are on real airborne surveys (:mod:`bench.integrity.surveys`) where ``COVIEW_DATA`` has any. The results of
+of the runs are on real airborne surveys (:mod:`bench.integrity.surveys`) where ``COVIEW_DATA`` has any, and eight more
+on each real run there. The table of families says what is found where, and after how many metres. The results of
 a site stay in ``--work`` until the code changes: the benchmark goes on where it ended, ``--minutes`` bounds one call,
 and any number of calls may share the folder at once. Runs share sites, at most eight of them one map, but never map
 and drive; beside the share of false runs stands the share of sites with a false run. Bounds are Clopper-Pearson's, at
@@ -23,8 +24,8 @@ import numpy as np
 
 from bench.harness.files import fingerprint, folder
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
-from bench.integrity.plan import FAMILIES, STATED, Site, plan
-from bench.integrity.run import Result, everywhere
+from bench.integrity.plan import FAMILIES, STATED, Site, plan, real_runs
+from bench.integrity.run import Result, data, everywhere
 from bench.integrity.surveys import files
 from coview_stream.errors import InputError
 
@@ -110,14 +111,18 @@ def class_table(results: Sequence[Result]) -> str:
 
 
 def family_table(results: Sequence[Result]) -> str:
-    """Lay out the counts of each family."""
+    """Lay out what was found after how many metres, for each family and each real survey and run."""
     lines = []
-    for family in FAMILIES:
-        t = Tally.of(run for run in results if run["family"] == family)
+    rows_of = sorted({(list(FAMILIES).index(run["family"]), run.get("place", "")) for run in results})
+    for number_of, place in rows_of:
+        family = list(FAMILIES)[number_of]
+        t = Tally.of(run for run in results if run["family"] == family and run.get("place", "") == place)
         if t.runs:
-            counts = map(str, (t.runs, t.right, t.false, t.ambiguous, t.searching))
-            lines.append([family, *counts, percent(t.bound, 1)])
-    return table(("family", "runs", "right", "false", "AMBIGUOUS", "SEARCHING", "false, below"), lines)
+            counts = map(str, (t.runs, t.right, t.ambiguous, t.searching))
+            metres = number(t.within(0.5), 1), number(t.within(0.9), 1)
+            lines.append([f"{family}, {place}".strip(" ,"), *counts, *metres, str(t.false), percent(t.bound, 1)])
+    head = "family", "runs", "found", "AMBIGUOUS", "SEARCHING", "median m", "90 % m", "false", "below (95 %)"
+    return table(head, lines)
 
 
 def reliability_table(results: Sequence[Result]) -> str:
@@ -188,12 +193,13 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def planned(count: int) -> list[Site]:
-    """Return the sites of ``count`` runs: simulated ones and, where there are any, real surveys in turn, half each."""
+    """Return the sites of ``count`` runs, half on real surveys where there are any, and those of recorded runs."""
+    recorded = real_runs(sorted(file.parent.name for file in data().glob("*/base.laz")))
     if not files():
-        return plan("reported", count)
+        return [*recorded, *plan("reported", count)]
     real, simulated = plan("surveys", count // 2), plan("reported", count - count // 2)
     both = [(k / len(sites), site) for sites in (real, simulated) for k, site in enumerate(sites)]
-    return [site for _, site in sorted(both, key=lambda entry: entry[0])]
+    return [*recorded, *(site for _, site in sorted(both, key=lambda entry: entry[0]))]
 
 
 def chosen(sites: Sequence[Site], families: str | None) -> list[Site]:
@@ -214,7 +220,9 @@ def verdicts(results: Sequence[Result]) -> Iterator[Row]:
         enough = most is not None and upper(0, t.runs) <= most
         target = f"0, below {percent(most or 1.0)}" if enough else "0"
         yield judged(f"integrity/false first fixes, {part}", text, target, t.false == 0, t.false)
-    simulated = (result for result in results if result["class"] == "ordinary" and result["group"] != "surveys")
+    simulated = (
+        result for result in results if result["class"] == "ordinary" and result["group"] in ("reported", "calibration")
+    )
     ordinary = Tally.of(simulated)
     if ordinary.runs:
         text = f"{ordinary.right} of {ordinary.runs}: {percent(ordinary.found, 1)}"

@@ -5,14 +5,14 @@ A site is drawn and mapped once and serves several runs, each with its own drive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from typing import Literal
 
 import numpy as np
 
-Group = Literal["calibration", "reported", "surveys"]
+Group = Literal["calibration", "reported", "surveys", "runs"]
 Class = Literal["ordinary", "outside", "near copies"]
 
 LIDARS = ("vlp16", "mid360", "os64")
@@ -62,6 +62,7 @@ FAMILIES: dict[str, Class] = {
     "survey shifted": "near copies",  # all that is solid 4 m off: right by ground and trees
     "survey gap": "near copies",  # 40 m around the drive are not on the map, the rest of its rows of houses is
     "survey twice": "near copies",  # a block of 80 m around the drive is on the map twice
+    "real run": "ordinary",  # a recorded run from any of its frames, forwards or back, on its map
 }  # fmt: skip
 """Class of each family of runs."""
 
@@ -106,6 +107,11 @@ def plan(group: Group, runs: int) -> list[Site]:
             if not runs:
                 return out
     raise AssertionError("count() ended")
+
+
+def real_runs(names: Iterable[str], starts: int = 8) -> list[Site]:
+    """Return the drives on each set of real data: from so many of its frames, every other one backwards."""
+    return [tuple(Run("runs", "real run", name, 0, k, "real") for k in range(starts)) for name in names]
 
 
 def _surveys(k: int) -> Iterator[Site]:

@@ -20,6 +20,7 @@ from bench.integrity.kinds import built, draw, surveyed
 from bench.integrity.plan import FAMILIES, Run, Site
 from bench.integrity.sites import beside_border, lane, rebuilt, shifted
 from coview_stream import BaseMap, Localizer
+from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
@@ -28,6 +29,7 @@ from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.recordings.open_run import open_run
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.odometry import drive as poses_along
 from coview_stream.sim.scenes import Scene
@@ -77,6 +79,7 @@ class Drive:
     odometry: Floats  # (N, 4, 4) odom <- body
     truth: Floats | None  # (N, 4, 4) map <- body; None where every fix is false
     frame: Callable[[int], Points]  # number -> cloud (K, 3), body frame, metres; call in ascending order
+    times: Floats | None = None  # (N,) seconds; None for a frame every FRAME_PERIOD
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -84,6 +87,8 @@ class Drive:
     @property
     def stamps(self) -> Floats:
         """(N,) seconds."""
+        if self.times is not None:
+            return self.times
         return FIRST_STAMP + FRAME_PERIOD * np.arange(len(self), dtype=np.float64)
 
     @property
@@ -93,8 +98,26 @@ class Drive:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def data() -> Path:
+    """Return the folder of real runs and surveys."""
+    return Path(os.environ.get("COVIEW_DATA") or "none")
+
+
+def _recorded(run: Run) -> Drive:
+    """Return a part of a recorded run: forwards from a frame, or backwards, with time running on."""
+    recorded, (stamps, truth) = open_run(data() / run.kind / "run"), read_tum(data() / run.kind / "truth.tum")
+    first = round(run.number * len(recorded) / 8)
+    order = np.arange(first, len(recorded)) if run.number % 2 == 0 else np.arange(first, -1, -1)
+    times = FIRST_STAMP + np.abs(stamps[order] - stamps[first])
+    return Drive(
+        truth[order], recorded.poses[order], truth[order], lambda k: recorded.read(int(order[k])).points, times
+    )
+
+
 def drive_of(run: Run) -> Drive | None:
     """Return the drive of a run from anywhere on its route, in either direction; None where there is no such street."""
+    if run.group == "runs":
+        return _recorded(run)
     if (scene := _scene(run)) is None:
         return None
 
@@ -236,7 +259,7 @@ def on_site(
     Runs of a site with a ``failed`` one are made again next time. None is returned of a site that another process
     makes, unless we ``wait``, or that was to begin after ``until``.
     """
-    about = [{"key": run.key, "class": FAMILIES[run.family], **asdict(run)} for run in site]
+    about = [{"key": run.key, "class": FAMILIES[run.family], "place": place(run), **asdict(run)} for run in site]
     new = []
 
     def one(run: Run, robot: Robot) -> Result:
@@ -272,9 +295,16 @@ def _failed(error: Exception) -> Result:
     return {"outcome": "failed", "reason": f"{type(error).__name__}: {error}"}
 
 
+def place(run: Run) -> str:
+    """Return the real site that a run is on; empty for a simulated one."""
+    if run.group == "surveys":
+        return surveys.place_of(run.seed).stem
+    return run.kind if run.group == "runs" else ""
+
+
 def map_of(run: Run) -> BaseMap:
     """Build the map that a run is made on; changes come later."""
-    return built(cloud_of(run))
+    return BaseMap.build(data() / run.kind / "base.laz") if run.group == "runs" else built(cloud_of(run))
 
 
 def cloud_of(run: Run) -> Floats:

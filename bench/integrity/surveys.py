@@ -103,6 +103,11 @@ def _place(seed: int, apart: int | None) -> tuple[Path, Floats, float]:
     raise InputError(f"no square of {SIZE:g} m of {', '.join(map(str, files()))} has enough that stands on it")
 
 
+def place_of(seed: int) -> Path:
+    """Return the survey of a square."""
+    return _place(seed, None)[0]
+
+
 def _cells(xyz: Floats, size: float) -> int:
     return len(np.unique(np.floor(xyz[:, :2] / size), axis=0))
 

@@ -83,7 +83,7 @@ class MapSummary:
         feet = f" ({width:.0f} x {depth:.0f} m if in feet: build --crs feet)" if self.crs == UNKNOWN else ""
         return (
             f"{self.width:.0f} x {self.depth:.0f} m{feet} with points on {area}, {self.density:.3g} points/m2 kept, "
-            f"heights {self.lowest:.1f} to {self.highest:.1f} m, crs {self.crs}, "
+            f"heights {self.lowest:.1f} to {self.highest:.1f} m but for strays, crs {self.crs}, "
             f"{self.bytes / 1e6:.0f} MB as {self.form} ({self.bytes / self.area / 1e3:.2g} GB per km2)"
         )
 

@@ -45,6 +45,9 @@ _MODULES = {"eval": "evaluate", "serve-map": "serve_map"}  # a module called eva
 _COMPLETE_FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path (commandline -ct))"}
 """Completion of a file name, as ``shtab coview_stream.cli.build_parser`` reads it from an argument."""
 
+_MEANT = {"--unit": "--crs", "--units": "--crs", "--feet": "--crs", "--lidar": "--sensor"}
+"""Options that people try, and the one that they mean."""
+
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
 """Extras with the libraries of a command; other commands name what they lack themselves."""
 
@@ -154,7 +157,8 @@ def _check_options(words: list[str], known: list[str], command: str) -> None:
     for word in itertools.takewhile(lambda word: word not in ("--", "--ros-args"), words):
         option = word.partition("=")[0]
         if option.startswith("--") and not any(name.startswith(option) for name in known):
-            near = did_you_mean(option, [name for name in known if name.startswith("--")])
+            meant = _MEANT.get(option, "")
+            near = did_you_mean(meant if meant in known else option, [name for name in known if name.startswith("--")])
             end = "" if near.endswith("?") else ";"
             raise ConfigError(
                 f"{command} has no option {option}; {near}{end} `{PROGRAM} {command} --help` explains them"

@@ -12,6 +12,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -20,6 +21,7 @@ from coview_stream.errors import CoViewError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import SigningKey
+    from coview_stream.basemap.summary import MapSummary
     from coview_stream.config import MapConfig
 
 
@@ -168,7 +170,7 @@ def _build_file(
     covered = summary(base_map)
     for warning in covered.warnings:
         warn(warning)
-    print(covered)
+    print(_told(covered, args.crs))
     return 0
 
 
@@ -199,10 +201,15 @@ def _build_site(
     covered = built.summary()
     for warning in covered.warnings:
         warn(warning)
-    print(covered)
+    print(_told(covered, args.crs))
     for line in built.skipped:
         print(f"left out: {line}", file=sys.stderr)
     return 1 if built.skipped else 0
+
+
+def _told(covered: MapSummary, crs: str | None) -> MapSummary:
+    """Return a summary that does not ask for the unit where ``--crs`` has stated it."""
+    return replace(covered, crs=f"unknown, converted from {crs}") if crs in ("feet", "us-feet") else covered
 
 
 @contextlib.contextmanager

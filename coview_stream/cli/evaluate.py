@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the evaluation; exit code 0 for a bad trajectory, too: the comparison is done."""
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.errors import InputError
-    from coview_stream.report.evaluation import evaluate, frame_errors
+    from coview_stream.report.evaluation import constant_offset, evaluate, frame_errors
 
     estimate, truth = read_tum(args.estimate), read_tum(args.truth)
     if not len(truth[0]):
@@ -42,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
         errors = frame_errors(estimate, truth)
         plot_errors(errors.distance, errors.e_t, errors.e_r, args.plot)
     print(evaluation.to_json() if args.json else table(evaluation))
+    if evaluation.false_frames > evaluation.posed / 2 and (offset := constant_offset(estimate, truth)):
+        print(f"{args.truth}: {offset}", file=sys.stderr)
     return 0
 
 
@@ -61,6 +64,8 @@ def table(evaluation: Evaluation) -> str:
         rows.append(("rotation error", _errors_text(evaluation.rotation, "deg")))
     if evaluation.false_frames:
         rows.append(("worst pose", f"{evaluation.worst_t_m:.2f} m, {evaluation.worst_r_deg:.2f} deg"))
+    if evaluation.unmatched and not evaluation.posed:
+        rows.append(("stamps", "none in common: is the truth of this run, and in seconds of the same clock?"))
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
 
 

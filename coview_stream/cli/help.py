@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 from coview_stream.errors import ConfigError, did_you_mean
@@ -18,9 +19,22 @@ def pages() -> dict[str, Path]:
     return {path.stem: path for path in found}
 
 
+class _Suggested(list[str]):
+    """Names that the shell completes; :func:`run` judges what was given."""
+
+    def __init__(self, known: Iterable[str]) -> None:
+        from coview_stream.cli import COMMANDS
+
+        super().__init__(dict.fromkeys([*COMMANDS, *known]))
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("topic", nargs="?", metavar="TOPIC", help="command or page, as listed without one")
+    topic = parser.add_argument("topic", nargs="?", metavar="TOPIC", help="command or page, as listed without one")
+    topic.choices = _Suggested(pages())
 
 
 def run(args: argparse.Namespace) -> int:

@@ -211,11 +211,14 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
         if state is State.TRACKING:
             found = f"the map is in feet: none on it {text}; found {converted} once it is converted"
             return Finding("FAIL", "place", found, "build it again with --crs feet, or us-feet")
+    (left, low, _), (right, high, _) = base_map.bounds
+    name = "this map" if base_map.path is None else base_map.path.name
+    map_name = f"{name} ({left:.0f}, {low:.0f} to {right:.0f}, {high:.0f} m)"
     remedy = (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres"
         f"{untried}, and has the site not changed? `coview-stream help reasons`"
     )
-    return Finding("FAIL" if sure else "warn", "place", f"none on this map {text}", remedy)
+    return Finding("FAIL" if sure else "warn", "place", f"none on {map_name} {text}", remedy)
 
 
 def in_feet(base_map: BaseMap, progress: bool = False) -> BaseMap | None:

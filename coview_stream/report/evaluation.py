@@ -109,17 +109,38 @@ def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
     true_stamps, true_poses = truth
     if not len(true_stamps):
         raise InputError("truth: holds no pose; give the trajectory that was really driven")
+    index, matched = _nearest(stamps, true_stamps)
+    T_est, T_true = poses[matched], true_poses[index]
+    e_t = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    turns = T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1)
+    e_r = np.asarray(Rotation.from_matrix(turns).magnitude()) if len(turns) else np.zeros(0)  # precise near zero
+    return FrameErrors(index, driven(true_poses)[index], e_r, e_t)
+
+
+def _nearest(stamps: Floats, true_stamps: Floats) -> tuple[Indices, Bools]:
+    """Return rows (K,) of the true stamps nearest to those of the mask (N,) of stamps that have one near enough."""
     after = np.clip(np.searchsorted(true_stamps, stamps), 0, len(true_stamps) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(true_stamps[before] - stamps) < np.abs(true_stamps[after] - stamps)
     index = np.where(closer, before, after)
     matched = np.abs(true_stamps[index] - stamps) < MAX_STAMP_GAP
-    index, T_est = index[matched], poses[matched]
-    T_true = true_poses[index]
-    e_t = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
-    turns = T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1)
-    e_r = np.asarray(Rotation.from_matrix(turns).magnitude()) if len(turns) else np.zeros(0)  # precise near zero
-    return FrameErrors(index, driven(true_poses)[index], e_r, e_t)
+    return index[matched], matched
+
+
+def constant_offset(estimate: Trajectory, truth: Trajectory) -> str | None:
+    """Say by which constant shift the truth differs from an estimate, on the map or of the body; None if by none."""
+    index, matched = _nearest(estimate[0], truth[0])
+    T_est, T_true = estimate[1][matched], truth[1][index]
+    if not len(index):
+        return None
+    apart = T_true[:, :3, 3] - T_est[:, :3, 3]
+    of_body = np.einsum("nji,nj->ni", T_est[:, :3, :3], apart)
+    for each, name in ((apart, "another origin of the map's frame"), (of_body, "another place on the body")):
+        shift = np.median(each, axis=0)
+        if (np.linalg.norm(each - shift, axis=1) < MAX_TRANSLATION / 3.0).mean() > MIN_RIGHT_SHARE:
+            x, y, z = shift
+            return f"lies {x:.2f}, {y:.2f}, {z:.2f} m from the estimate all along: is it of {name}?"
+    return None
 
 
 def driven(poses: Floats) -> Floats:

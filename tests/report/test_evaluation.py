@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.report.evaluation import evaluate, frame_errors
+from coview_stream.report.evaluation import constant_offset, evaluate, frame_errors
 
 STAMPS = 1000.0 + 0.1 * np.arange(20)
 
@@ -123,3 +123,14 @@ def test_error_at_the_odometry_origin_contains_the_lever_arm():
 def test_empty_truth_is_refused():
     with pytest.raises(InputError, match="no pose"):
         evaluate(straight_truth(), NOTHING)
+
+
+def test_truth_of_another_origin_or_place_on_the_body_is_named():
+    yaw, stamps = np.linspace(0.0, np.pi, 20), np.arange(20.0)
+    poses = np.array([pose_from(rot_z(y), np.array([10.0 * k, 0.0, 0.0])) for k, y in enumerate(yaw)])
+    elsewhere, beside, other = poses.copy(), poses @ pose_from(np.eye(3), np.array([4.0, 0.0, 1.0])), poses.copy()
+    elsewhere[:, :3, 3] += 500.0, 20.0, 3.0
+    other[:, 1, 3] += 30.0 * np.sin(stamps)
+    assert "500.00, 20.00, 3.00 m" in (constant_offset((stamps, poses), (stamps, elsewhere)) or "")
+    assert "4.00, 0.00, 1.00 m" in (constant_offset((stamps, poses), (stamps, beside)) or "")
+    assert constant_offset((stamps, poses), (stamps, other)) is None

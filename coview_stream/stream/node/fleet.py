@@ -211,7 +211,7 @@ class Fleet:
                     orphans.append(robot)
         if orphans:
             names = _names({str(self._owners[robot]) for robot in orphans})
-            log.warning("fleet: %d robots that nobody serves: %s should", len(orphans), names)
+            log.warning("fleet: no node serves %d of the robots; %s should", len(orphans), names)
         self.unserved = tuple(unserved)
         if given_up or taken or orphans:
             self._move(given_up, taken + orphans)
