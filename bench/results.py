@@ -15,10 +15,12 @@ that no command makes are kept below the others.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -145,7 +147,7 @@ def measured(command: str, threads: int | None = None) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows.json"
         line = [sys.executable, "-m", "bench", name, *words, "--json", str(file)]
-        process = subprocess.Popen(line, env=environment(threads), stdout=sys.stderr)
+        process = subprocess.Popen(line, env=environment(threads), stdout=sys.stderr, start_new_session=True)
         _RUNNING.add(process)
         code = process.wait()
         _RUNNING.discard(process)
@@ -241,8 +243,9 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
             except BaseException:  # interrupted, or told to end
                 stopped.set()
                 pool.shutdown(wait=False, cancel_futures=True)
-                for process in list(_RUNNING):
-                    process.terminate()
+                for process in list(_RUNNING):  # with the processes of its own
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(process.pid, signal.SIGTERM)
                 raise
     if _code() != code:
         print("bench release: the code changed meanwhile; begin again", file=sys.stderr)
