@@ -17,12 +17,6 @@ UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
 
 @pytest.fixture(scope="module")
-def cut(map_points):
-    """20 x 20 m of the small world."""
-    return map_points[(np.abs(map_points[:, :2] + 5.0) < 10.0).all(axis=1)]
-
-
-@pytest.fixture(scope="module")
 def whole(cut, tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "site.npy"
     np.save(path, cut + UTM)

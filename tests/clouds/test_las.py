@@ -6,6 +6,7 @@ import struct
 import laspy
 import numpy as np
 import pytest
+from las_file import written
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from coview_stream.clouds.cloud_head import read_head
@@ -14,16 +15,6 @@ from coview_stream.errors import CloudError, CoViewWarning
 
 UTM = np.array([351_154.5, 4_025_876.25, 14.0])
 PROJECTED = 'PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["{unit}",1]]'
-
-
-def written(path, points, version="1.2", point_format=1, vlrs=()):
-    header = laspy.LasHeader(point_format=point_format, version=version)
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(points.min(axis=0))
-    header.vlrs.extend(vlrs)
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = points.T
-    las.write(path)
-    return path
 
 
 def geo_keys(**keys):

@@ -1,8 +1,9 @@
 """Surveys in feet: their unit, the same system in metres, and maps of them."""
 
-import laspy
 import numpy as np
 import pytest
+from las_file import written
+from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.site.site_build import build_site
@@ -57,14 +58,8 @@ def survey(map_points):
 
 
 def in_feet(path, survey, crs=None):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(survey.min(axis=0) / US_FOOT)
-    if crs is not None:
-        header.add_crs(pyproj.CRS(crs))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (survey / US_FOOT).T
-    las.write(str(path))
-    return path
+    system = [] if crs is None else [WktCoordinateSystemVlr(pyproj.CRS(crs).to_wkt())]
+    return written(path, survey / US_FOOT, "1.4", 6, system)
 
 
 @pytest.mark.slow

@@ -27,6 +27,14 @@ def moved(x, yaw=0.0):
     return pose_from(rot_z(yaw), [x, 0.0, 0.0])
 
 
+def stepped(cloud, told, frames=2, config=LEVEL):
+    """Odometry that has seen the cloud a few times, ten times a second."""
+    odometry = LidarOdometry(config, told)
+    for k in range(frames):
+        odometry.step(cloud, None, 0.1 * k)
+    return odometry
+
+
 def test_odometry_frame_is_level_with_tilted_sensor(scene):
     cloud, up = frame(scene, (0.15, -0.1))
     odometry = LidarOdometry(registration=Told())
@@ -54,9 +62,7 @@ def test_odometry_starts_at_first_frame_with_ground(cloud):
 
 def test_constant_velocity_prediction_scales_with_time(cloud):
     told = Told(np.eye(4), moved(1.0, 0.1), moved(2.0, 0.2))
-    odometry = LidarOdometry(LEVEL, told)
-    for stamp in (0.0, 0.1, 0.2):
-        odometry.step(cloud, None, stamp)
+    odometry = stepped(cloud, told, 3)
     odometry.step(cloud, None, 0.5)
     step = inverse(moved(1.0, 0.1)) @ moved(2.0, 0.2)
     guess = inverse(moved(2.0, 0.2)) @ told.guesses[3]
@@ -67,9 +73,7 @@ def test_constant_velocity_prediction_scales_with_time(cloud):
 def test_sweep_is_deskewed_by_previous_motion(cloud):
     step = moved(1.0, 0.05)
     told = Told(np.eye(4), step)
-    odometry = LidarOdometry(LEVEL, told)
-    odometry.step(cloud, None, 0.0)
-    odometry.step(cloud, None, 0.1)
+    odometry = stepped(cloud, told)
     skewed, times = swept(cloud, step)
     odometry.step(skewed, times, 0.2)
     assert np.abs(skewed - cloud).max() > 0.5
@@ -121,9 +125,7 @@ def covered(cloud):
 )
 def test_bad_frame_is_refused_and_changes_nothing(cloud, bad):
     told = Told(np.eye(4), moved(0.1))
-    odometry = LidarOdometry(LEVEL, told)
-    odometry.step(cloud, None, 0.0)
-    odometry.step(cloud, None, 0.1)
+    odometry = stepped(cloud, told)
     with pytest.raises(CloudError):
         odometry.step(bad(cloud), None, 0.2)
     assert len(told.frames) == 2
@@ -144,8 +146,7 @@ def test_nan_rows_are_dropped_with_their_times(cloud):
 
 @pytest.mark.parametrize("stamp", [0.0, -1.0, np.nan, np.inf])
 def test_stamps_must_increase(cloud, stamp):
-    odometry = LidarOdometry(LEVEL, Told())
-    odometry.step(cloud, None, 0.0)
+    odometry = stepped(cloud, Told(), 1)
     with pytest.raises(RunError, match="stamp"):
         odometry.step(cloud, None, stamp)
     assert is_pose(odometry.step(cloud, None, 0.1))
@@ -153,9 +154,7 @@ def test_stamps_must_increase(cloud, stamp):
 
 def test_gap_restarts_local_map_at_last_pose(cloud):
     told = Told(np.eye(4), moved(1.0), moved(2.0))
-    odometry = LidarOdometry(LEVEL, told)
-    for k in range(3):
-        odometry.step(cloud, None, 0.1 * k)
+    odometry = stepped(cloud, told, 3)
     clears = told.clears
     assert np.allclose(odometry.step(cloud, None, 30.0), moved(2.0))
     assert told.clears == clears + 1
@@ -165,9 +164,7 @@ def test_gap_restarts_local_map_at_last_pose(cloud):
 @pytest.mark.parametrize("wild", [moved(40.0), moved(0.0, 2.5), np.full((4, 4), np.nan)])
 def test_implausible_motion_is_refused(cloud, wild):
     told = Told(np.eye(4), moved(1.0), wild)
-    odometry = LidarOdometry(LEVEL, told)
-    odometry.step(cloud, None, 0.0)
-    odometry.step(cloud, None, 0.1)
+    odometry = stepped(cloud, told)
     with pytest.raises(CloudError, match="lost its way"):
         odometry.step(cloud, None, 0.2)
     assert odometry.restarts == 1
@@ -222,8 +219,7 @@ def test_shaken_body_is_guessed_upright(scene):
     cloud, _ = frame(scene)
     shaken, up = frame(scene, (0.03, -0.02))
     told = Told(np.eye(4))
-    odometry = LidarOdometry(LidarOdometryConfig(gravity="level"), told)
-    odometry.step(cloud, None, 0.0)
+    odometry = stepped(cloud, told, 1, LidarOdometryConfig(gravity="level"))
     odometry.step(shaken, None, 0.1)
     assert np.degrees(np.arccos(told.guesses[1][2, :3] @ up)) < 0.5
 
