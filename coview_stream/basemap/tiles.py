@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
+from coview_stream.geometry.rasters import by_square
 from coview_stream.geometry.transforms import Points
 
 Key = tuple[int, int]
@@ -32,13 +33,8 @@ def sort_by_tile(points: Points, normals: Points | Int8s, tile: float) -> tuple[
     """
     scale = 1.0 if normals.dtype == np.int8 else _NORMAL_SCALE
     packed: Int8s = np.rint(normals * np.float32(scale)).astype(np.int8)
-    cells = np.floor(points[:, :2].astype(np.float64) / tile).astype(np.int64)
-    order = np.lexsort((cells[:, 1], cells[:, 0]))
-    cells = cells[order]
-    change = np.flatnonzero((np.diff(cells, axis=0) != 0).any(axis=1)) + 1
-    begin = np.concatenate([[0], change])
-    end = np.concatenate([change, [len(cells)]])
-    return points[order], packed[order], np.column_stack([cells[begin], begin, end])
+    order, cells, begin = by_square(points, tile)
+    return points[order], packed[order], np.column_stack([cells, begin[:-1], begin[1:]])
 
 
 def spans(index: Ints, tile: float, centre: Floats, radius: float) -> Ints:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from coview_stream.errors import InputError
 from coview_stream.fusion.localized_run import PosedFrame
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.geometry.rasters import min_filter
+from coview_stream.geometry.rasters import by_square, min_filter
 from coview_stream.geometry.transforms import Points
 
 REACH = 25.0
@@ -40,13 +40,8 @@ class Sightings:
 
     def __init__(self, points: Points, margin: float) -> None:
         """Count for points (N, 3) relative to the map's origin; a ray through one ends ``margin`` metres behind it."""
-        tiles = np.floor(points[:, :2].astype(np.float64) / _TILE).astype(np.int64)
-        self.order: Ints = np.lexsort((tiles[:, 1], tiles[:, 0]))
-        tiles = tiles[self.order]
+        self.order, self._tiles, self._begin = by_square(points, _TILE)
         self.points = points[self.order]
-        begin = np.flatnonzero(np.append(len(tiles) > 0, (np.diff(tiles, axis=0) != 0).any(axis=1)))
-        self._begin = np.append(begin, len(tiles)).astype(np.int64)
-        self._tiles = tiles[self._begin[:-1]]
         self._margin = margin
         self.through = np.zeros(len(points), dtype=np.uint32)
         self.seen = np.zeros(len(points), dtype=np.uint32)
@@ -190,11 +185,9 @@ def distances(points: Points, around: Callable[[Floats, float], Points], reach: 
     out = np.full(len(points), np.inf, dtype=np.float32)
     if not len(points):
         return out
-    tiles = np.floor(points[:, :2].astype(np.float64) / _TREE_TILE).astype(np.int64)
-    order = np.lexsort((tiles[:, 1], tiles[:, 0]))
-    ends = np.flatnonzero((np.diff(tiles[order], axis=0) != 0).any(axis=1)) + 1
-    for index in np.split(order, ends):
-        centre = (tiles[index[0]] + 0.5) * _TREE_TILE
+    order, tiles, begin = by_square(points, _TREE_TILE)
+    for tile, index in zip(tiles, np.split(order, begin[1:-1]), strict=True):
+        centre = (tile + 0.5) * _TREE_TILE
         others = around(centre, _TREE_TILE * 0.7072 + reach)
         if len(others):
             out[index] = cKDTree(others).query(points[index], distance_upper_bound=reach)[0]

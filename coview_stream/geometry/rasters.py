@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from coview_stream.errors import ConfigError
-from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
+from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints, Reals
 from coview_stream.geometry.transforms import Points
 
 _MAX_CELLS = 200_000_000  # set by hand: a raster above that (0.8 GB) means stray coordinates, not a map
@@ -57,6 +57,21 @@ def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
             f"a raster of {width} x {height} cells of {cell} m: remove stray points or raise the cell size"
         )
     return corner, (height, width), index[1] * width + index[0]
+
+
+def by_square(points: Reals, edge: float) -> tuple[Ints, Ints, Ints]:
+    """Sort points (N, 2 or more) into squares of an edge, by column and row.
+
+    Returns:
+        order: (N,) indices of the points, square by square.
+        squares: (T, 2) column and row: a square covers ``[column, column + 1) * edge`` in x, likewise in y.
+        begin: (T + 1,) where each square's points begin in that order, and their number.
+    """
+    cells = np.floor(points[:, :2].astype(np.float64) / edge).astype(np.int64)
+    order = np.lexsort((cells[:, 1], cells[:, 0]))
+    cells = cells[order]
+    begin = np.flatnonzero(np.append(len(cells) > 0, (np.diff(cells, axis=0) != 0).any(axis=1)))
+    return order, cells[begin], np.append(begin, len(cells))
 
 
 def lowest_per_cell(points: Points, flat: Ints) -> Indices:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from huts import GROUND, with_huts
 
 import coview_kernels as kernels
 from coview_stream.basemap.likelihood_field import field_arrays, field_of
@@ -20,19 +21,11 @@ class Site:
     """Rolling ground with huts on it: walls and flat roofs, 60 x 60 m; ``now`` digs the ground."""
 
     def __init__(self, huts=24, seed=5):
-        rng = np.random.default_rng(seed)
-        self.rng = rng
-        xy = np.stack(np.meshgrid(*[np.arange(-30, 30, 0.5)] * 2), axis=-1).reshape(-1, 2)
-        parts = [(np.column_stack([xy, self.level(xy)]), (0, 0, 1))]
-        for x, y in rng.uniform(-27, 27, (huts, 2)):
-            foot, top = float(self.level(np.array([[x, y]]))[0]), rng.uniform(3.0, 7.0)
-            along, up = (v.ravel() for v in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(0.6, top, 0.25)))
-            parts.append((np.column_stack([x + 0 * along, y + along, foot + up]), (1, 0, 0)))
-            u, v = (w.ravel() for w in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(-1.5, 1.6, 0.25)))
-            parts.append((np.column_stack([x + u, y + v, np.full(u.size, foot + top)]), (0, 0, 1)))
-        self.points = np.concatenate([part for part, _ in parts]).astype(np.float32)
-        normals = np.concatenate([np.tile(np.float32(n), (len(part), 1)) for part, n in parts])
-        self.ground = np.arange(len(self.points)) < len(xy)
+        self.rng = rng = np.random.default_rng(seed)
+        places = rng.uniform(-27, 27, (huts, 2))
+        rows = np.column_stack([places, self.level(places), rng.uniform(3.0, 7.0, huts)])
+        self.points, normals, above = with_huts(self.level(GROUND), rows)
+        self.ground = ~above
         surveyed = np.ones((32, 32), dtype=bool)
         self.field = field_of(field_arrays(self.points, normals, surveyed, np.array([-32.0, -32.0]), 2.0))
         self.target = LocalMap(self.points, normals)

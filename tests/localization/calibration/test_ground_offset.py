@@ -2,24 +2,16 @@
 
 import numpy as np
 import pytest
+from huts import GROUND, with_huts
 
 from coview_stream.localization.calibration.ground_offset import GroundOffset
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 
 def site(rng, canopies=True, count=24):
-    """Points (N, 3), normals (N, 3) and which stand above the ground: flat ground, boxes, perhaps flat tops on them."""
-    xy = np.stack(np.meshgrid(*[np.arange(-30, 30, 0.5)] * 2), axis=-1).reshape(-1, 2)
-    parts = [(np.column_stack([xy, np.zeros(len(xy))]), (0, 0, 1))]
-    for x, y in rng.uniform(-27, 27, (count, 2)):
-        along, up = (v.ravel() for v in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(0.6, 4.0, 0.25)))
-        parts.append((np.column_stack([x + 0 * along, y + along, up]), (1, 0, 0)))
-        if canopies:
-            u, v = (w.ravel() for w in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(-1.5, 1.6, 0.25)))
-            parts.append((np.column_stack([x + u, y + v, np.full(u.size, 4.0)]), (0, 0, 1)))
-    points = np.concatenate([part for part, _ in parts]).astype(np.float32)
-    normals = np.concatenate([np.tile(np.float32(n), (len(part), 1)) for part, n in parts])
-    return points, normals, np.arange(len(points)) >= len(xy)
+    """Flat ground with huts, perhaps with flat tops."""
+    huts = [(x, y, 0.0, 4.0) for x, y in rng.uniform(-27, 27, (count, 2))]
+    return with_huts(np.zeros(len(GROUND)), huts, canopies)
 
 
 def learned(lift, canopies=True, times=30, offset=None):
