@@ -11,7 +11,7 @@ from bench.harness.rows import upper
 from bench.integrity import challenge, run
 from bench.integrity.integrity import RUNS, Tally, chosen, classes, planned, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
-from bench.integrity.plan import FAMILIES, STATED, Run, plan
+from bench.integrity.plan import FAMILIES, STATED, Run, plan, real_runs
 from bench.integrity.run import altered, drive_of, judged
 from coview_stream.clouds import write_tum
 from coview_stream.errors import InputError
@@ -127,7 +127,8 @@ def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_rep
     assert min(classes.count("ordinary"), classes.count("outside")) >= 300
     assert classes.count("near copies") >= 400
     real = every("surveys", 30)
-    assert {run.family for run in (*runs, *real, *every("calibration"))} == set(FAMILIES)
+    recorded = real_runs(["a", "b"])
+    assert {run.family for run in (*runs, *real, *every("calibration"), *recorded[0])} == set(FAMILIES)
     assert {run.family for run in every("reported", 60)} == {run.family for run in runs}
 
 
