@@ -3,6 +3,8 @@
 
 The coarse level counts the hits of a point at all 49 shifts at once: they are neighbouring bits of the raster, seven
 from each of seven rows, and are added to 49 numbers whose digits lie side by side in words.
+
+Points are (3, N), one coordinate after another: then LLVM looks up several at a time.
 """
 
 from coview_kernels import runtime
@@ -23,6 +25,7 @@ from coview_kernels.reference.field import (
 ti = runtime.library()
 
 FLOATS = ti.types.ndarray(ti.f32, 1)
+POINTS = ti.types.ndarray(ti.f32, 2)
 DOUBLES = ti.types.ndarray(ti.f64, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 PLANES = ti.types.ndarray(ti.u16, 1)
@@ -74,13 +77,12 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
         c, s = ti.cos(angle), ti.sin(angle)
         # digits of 49 numbers that are counted in one go: bit 7 i + j of the d-th word is digit d of shift (i, j)
         digits = ti.Vector.zero(ti.i64, DIGITS)
-        for p in range(structure.shape[0] // 3):
-            q = 3 * p
-            u, v = structure[q], structure[q + 1]
+        for p in range(structure.shape[1]):
+            u, v = structure[0, p], structure[1, p]
             row = ti.cast(ti.floor(y + s * u + c * v), ti.i32) - REACH
             column = ti.cast(ti.floor(x + c * u - s * v), ti.i32) - REACH
             if row >= 0 and row < high - 2 * REACH and column >= 0 and column < 8 * blocks - 8:
-                level = ti.cast(ti.floor(z + structure[q + 2]), ti.i32) & 31
+                level = ti.cast(ti.floor(z + structure[2, p]), ti.i32) & 31
                 first = (level * blocks + (column >> 3)) * high + row
                 carry = ti.cast(0, ti.i64)
                 for i in ti.static(range(WINDOW)):
@@ -109,9 +111,9 @@ def fine_hits(
 ):  # fmt: skip
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
-    for p in range(structure.shape[0] // 3):
-        u, v = structure[3 * p], structure[3 * p + 1]
-        level = ti.cast(ti.floor(2.0 * (z + structure[3 * p + 2])), ti.i64) & 63
+    for p in range(structure.shape[1]):
+        u, v = structure[0, p], structure[1, p]
+        level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
         rows = ti.Vector.zero(ti.i32, 3)
         columns = ti.Vector.zero(ti.i32, 3)
         for k in ti.static(range(3)):
@@ -130,10 +132,10 @@ def hits_at(
     """Count at a pose points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     hits = 0
-    for p in range(structure.shape[0] // 3):
-        u, v = structure[3 * p], structure[3 * p + 1]
+    for p in range(structure.shape[1]):
+        u, v = structure[0, p], structure[1, p]
         at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v) + first
-        level = z + structure[3 * p + 2]
+        level = z + structure[2, p]
         hits += bit(bits[at], level) + bit(bits[at + 1], level)
     return hits
 
@@ -146,10 +148,10 @@ def rise(
     """Return by how much the scan has to rise to the map's ground, from points within ``reach`` of it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     total, number = ti.cast(0.0, ti.f32), 0
-    for p in range(low.shape[0] // 3):
-        u, v = low[3 * p], low[3 * p + 1]
+    for p in range(low.shape[1]):
+        u, v = low[0, p], low[1, p]
         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[3 * p + 2]
+        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[2, p]
         counts = ti.cast(ground_of(surface[at]) > NOT_SURVEYED, ti.i32) & ti.cast(ti.abs(d) < reach, ti.i32)
         total += ti.select(counts > 0, d, 0.0)
         number += counts
@@ -160,7 +162,7 @@ def rise(
 def score(
     planes: PLANES, blocks: ti.i32, high: ti.i32,
     table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, first: ti.i32, surface: WHOLES,
-    few: FLOATS, some: FLOATS, lows: FLOATS, structure: FLOATS, low: FLOATS, free: FLOATS,
+    structure: POINTS, low: POINTS, free: POINTS, few: POINTS, some: POINTS, lows: POINTS,
     levels: ti.i32, coarse: ti.i32,
     poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
 ):  # fmt: skip
@@ -210,12 +212,12 @@ def score(
                         z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     c, s = ti.cos(yaw), ti.sin(yaw)
                     inside, close, covered, inside_low, grounded, passed, on = 0, 0, 0, 0, 0, 0, 0
-                    for p in range(structure.shape[0] // 3):
-                        u, v = structure[3 * p], structure[3 * p + 1]
+                    for p in range(structure.shape[1]):
+                        u, v = structure[0, p], structure[1, p]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
                         word = surface[at]
                         known = ti.cast(ground_of(word) != NOT_SURVEYED, ti.i32)
-                        level = z + structure[3 * p + 2]
+                        level = z + structure[2, p]
                         edge = word >> 16
                         hit = bit(bits[2 * at + first], level)
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
@@ -223,21 +225,21 @@ def score(
                         close += hit & known
                         on += bit(bits[2 * at + 1 + first], level) & known
                         covered += (hit | ti.cast(top > level - UNDER_EDGE, ti.i32)) & known
-                    for p in range(low.shape[0] // 3):
-                        u, v = low[3 * p], low[3 * p + 1]
+                    for p in range(low.shape[1]):
+                        u, v = low[0, p], low[1, p]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
                         height = ground_of(surface[at])
                         known = ti.cast(height != NOT_SURVEYED, ti.i32)
-                        level = z + low[3 * p + 2]
+                        level = z + low[2, p]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
                         upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1 + first], level)
                         inside_low += known
                         grounded += (flat | upper) & known
-                    for p in range(free.shape[0] // 3):
-                        u, v = free[3 * p], free[3 * p + 1]
+                    for p in range(free.shape[1]):
+                        u, v = free[0, p], free[1, p]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-                        passed += bit(bits[2 * at + 1 + first], z + free[3 * p + 2])
+                        passed += bit(bits[2 * at + 1 + first], z + free[2, p])
                     poses[4 * h] = x
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z

@@ -268,8 +268,8 @@ def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
         "field", "score",
         layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2],
         layers.table.reshape(-1), layers.table.shape[1], layers.base, bits, first,
-        layers.surface.reshape(-1), plan.few.reshape(-1), plan.some.reshape(-1), plan.lows.reshape(-1),
-        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels, int(plan.coarse),
+        layers.surface.reshape(-1), *(np.ascontiguousarray(points.T) for points in plan[:6]), plan.levels,
+        int(plan.coarse),
         poses.reshape(-1), counts.reshape(-1), runtime.workers(),
     )()  # fmt: skip
     return poses, counts
