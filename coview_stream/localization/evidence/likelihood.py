@@ -98,10 +98,8 @@ def clear_and_level(observed: Floats32, background: Background) -> Floats:
     hit = observed[:, Share.PASSED].astype(np.float64)
     covered = np.maximum(observed[:, Share.COVERED], observed[:, Share.COVERED_GROUND])
     clear = np.maximum(covered - hit, 0.0)
-    free = background.number[1] * (
-        hit[:, None, None] * np.log(passed / background.passed)
-        + clear[:, None, None] * np.log((1.0 - passed) / (1.0 - background.passed))
-    )
+    free = np.multiply.outer(hit, background.number[1] * np.log(passed / background.passed))
+    free += np.multiply.outer(clear, background.number[1] * np.log((1.0 - passed) / (1.0 - background.passed)))
     ground = observed[:, Share.COVERED_GROUND].astype(np.float64)
     share = np.clip(observed[:, Share.GROUND] / np.maximum(ground, 0.05), _EDGE, 1.0 - _EDGE)
     a, b = background.ground
@@ -109,7 +107,8 @@ def clear_and_level(observed: Floats32, background: Background) -> Floats:
     gain, usual = (_beta(x, *_GROUND) - _beta(x, a, b) for x in (share, mean))
     # a place rougher than chance gets no more than one like chance, however rare it is
     level = np.clip(ground, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain)
-    return np.asarray(free + level[:, None, None])
+    free += level[:, None, None]
+    return np.asarray(free)
 
 
 def _beta(x: Floats, a: float, b: float) -> Floats:

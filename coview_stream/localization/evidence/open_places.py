@@ -15,7 +15,7 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.evidence.background import OPEN, Background
-from coview_stream.localization.evidence.likelihood import clear_and_level
+from coview_stream.localization.evidence.likelihood import NUISANCES, clear_and_level
 from coview_stream.localization.evidence.observation import ScanPart, Share
 
 _STATIONS = 4096  # that a keyframe is observed from
@@ -23,6 +23,7 @@ _MOST = 8 * _STATIONS  # stations of a search: rarer open places are not told fr
 _PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
 _STEPS = 5  # of expectation and maximization
 _EVERY = 8  # one of so many structure points is looked up
+_BLOCK = 512  # places at a time: intermediate arrays stay in the cache
 _SEED = 20240
 _NOTHING = np.empty((0, len(Share)), dtype=np.float32)
 SIGHT = 35.0
@@ -67,21 +68,28 @@ class OpenPlaces:
         newest = self._newest
         if leader is not None:
             newest = newest[np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT]
-        scored, anywhere = _odds(chance, background), _odds(newest, background)
+        scored, anywhere = _odds_against(chance, background), _odds_against(newest, background)
         self._count = self._before[0] + len(anywhere)
         named = rate = np.full(scored.shape[1:], OPEN, dtype=np.float32)
         for _ in range(_STEPS):
-            named = _probabilities(scored, named).sum(axis=0) / np.float32(len(chance) + 1)  # one more is not open
-            self._open = self._before[1] + _probabilities(anywhere, rate).sum(axis=0)
+            named = _expected(scored, named) / np.float32(len(chance) + 1)  # one more is not open
+            self._open = self._before[1] + _expected(anywhere, rate)
             rate = ((self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)).astype(np.float32)
         return np.maximum(rate, named).astype(np.float64)
 
 
-def _odds(observed: Floats32, background: Background) -> Floats32:
-    """Return likelihood ratios (P, Q, L) of open places to others at places with these observations (P, 7)."""
-    return np.exp(np.clip(clear_and_level(observed, background), -80.0, 80.0).astype(np.float32))
+def _odds_against(observed: Floats32, background: Background) -> Floats32:
+    """Return likelihood ratios (P, Q, L) of places that are not open to open ones, for these observations (P, 7)."""
+    out = np.empty((len(observed), NUISANCES[0], NUISANCES[2]), dtype=np.float32)
+    for start in range(0, len(out), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        np.clip(-clear_and_level(observed[part], background), -60.0, 60.0, out=out[part], casting="same_kind")
+    return np.exp(out, out=out)
 
 
-def _probabilities(odds: Floats32, share: Floats32) -> Floats32:
-    """Return probabilities (P, Q, L) that places are open, where a ``share`` (Q, L) of all is."""
-    return np.asarray(share * odds / (1.0 - share + share * odds))
+def _expected(odds_against: Floats32, share: Floats32) -> Floats32:
+    """Return the expected number (Q, L) of open places among P with these odds, where a ``share`` (Q, L) of all is."""
+    probability = odds_against * ((1.0 - share) / np.maximum(share, np.float32(1e-10)))
+    probability += 1.0
+    np.reciprocal(probability, out=probability)
+    return np.asarray(probability.sum(axis=0))
