@@ -238,13 +238,18 @@ def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
 
     Arguments are as for :func:`field_scores`. In NumPy: it is called for one pose, and seldom.
     """
-    surveyed, _, covered, _ = _structure_at(field, structure, pose)
+    surveyed, _, covered, _ = reference.structure_at(field.layers, *_from_corner(field, structure, pose))
     return np.asarray(surveyed & ~covered)
 
 
-def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
-    """Mask structure points (N, 3) at a pose (4,) within about half a metre of map structure, likewise."""
-    return _structure_at(field, structure, pose)[1]
+def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike, shifts: npt.ArrayLike) -> Mask:
+    """Mask (H, N) structure points (N, 3) within about half a metre of map structure at shifts of a pose (4,).
+
+    Shifts (H, 2) are x and y, whole cells, metres.
+    """
+    offsets = np.rint(np.asarray(shifts, dtype=np.float64)[:, ::-1] / CELL).astype(np.int64)
+    points, at = _from_corner(field, structure, pose)
+    return reference.near_shifted(field.layers, points, at, offsets)
 
 
 def ground_heights(field: FieldMap, points: F32) -> F32:
@@ -253,10 +258,10 @@ def ground_heights(field: FieldMap, points: F32) -> F32:
     return reference.ground_heights(field.layers, as_float32("points", points, None, 3) - corner)
 
 
-def _structure_at(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple[Mask, Mask, Mask, Mask]:
+def _from_corner(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple[F32, F64]:
     at = as_finite64("pose", np.reshape(np.asarray(pose, dtype=np.float64), (1, -1)), 1, 4)[0]
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
-    return reference.structure_at(field.layers, as_float32("structure", structure, None, 3), at - corner)
+    return as_float32("structure", structure, None, 3), at - corner
 
 
 def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:

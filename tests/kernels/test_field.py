@@ -121,6 +121,17 @@ def test_walls_below_a_roof_edge_are_covered():
     assert found.near[0] == 0
 
 
+def test_points_moved_by_whole_cells_are_looked_up_where_they_lie(scene: Scene):
+    field, scan, truth, _ = scene
+    shifts = np.array([(0.0, 0.0), (3.0, -2.0), (-7.0, 8.0), (60.0, 0.0), (0.5, -90.0)])
+    near = kernels.near_structure(field, scan.structure, truth, shifts)
+    for mask, (x, y) in zip(near, shifts, strict=True):
+        moved = kernels.field_scores(field, scan, [truth + np.array([x, y, 0.0, 0.0])], kernels.Move.NONE)
+        assert abs(int(mask.sum()) - int(moved.near[0])) <= 1  # a point on an edge may round
+    assert near[0].mean() > 0.5
+    assert not near[3:].any()
+
+
 def test_empty_scan_and_no_hypotheses_are_answered(scene: Scene):
     field, scan, pose, _ = scene
     empty = np.zeros((0, 3), dtype=np.float32)

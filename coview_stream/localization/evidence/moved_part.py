@@ -109,15 +109,14 @@ def _explained(field: kernels.FieldMap, points: Points, structure: Points, shift
 
     ``points`` and the scan's ``structure`` (M, 3) are relative to the place.
     """
-    moved = np.repeat(points[None], len(shifts), axis=0)
-    moved[:, :, :2] += shifts[:, None].astype(np.float32)
-    flat = moved.reshape(-1, 3)
-    near = np.flatnonzero(kernels.near_structure(field, flat, place))
-    out = np.zeros(len(flat))
-    if len(near):
-        distance, _ = kernels.nearest(kernels.PointGrid(structure), flat[near], _TAKEN)
-        out[near[~np.isfinite(distance)]] = 1.0
-    return out.reshape(len(shifts), len(points))
+    explained = kernels.near_structure(field, points, place, shifts)
+    shift, point = np.nonzero(explained)
+    if len(point):
+        moved = points[point]
+        moved[:, :2] += shifts[shift].astype(np.float32)
+        distance, _ = kernels.nearest(kernels.PointGrid(structure), moved, _TAKEN)
+        explained[shift, point] = ~np.isfinite(distance)
+    return explained.astype(np.float64)
 
 
 def _log_likelihood_ratios(fits: Floats, usual: Floats) -> Floats:

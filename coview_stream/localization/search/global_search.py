@@ -275,9 +275,9 @@ class GlobalSearch:
             if around(place, _STREET) and not around(place, BASIN_DISTANCE)
             and not same_place(place.T_map_odom, first.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE)
         ]  # fmt: skip
-        if error < risk or error - sum(place.probability for place in near) >= risk:
-            return scored
-        for place in near[:_GUESSES]:
+        for k, place in enumerate(near[:_GUESSES]):
+            if error < risk or error - sum(other.probability for other in near[k:]) >= risk:
+                break
             found = register_place(
                 place, scan, self.base_map, self.config, self._local_maps, widest=self.config.registration.search[0]
             )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from coview_kernels.reference.covisibility import coview, dense, paper_context, visible
 from coview_kernels.reference.crop import crop_points
 from coview_kernels.reference.distinct import distinct_poses
-from coview_kernels.reference.field import field_scores, ground_heights, structure_at
+from coview_kernels.reference.field import field_scores, ground_heights, near_shifted, structure_at
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.overhead import height_columns, lowest_heights, offsets_near
@@ -33,6 +33,7 @@ __all__ = [
     "ground_heights",
     "height_columns",
     "lowest_heights",
+    "near_shifted",
     "nearest",
     "offsets_near",
     "paper_context",

@@ -176,6 +176,23 @@ def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, 
     return surveyed, near, covered, _bit(layers.bits[cell][:, 1], placed[:, 2]) & surveyed
 
 
+def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -> Mask:
+    """Mask (H, N) structure points (N, 3) at a pose (4,) near map structure, moved by (H, 2) rows and columns."""
+    placed = _placed(structure, pose)
+    cell = np.floor(placed[:, 1::-1] / np.float32(CELL)).astype(np.int64)
+    first = cell.min(axis=0) + offsets.min(axis=0)
+    last = cell.max(axis=0) + offsets.max(axis=0)
+    limits = np.array(layers.table.shape) * TILE - 1
+    row, column = (np.clip(np.arange(first[k], last[k] + 1), 0, limits[k]) for k in range(2))
+    tile = layers.table[row // TILE][:, column // TILE].astype(np.int64)
+    at = ((tile * TILE) + (row % TILE)[:, None]) * TILE + column % TILE
+    known = layers.surface.reshape(-1).take(at).astype(np.int16) != NOT_SURVEYED
+    words = np.where(known, layers.bits.reshape(-1).take(2 * at), 0).ravel()
+    width = np.array([len(column), 1])
+    level = np.floor(placed[:, 2] / np.float32(CELL)).astype(np.int64) & 63
+    return np.asarray((words.take((offsets @ width)[:, None] + (cell - first) @ width) >> level) & 1, dtype=bool)
+
+
 def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
     surveyed, near, covered, on = structure_at(layers, plan.structure, pose)
     lower = _placed(plan.low, pose)
