@@ -375,10 +375,6 @@ class StationGrid:
         """Return column and row (N, 2) of the cells of stations, counted from the map's zero."""
         return np.asarray(np.floor(self.stations[chosen, :2].astype(np.float64) / self.block), dtype=np.int64)
 
-    def storeys(self, station: int) -> list[int]:
-        """Return the stations of a station's cell, lowest first, with itself."""
-        return [k for k in self.levels_at(self.stations[station][None])[:, 0].tolist() if k >= 0]
-
     def cell(self, positions: Reals) -> Indices:
         """Return the number of the cell (N,) that holds each of (N, 2 or 3) positions; off the grid, the last."""
         index = np.floor(np.asarray(positions[:, :2], dtype=np.float64) * (1.0 / self.block)).astype(np.int64)

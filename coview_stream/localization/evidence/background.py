@@ -79,8 +79,13 @@ def scatter(observed: Floats32) -> Floats:
     """
     if len(observed) < 2:
         return np.full(4, np.nan)
-    count = len(observed)
-    shares = np.sort(_compared(observed), axis=0)
+    return _scatter(_compared(observed))
+
+
+def _scatter(shares: Floats) -> Floats:
+    """Return :func:`scatter` of each column of shares (P, C)."""
+    count = len(shares)
+    shares = np.sort(shares, axis=0)
     levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
     reach = (levels[1:] - levels[0]) / np.array([normal_quantile(percent / 100.0) for percent in _TAIL])[:, None]
     if count >= _MANY:  # the second largest, by Blom's plotting position; the largest may be a twin of the right place
@@ -98,17 +103,18 @@ def left_in_mean(observed: Floats32) -> Floats:
     count, width = observed.shape[:2]
     if count < _MANY or width < 2:
         return np.ones(4)
-    shares = np.stack([_compared(observed[:, k]) for k in range(width)])
-    whole = shares.mean(axis=0).var(axis=0) / np.maximum(shares.var(axis=1).mean(axis=0), 1e-9)
-    single = np.mean([scatter(observed[:, k]) for k in range(width)], axis=0)
+    shares = _compared(observed)
+    whole = shares.mean(axis=1).var(axis=0) / np.maximum(shares.var(axis=0).mean(axis=0), 1e-9)
+    single = _scatter(shares.reshape(count, -1)).reshape(width, -1).mean(axis=0)
     return np.asarray(np.clip(np.maximum(whole, scatter(observed.mean(axis=1)) / single), 1.0 / width, 1.0))
 
 
 def _compared(observed: Floats32) -> Floats:
-    covered = np.maximum(observed[:, Share.COVERED], _COVERED)
-    near = observed[:, Share.NEAR]
-    shares = observed[:, Share.ON] / covered, near / covered, (near + observed[:, Share.EDGE]) / covered
-    return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
+    """Return the compared shares (..., 4) of observations (..., 7)."""
+    covered = np.maximum(observed[..., Share.COVERED], _COVERED)
+    near = observed[..., Share.NEAR]
+    shares = observed[..., Share.ON] / covered, near / covered, (near + observed[..., Share.EDGE]) / covered
+    return np.stack([*shares, -observed[..., Share.PASSED]], axis=-1).astype(np.float64)
 
 
 def estimate_background(now: Floats32, variance: Floats, followed: Floats32, most: Most | None = None) -> Background:

@@ -46,9 +46,11 @@ class OpenPlaces:
         """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading."""
         if self._count >= _MOST or not len(stations):
             return self.add(_NOTHING, np.empty((0, 2)))
-        at = stations[self._random.integers(len(stations), size=_STATIONS)].astype(np.float64)
+        chosen = self._random.integers(len(stations), size=_STATIONS)
         heading = self._random.uniform(-np.pi, np.pi, _STATIONS)
-        poses = np.column_stack([at[:, :2], at[:, 2] + height, heading])
+        order = np.argsort(chosen, kind="stable")  # neighbours are looked up in turn: they lie in the same memory
+        at = stations[chosen[order]].astype(np.float64)
+        poses = np.column_stack([at[:, :2], at[:, 2] + height, heading[order]])
         # structure only moves the scan as it moves those at scored places
         ground = replace(part, points=replace(part.points, structure=part.points.structure[::_EVERY]))
         return self.add(ground.look_up(field, poses, kernels.Move.NEAR).shares, at[:, :2])

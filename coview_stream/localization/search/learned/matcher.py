@@ -224,16 +224,17 @@ class LearnedRecognizer:
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on all storeys below and above them: from above these look alike."""
-        grid = self.consensus.grid
+        grid, peaks = self.consensus.grid, self.consensus.hypotheses()
         places: dict[tuple[int | None, int | None], Hypothesis] = {}
-        for peak in self.consensus.hypotheses():
-            assert peak.station is not None  # the consensus names stations
+        own = np.array([peak.station for peak in peaks], dtype=np.int64)
+        for peak, middle, stations in zip(peaks, own, grid.levels_at(grid.stations[own]).T.tolist(), strict=True):
             places.setdefault((peak.station, peak.shift), replace(peak, learned=True))
-            for station in grid.storeys(peak.station):
+            for station in stations:
+                if station < 0 or (station, peak.shift) in places:
+                    continue
                 T = peak.T_map_odom.copy()
-                T[2, 3] += float(grid.stations[station, 2] - grid.stations[peak.station, 2])
-                place = replace(peak, T_map_odom=T, station=station, learned=True)
-                places.setdefault((place.station, place.shift), place)
+                T[2, 3] += float(grid.stations[station, 2] - grid.stations[middle, 2])
+                places[station, peak.shift] = replace(peak, T_map_odom=T, station=station, learned=True)
         return list(places.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def clear(self) -> None:
