@@ -97,9 +97,8 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Make the worlds, then score the answers."""
     below = folder() / "challenge"
-    runs = [
-        run for site in planned(asked.count or (QUICK if asked.quick else COUNT)) for run in site if make(run, below)
-    ]
+    chosen = (run for site in planned(asked.count or (QUICK if asked.quick else COUNT)) for run in site)
+    runs = [run for run in chosen if run.group != "runs" and make(run, below)]
     yield informs("challenge/runs", len(runs), "")
     if asked.make:
         return

@@ -1,13 +1,13 @@
 """Share of false first fixes, over families of sites that nothing was fitted on, with exact bounds.
 
 A run is a drive on a map until its first fix, or 60 metres: right (nearer than 3 m and 5 degrees), false, or none. Half
-of the runs are on real airborne surveys (:mod:`bench.integrity.surveys`) where ``COVIEW_DATA`` has any, and eight more
-on each real run there. The table of families says what is found where, and after how many metres. The results of
-a site stay in ``--work`` until the code changes: the benchmark goes on where it ended, ``--minutes`` bounds one call,
-and any number of calls may share the folder at once. Runs share sites, at most eight of them one map, but never map
-and drive; beside the share of false runs stands the share of sites with a false run. Bounds are Clopper-Pearson's, at
-95 %, and hold for these families, surveys and this simulator. Stated errors of all searched keyframes are noted, and
-whether the most probable place was right: how often they hold.
+of the runs are on real airborne surveys (:mod:`bench.integrity.surveys`) where ``COVIEW_DATA`` has any; all 3,000 have
+eight more on each real run there. The table of families says what is found where, and after how many metres. The
+results of a site stay in ``--work`` until the code changes: the benchmark goes on where it ended, ``--minutes`` bounds
+one call, and any number of calls may share the folder at once. Runs share sites, at most eight of them one map, but
+never map and drive; beside the share of false runs stands the share of sites with a false run. Bounds are
+Clopper-Pearson's, at 95 %, and hold for these families, surveys and this simulator. Stated errors of all searched
+keyframes are noted, and whether the most probable place was right: how often they hold.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.harness.files import fingerprint, folder
+from bench.harness.files import data, fingerprint, folder
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan, real_runs
-from bench.integrity.run import Result, data, everywhere
+from bench.integrity.run import Result, everywhere
 from bench.integrity.surveys import files
 from coview_stream.errors import InputError
 
@@ -194,7 +194,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 def planned(count: int) -> list[Site]:
     """Return the sites of ``count`` runs, half on real surveys where there are any, and those of recorded runs."""
-    recorded = real_runs(sorted(file.parent.name for file in data().glob("*/base.laz")))
+    names = sorted(file.parent.name for file in data().glob("*/base.laz"))
+    recorded = real_runs(names) if count >= RUNS else []
     if not files():
         return [*recorded, *plan("reported", count)]
     real, simulated = plan("surveys", count // 2), plan("reported", count - count // 2)

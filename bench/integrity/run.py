@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.harness.files import remembered, thread_settings
+from bench.harness.files import data, remembered, thread_settings
 from bench.integrity import surveys
 from bench.integrity.kinds import built, draw, surveyed
 from bench.integrity.plan import FAMILIES, Run, Site
@@ -96,11 +96,6 @@ class Drive:
         """(N,) metres since the first frame."""
         steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def data() -> Path:
-    """Return the folder of real runs and surveys."""
-    return Path(os.environ.get("COVIEW_DATA") or "none")
 
 
 def _recorded(run: Run) -> Drive:

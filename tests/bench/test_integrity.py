@@ -134,9 +134,12 @@ def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_rep
 
 def test_half_of_the_3000_runs_are_on_real_surveys_and_900_near_copies_and_900_outside(tmp_path, monkeypatch):
     monkeypatch.setenv("COVIEW_DATA", str(tmp_path))
-    (tmp_path / "surveys").mkdir()
-    (tmp_path / "surveys" / "town.laz").touch()
+    for file in ("surveys/town.laz", "drive/base.laz"):
+        (tmp_path / file).parent.mkdir()
+        (tmp_path / file).touch()
     runs = [run for site in planned(RUNS) for run in site]
+    assert [run.kind for run in runs if run.group == "runs"] == ["drive"] * 8
+    runs = [run for run in runs if run.group != "runs"]
     assert len({run.key for run in runs}) == len(runs) == 3000
     assert sum(run.group == "surveys" for run in runs) == 1500
     classes = [FAMILIES[run.family] for run in runs]
@@ -193,7 +196,7 @@ def test_a_site_without_a_map_costs_its_runs_and_is_made_again(tmp_path, monkeyp
 def test_a_site_that_another_process_makes_is_not_made_again_nor_one_after_the_time(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(run, "map_of", lambda case: calls.append(case) or 1 / 0)
-    site = plan("surveys", 2)[0]
+    site = plan("reported", 2)[0]
     assert run.on_site(site, tmp_path, "a", until=0.0) == ([], False)
     below = tmp_path / "integrity"
     with locked(tmp_path / f"integrity-{site[0].kind}-{site[0].seed}.lock"):
