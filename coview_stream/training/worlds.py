@@ -7,6 +7,7 @@ import os
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -217,14 +218,11 @@ def write_dataset(
     report = progress or (lambda seed, seconds: None)
     write = partial(_timed, directory, recipe)
     # Open3D in a forked process may hang on the threads of its parent
-    executor = ProcessExecutor(workers) if workers > 1 else Executor()
-    try:
+    with closing(ProcessExecutor(workers) if workers > 1 else Executor()) as executor:
         for number, seconds in executor.run(write, missing):
             if isinstance(seconds, Exception):
                 raise seconds
             report(missing[number], seconds)
-    finally:
-        executor.close()
     return list(paths.values())
 
 

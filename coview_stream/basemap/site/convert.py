@@ -144,5 +144,5 @@ def one_of_each_cube(points: Points, cube: float = CUBE) -> Ints:
     mean = np.stack([np.bincount(number, weights=points[:, d]) for d in range(3)], axis=1) / count[:, None]
     away = np.square(points - mean[number]).sum(axis=1)
     order = np.lexsort((away, number))
-    first = np.flatnonzero(np.append(True, np.diff(number[order]) != 0)) if len(order) else order
+    first = np.unique(number[order], return_index=True)[1]
     return np.sort(order[first])

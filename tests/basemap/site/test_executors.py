@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -40,39 +41,30 @@ def test_steps_in_this_process():
 def test_run_that_is_left_ends_its_own_processes_alone():
     stranger = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,))
     stranger.start()
-    executor = ProcessExecutor(1)
-    try:
+    with closing(ProcessExecutor(1)) as executor:
         results = executor.run(step, [1, 2, 3, 4])
         next(results)
         results.close()
         assert stranger.is_alive()
         assert told(executor.run(step, [5])) == {0: 25}
-    finally:
-        executor.close()
         stranger.kill()
 
 
 @pytest.mark.slow
 def test_steps_in_processes_and_one_that_kills_its_process():
-    executor = ProcessExecutor(2)
-    try:
+    with closing(ProcessExecutor(2)) as executor:
         assert told(executor.run(step, [1, 2, 3, 4])) == EXPECTED
         found = told(executor.run(deadly, [1, 2, 3, 4]))
         assert "its process died" in found.pop(1)
         assert found == {0: 1, 2: 3, 3: 4}
         assert told(executor.run(step, [5])) == {0: 25}  # the next ones have a pool again
-    finally:
-        executor.close()
 
 
 @pytest.mark.slow
 def test_steps_by_a_cluster_of_dask():
     pytest.importorskip("distributed", reason="pip install 'coview-stream[cluster]'")
-    executor = DaskExecutor("local", 1)
-    try:
+    with closing(DaskExecutor("local", 1)) as executor:
         assert told(executor.run(step, [1, 2, 3, 4])) == EXPECTED
-    finally:
-        executor.close()
 
 
 def test_numbers_of_workers_and_schedulers_that_do_not_answer():
@@ -87,10 +79,7 @@ def test_numbers_of_workers_and_schedulers_that_do_not_answer():
 def test_environment_is_as_it_was(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    executor = ProcessExecutor(1)
-    try:
+    with closing(ProcessExecutor(1)) as executor:
         assert dict(executor.run(Path, [])) == {}
-    finally:
-        executor.close()
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ

@@ -1,6 +1,7 @@
 """A site built of clouds: the same bytes whatever the order and the workers, resumed, as good a map as one file."""
 
 import json
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -65,11 +66,8 @@ def test_order_of_the_files_changes_nothing(site, halves, tmp_path):
 
 @pytest.mark.slow
 def test_number_of_workers_changes_nothing(site, halves, tmp_path):
-    executor = ProcessExecutor(2)
-    try:
+    with closing(ProcessExecutor(2)) as executor:
         built = build_site(halves, tmp_path / "other", CONFIG, executor=executor)
-    finally:
-        executor.close()
     assert (tmp_path / "other" / "manifest.json").read_bytes() == (site / "manifest.json").read_bytes()
     assert built.manifest.hashes() == {
         path.name for path in (tmp_path / "other" / "layers").glob("*/*")
