@@ -30,6 +30,7 @@ ACCENT = "#009E73"
 MAX_BASE_POINTS = 1_000_000
 """A base map is thinned to this many points: more do not show in a picture of 800 cells across."""
 
+_UNLIKELY = 0.01  # of the first place's probability: less probable ones are not drawn
 _GROUND_WINDOW = 25.0  # metres; terrain changes little over it, and few buildings are wider
 
 _STYLE = {
@@ -221,6 +222,7 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
 
 def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
     """Draw places (P, 6) as discs, the larger the more probable, with a line ahead, as long as 3 % of the picture."""
+    places = places[places[:, 4] >= _UNLIKELY * places[0, 4]]
     x, y, yaw, probability = places[:, 0] - shift[0], places[:, 1] - shift[1], places[:, 3], places[:, 4]
     label = f"places that the last frame may be at, the first with {probability[0]:.0%}"
     style = {"color": STATE_COLOURS["AMBIGUOUS"], "zorder": 4}
