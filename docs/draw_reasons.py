@@ -34,7 +34,9 @@ def draw(name: str, site: Path, recorded: Path, out: Path) -> None:
     run("locate", site, recorded, "-o", results)
     picture = Image.open(results / "trajectory.png").convert("RGB")
     picture.thumbnail((SIZE, SIZE))
-    picture.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(out / f"reason_{name}.png", optimize=True)
+    picture.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+        out / f"reason_{name}.png", optimize=True
+    )
     print(f"{name}: {json.loads((results / 'result.json').read_text())['reason']}")
 
 
