@@ -60,6 +60,8 @@ BAD = [
     (RegistrationConfig, "track", (0.5, 0.0)),
     (RegistrationConfig, "iterations", 0),
     (RegistrationConfig, "gravity_sigma", 0.0),
+    (RegistrationConfig, "inflation", 0.0),
+    (RegistrationConfig, "shared", 0.0),
     (AcceptanceConfig, "risk", 0.0),
     (AcceptanceConfig, "risk", 0.9e-9),
     (AcceptanceConfig, "risk", 0.5),
@@ -70,6 +72,14 @@ BAD = [
     (AcceptanceConfig, "max_tilt", float("nan")),
     (TrackingConfig, "distance", 0.0),
     (TrackingConfig, "yaw_drift", -0.1),
+    (LidarOdometryConfig, "voxel", 0.0),
+    (LidarOdometryConfig, "max_gap", float("nan")),
+    (LidarOdometryConfig, "max_range", 0.5),
+    (NodeConfig, "pose_rate", 0.0),
+    (NodeConfig, "pose_rate", 201.0),
+    (NodeConfig, "dead_reckoning_timeout", -1.0),
+    (NodeConfig, "odometry_history", float("nan")),
+    (NodeConfig, "max_gap", float("inf")),
 ]
 
 

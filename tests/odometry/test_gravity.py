@@ -83,14 +83,9 @@ def test_invalid_gravity_is_refused(text):
 def test_accelerometer_sign_is_explained():
     with pytest.raises(ConfigError, match="accelerometer"):
         LidarOdometryConfig(gravity=(0.0, 0.0, 9.81))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"voxel": 0.0}, {"max_gap": np.nan}, {"max_range": 0.5}, {"gravity": "moon"}, {"gravity": (1.0, 2.0)}]
-)
-def test_lidar_odometry_config_out_of_range_is_refused(wrong):
-    with pytest.raises(ConfigError):
-        LidarOdometryConfig(**wrong)
+    for wrong in ("moon", (1.0, 2.0)):
+        with pytest.raises(ConfigError, match="gravity"):
+            LidarOdometryConfig(gravity=wrong)
 
 
 TRUE = np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
