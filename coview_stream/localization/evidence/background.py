@@ -4,24 +4,29 @@ All scored places but those around the leader are chance places. Their mean shar
 place, as much as 0.4 in a yard of equal boxes. Their scatter gives the number of independent observations in a scan:
 neighbouring points fall and rise together, and so do the scans of successive keyframes. A search has hundreds of wrong
 places; tracking has one place, so its background is measured in rings around it (:func:`observe_with_background`).
+
+Wrong places differ: among trees or houses any scan fits better than on a field. So a search also observes the map
+around each place, a few metres off and turned a little. Chance at a place is chance on this map, changed as much as the
+shares around the place differ from those around others, and the scatter is that about it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.distributions import normal_quantile
-from coview_stream.localization.evidence.observation import ObservedScan, Share
+from coview_stream.localization.evidence.observation import ObservedScan, ScanPart, Share
 
 # prior, set by hand
 _PSEUDO = 6.0  # chance places that it counts as
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
 _MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
+_LEAST_DEVIATION = 0.03  # of shares, at a thousand independent points
 _COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _MANY = 20  # places from which the second largest share is meaningful
@@ -33,6 +38,10 @@ OPEN = 0.01
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
 _TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
+NEARBY = slice(len(Share), len(Share) + 4)
+"""Columns of an observation (15,) of a search: shares of the structure's outcomes around the place."""
+NEARBY_VARIANCE = slice(NEARBY.stop, NEARBY.stop + 4)
+"""Columns of an observation (15,) of a search: the squared standard errors of these shares."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,7 @@ class Background:
     Attributes:
         structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
             unexplained.
+        around: (4,) the same around chance places; None where it was not observed.
         passed: probability that a free point lies on map structure.
         ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
         number: effective numbers of independent structure points and of free points.
@@ -62,6 +72,22 @@ class Background:
     ground: tuple[float, float]
     number: tuple[float, float]
     open: float | Floats = OPEN
+    around: Floats | None = None
+
+    def structure_at(self, observed: Floats32) -> Floats:
+        """Return ``structure`` at places observed (P, 15): (P, 4), by the outcomes around each; else (1, 4)."""
+        return _structure_at(observed, self.structure, self.around)
+
+    def relative_variance_at(self, observed: Floats32) -> Floats:
+        """Return the squared relative standard errors (P, 4) of :meth:`structure_at`; (1, 4) zeros without ``around``.
+
+        Chance at a place is told by few poses around it.
+        """
+        if self.around is None:
+            return np.zeros((1, 4))
+        nearby = len(_NEIGHBOURS) * observed[:, NEARBY] + self.around
+        variance = len(_NEIGHBOURS) ** 2 * observed[:, NEARBY_VARIANCE] / np.square(nearby)
+        return np.log1p(variance.astype(np.float64))  # of a logarithm, as shares are positive
 
 
 def outcomes(observed: Floats32) -> Floats:
@@ -70,73 +96,108 @@ def outcomes(observed: Floats32) -> Floats:
     return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
 
 
+def observe_around(field: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
+    """Return the outcomes' mean shares (P, 8) at the neighbours of poses (P, 4), and their squared standard errors."""
+    nothing = part.points.structure[:0]
+    structure = replace(part, points=replace(part.points, low=nothing, free=nothing))
+    neighbours = (poses[:, None] + _NEIGHBOURS).reshape(-1, 4)
+    shares = structure.look_up(field, neighbours, kernels.Move.NONE).shares
+    each = outcomes(shares).reshape(-1, len(_NEIGHBOURS), 4)
+    return np.column_stack([each.mean(axis=1), each.var(axis=1, ddof=1) / len(_NEIGHBOURS)]).astype(np.float32)
+
+
 def scatter(observed: Floats32) -> Floats:
-    """Return the variances (4,) of chance places' shares: on, near, explained, passed.
+    """Return the variances (4,) of chance places' shares (on, near, explained, passed), of one point's as the unit.
 
     They belong to the narrowest normal distribution that covers the tail towards the shares of a right place, at one,
     two and about three standard deviations and at the second largest share. The tail is often wider than the middle,
     where a few places are of another kind than the rest.
     """
-    if len(observed) < 2:
-        return np.full(4, np.nan)
-    return _scatter(_compared(observed))
+    return _tail_variance(_deviations(observed))
 
 
-def _scatter(shares: Floats) -> Floats:
-    """Return :func:`scatter` of each column of shares (P, C)."""
+def left_in_mean(observed: Floats32) -> Floats:
+    """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
+
+    ``observed`` (N, W, 7 or 15) has W keyframes at the same chance places. Keyframes see much of the same surroundings,
+    so a place that fits by chance goes on to fit: at 1 all keyframes see the same.
+    """
+    count, width = observed.shape[:2]
+    if count < _MANY or width < 2:
+        return np.ones(4)
+    each = np.stack([_deviations(observed[:, k]) for k in range(width)])
+    mean = each.mean(axis=0)
+    whole = mean.var(axis=0) / np.maximum(each.var(axis=1).mean(axis=0), 1e-9)
+    single = _tail_variance(each.transpose(1, 0, 2).reshape(count, -1)).reshape(width, -1).mean(axis=0)
+    return np.asarray(np.clip(np.maximum(whole, _tail_variance(mean) / single), 1.0 / width, 1.0))
+
+
+def _tail_variance(shares: Floats) -> Floats:
+    """Return :func:`scatter` of each column of shares (N, C)."""
     count = len(shares)
+    if count < 2:
+        return np.full(shares.shape[1], np.nan)
     shares = np.sort(shares, axis=0)
     levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
     reach = (levels[1:] - levels[0]) / np.array([normal_quantile(percent / 100.0) for percent in _TAIL])[:, None]
     if count >= _MANY:  # the second largest, by Blom's plotting position; the largest may be a twin of the right place
         last = (shares[-2] - levels[0]) / normal_quantile((count - 1.375) / (count + 0.25))
         reach = np.vstack([reach, last])
-    return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
+    return np.asarray(np.maximum(reach.max(axis=0), _LEAST_DEVIATION) ** 2)
 
 
-def left_in_mean(observed: Floats32) -> Floats:
-    """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
+def _deviations(observed: Floats32) -> Floats:
+    """Return the deviations (N, 4) of the shares on, near, explained and passed from chance, of one point's as unit."""
+    covered = np.maximum(observed[:, Share.COVERED], _COVERED)
+    near = observed[:, Share.NEAR]
+    structure = np.column_stack([observed[:, Share.ON], near, near + observed[:, Share.EDGE]]) / covered[:, None]
+    expected = np.cumsum(_structure_at(observed, *_structure(observed)), axis=1)[:, :3]
+    passed = _passed(observed)
+    return np.column_stack(
+        [
+            (structure - expected) / np.sqrt(expected * (1.0 - expected)),
+            (passed - observed[:, Share.PASSED]) / np.sqrt(passed * (1.0 - passed)),
+        ]
+    ).astype(np.float64)
 
-    ``observed`` (N, W, 7) has W keyframes at the same chance places. Keyframes see much of the same surroundings, so a
-    place that fits by chance goes on to fit: at 1 all keyframes see the same.
-    """
-    count, width = observed.shape[:2]
-    if count < _MANY or width < 2:
-        return np.ones(4)
-    shares = _compared(observed)
-    whole = shares.mean(axis=1).var(axis=0) / np.maximum(shares.var(axis=0).mean(axis=0), 1e-9)
-    single = _scatter(shares.reshape(count, -1)).reshape(width, -1).mean(axis=0)
-    return np.asarray(np.clip(np.maximum(whole, scatter(observed.mean(axis=1)) / single), 1.0 / width, 1.0))
+
+def _structure(observed: Floats32) -> tuple[Floats, Floats | None]:
+    """Return the structure's outcomes (4,) at chance places, and around them."""
+    presumed = _PSEUDO * np.array(_PSEUDO_SHARES)
+    chance = outcomes(observed).sum(axis=0) + presumed
+    if observed.shape[1] == len(Share):
+        return chance / chance.sum(), None
+    around = observed[:, NEARBY].sum(axis=0, dtype=np.float64) + presumed
+    return chance / chance.sum(), around / around.sum()
 
 
-def _compared(observed: Floats32) -> Floats:
-    """Return the compared shares (..., 4) of observations (..., 7)."""
-    covered = np.maximum(observed[..., Share.COVERED], _COVERED)
-    near = observed[..., Share.NEAR]
-    shares = observed[..., Share.ON] / covered, near / covered, (near + observed[..., Share.EDGE]) / covered
-    return np.stack([*shares, -observed[..., Share.PASSED]], axis=-1).astype(np.float64)
+def _structure_at(observed: Floats32, chance: Floats, around: Floats | None) -> Floats:
+    """Return the structure's outcomes by chance at places observed (P, 15): (P, 4); (1, 4) without ``around``."""
+    if around is None:
+        return chance[None]
+    nearby = len(_NEIGHBOURS) * observed[:, NEARBY].astype(np.float64) + around  # all places count as one neighbour
+    share = nearby * (chance / around)
+    return np.asarray(share / share.sum(axis=1, keepdims=True))
+
+
+def _passed(observed: Floats32) -> float:
+    return float(np.clip(observed[:, Share.PASSED].mean(), *_PASSED)) if len(observed) else 0.05
 
 
 def estimate_background(now: Floats32, variance: Floats, followed: Floats32, most: Most | None = None) -> Background:
     """Estimate the background from chance places.
 
     Args:
-        now: (N, 7) the newest keyframe's observations there.
+        now: (N, 7 or 15) the newest keyframe's observations there.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        followed: (K, 7) mean observations over the keyframes at the followed ones.
+        followed: (K, 7 or 15) mean observations over the keyframes at the followed ones.
         most: limits of the number of independent observations.
     """
     most = most or Most()
-    counts = outcomes(now)
-    total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
-    structure = total / total.sum()
-    passed = float(np.clip(now[:, Share.PASSED].mean(), *_PASSED)) if len(now) else 0.05
-    chance = np.append(np.cumsum(structure[:3]), passed)
-    chance = chance * (1.0 - chance)
+    structure, around = _structure(now)
     count = np.where(np.isfinite(variance), len(now), 0)
     measured = np.where(np.isfinite(variance), variance, 0.0)
-    presumed = chance / _PSEUDO_NUMBER
-    number = _CALIBRATED * chance / ((count * measured + _PSEUDO * presumed) / (count + _PSEUDO))
+    number = _CALIBRATED * (count + _PSEUDO) / (count * measured + _PSEUDO / _PSEUDO_NUMBER)
     high = float(3.0 / (1.0 / number[:3]).sum())
     both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
     # a Beta distribution by mean and variance of the ground's shares
@@ -146,7 +207,8 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     mean = float(np.clip(shares.mean(), 0.02, 0.98))
     spread = float(np.clip(shares.var(), 1e-4, 0.9 * mean * (1.0 - mean)))
     size = mean * (1.0 - mean) / spread - 1.0
-    return Background(structure, passed, (max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)), both)
+    level = max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)
+    return Background(structure, _passed(now), level, both, around=around)
 
 
 def observe_with_background(
@@ -166,3 +228,7 @@ def chance_places(pose: Floats) -> Floats:
     radius, turn = np.take(_RINGS, ring), np.take(_TURNS, (ring + spoke) % len(_TURNS))
     zero = np.zeros_like(radius)
     return np.asarray(pose + np.column_stack([radius * np.cos(angle), radius * np.sin(angle), zero, turn]))
+
+
+_NEIGHBOURS = chance_places(np.zeros(4))[: 2 * _SPOKES : 2]
+"""Steps (8, 4) to the poses that tell chance at a place: 3 and 5 metres off, every other spoke."""

@@ -51,6 +51,9 @@ _LEAKS = np.array([0.05, 0.3, 0.6])  # rays through unchanged structure, as a sh
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
 _EDGE = 0.02  # shares of the ground are clipped to this margin
 
+_NORMAL = np.linspace(-8.0, 8.0, 129)  # standard deviations
+_NORMAL_WEIGHTS = -0.5 * np.square(_NORMAL) - np.log(np.exp(-0.5 * np.square(_NORMAL)).sum())  # logarithms
+
 NUISANCES = (len(KEPT), len(_SURVEYS), len(_LEAKS))
 """Shape (Q, D, L) of a table over the nuisances: unchanged share, kind of survey, leaks."""
 
@@ -59,7 +62,7 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> Floats:
     """Return log-likelihood ratios (P,) of places against chance, summed over the nuisances.
 
     Args:
-        observed: (P, 7) mean observations at the places, see :class:`Share`.
+        observed: (P, 7) mean observations at the places, see :class:`Share`; (P, 15) with the outcomes around them.
         background: shares at chance places.
     """
     if not len(observed):
@@ -81,12 +84,29 @@ def nuisance_prior(background: Background) -> Floats:
     return np.asarray(np.repeat(table, len(_LEAKS), axis=2) / len(_LEAKS))
 
 
+def ratio_variances(observed: Floats32, background: Background) -> Floats:
+    """Return the variances (P,) of log-likelihood ratios by the standard errors of chance at each place.
+
+    They count as far as a place is explained by unchanged structure, at the most probable values of the nuisances.
+    """
+    counts = outcomes(observed)
+    chance = background.structure_at(observed)[:, None, None]
+    right = KEPT[:, None, None] * _SURVEYS
+    explained = right + (1.0 - KEPT[:, None, None]) * chance  # (P, Q, D, 4)
+    structure = np.einsum("pc,pqdc->pqd", counts, np.log(explained / chance)) * background.number[0]
+    best = (structure + np.log(nuisance_prior(background).sum(axis=2))).reshape(len(counts), -1).argmax(axis=1)
+    unchanged = (right / explained).reshape(len(explained), -1, 4)
+    weights = background.number[0] * counts * unchanged[np.minimum(np.arange(len(counts)), len(explained) - 1), best]
+    return np.asarray((np.square(weights) * background.relative_variance_at(observed)).sum(axis=1))
+
+
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:
     """Return log-likelihood ratios (P, Q, D, L) of places against chance, by the values of the nuisances."""
     counts = outcomes(observed)
     q = KEPT[:, None, None]
-    explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
-    structure = np.einsum("pc,qdc->pqd", counts, np.log(explained / background.structure)) * background.number[0]
+    chance = background.structure_at(observed)[:, None, None]
+    explained = q * _SURVEYS + (1.0 - q) * chance  # (P, Q, D, 4)
+    structure = np.einsum("pc,pqdc->pqd", counts, np.log(explained / chance)) * background.number[0]
     rest = clear_and_level(observed, background)
     rest -= np.logaddexp(np.log1p(-background.open), np.log(background.open) + rest)  # a chance place may be open, too
     return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
@@ -127,7 +147,7 @@ class Posterior:
         return float(self.place[~same].sum() + self.none)
 
 
-def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1) -> Posterior:
+def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variances: Floats | None = None) -> Posterior:
     """Return the posterior of places.
 
     It may be looked at after every keyframe: where every place is wrong the odds of all places together are a
@@ -139,15 +159,29 @@ def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1) -> Poste
         votes: (P,) ranks in the votes, from 0.
         count: number N of scored places, these included: the others have the likelihood of chance.
         starts: how often the search has started since a place was accepted.
+        variances: (P,) of the ratios; none by default.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
     # two recognizers rank places, and followed places keep their ranks: the sum may exceed that of one list
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
     total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
-    logs = np.append(ratios - np.log1p(ranks) - np.log(total * starts**2), 0.0)
+    prior = np.append(-np.log1p(ranks) - np.log(total * starts**2), 0.0)
+    ratios = np.append(ratios, 0.0)
+    leader = int((ratios + prior).argmax())
+    gaps = ratios[leader] - ratios
+    if variances is not None and leader < len(ranks):
+        gaps = _mean_gaps(gaps, np.sqrt(np.append(variances, 0.0) + variances[leader]))
+    logs = prior - gaps
     odds = np.exp(logs - logs.max())
     odds /= odds.sum()
     return Posterior(odds[:-1], float(odds[-1]))
+
+
+def _mean_gaps(gaps: Floats, sigmas: Floats) -> Floats:
+    """Return log-odds (N,) that are as probable, on the average, as uncertain ones: ``gaps`` with normal errors."""
+    uncertain = gaps - sigmas * _NORMAL[:, None]
+    wrong = np.logaddexp.reduce(_NORMAL_WEIGHTS[:, None] - np.logaddexp(0.0, uncertain), axis=0)
+    return np.asarray(np.where(gaps > 0.0, np.log(-np.expm1(wrong)) - wrong, gaps))
 
 
 def expected_by_chance(ratio: float, count: int) -> float:

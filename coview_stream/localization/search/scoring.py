@@ -19,8 +19,20 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Circle
-from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
-from coview_stream.localization.evidence.likelihood import expected_by_chance, log_likelihood_ratios, posterior
+from coview_stream.localization.evidence.background import (
+    NEARBY_VARIANCE,
+    Most,
+    estimate_background,
+    left_in_mean,
+    observe_around,
+    scatter,
+)
+from coview_stream.localization.evidence.likelihood import (
+    expected_by_chance,
+    log_likelihood_ratios,
+    posterior,
+    ratio_variances,
+)
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
@@ -116,7 +128,7 @@ class Followed:
     Attributes:
         hypotheses: at the newest keyframe.
         votes: (P,) newest ranks in the votes, from 0.
-        observed: (P, W, 7) observations at the keyframes, oldest first.
+        observed: (P, W, 15) observations at and around them at the keyframes, oldest first.
         newest: (P,) rows among the newest keyframe's poses.
     """
 
@@ -129,7 +141,7 @@ class Followed:
     def none(cls) -> Followed:
         """Return no places, at no keyframes."""
         nothing = np.empty(0, dtype=np.int64)
-        return cls([], nothing, np.empty((0, 0, len(Share)), dtype=np.float32), nothing)
+        return cls([], nothing, np.empty((0, 0, NEARBY_VARIANCE.stop), dtype=np.float32), nothing)
 
     def __getitem__(self, order: Ints) -> Followed:
         hypotheses = [self.hypotheses[k] for k in order]
@@ -142,7 +154,7 @@ class _Observed:
 
     Attributes:
         poses: (H, 4).
-        shares: (H, 7) observations.
+        shares: (H, 15) observations, around the places' best hypotheses as well.
         scores: (H,) evidence scores.
         groups: rows by place, best hypothesis and best place first.
     """
@@ -200,7 +212,9 @@ class PlaceScorer:
         """Begin with earlier keyframes, oldest first: places are compared by them as well."""
         self._scans = scans
         self._scatter = [np.full(4, np.nan)] * len(scans)
-        self._followed = replace(Followed.none(), observed=np.empty((0, len(scans), len(Share)), dtype=np.float32))
+        self._followed = replace(
+            Followed.none(), observed=np.empty((0, len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
+        )
 
     def score(
         self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
@@ -227,12 +241,12 @@ class PlaceScorer:
         observed = self._observe(scan, count, all_hypotheses)
         followed = self._follow(scan, observed, all_hypotheses, ranks, hints)
         first = observed.first
-        ratios = self._evidence(followed, observed, scan)
+        ratios, variances = self._evidence(followed, observed, scan)
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
         self._scans.append(scan)
         self._followed = followed = followed[order]
         self._thin_out()
-        chances = posterior(ratios[order] + prior, followed.votes, len(first), self.starts)
+        chances = posterior(ratios[order] + prior, followed.votes, len(first), self.starts, variances[order])
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)
@@ -267,7 +281,7 @@ class PlaceScorer:
     def _observe(self, scan: ObservedScan, followed: int, hypotheses: list[Hypothesis]) -> _Observed:
         """Observe the map from hypotheses; the first ``followed`` are followed places and hardly drift."""
         if not hypotheses:
-            nothing = np.empty((0, len(Share)), dtype=np.float32)
+            nothing = np.empty((0, NEARBY_VARIANCE.stop), dtype=np.float32)
             return _Observed(np.empty((0, 4)), nothing, np.empty(0, dtype=np.float32), [])
         start, layers = scan.poses(np.array([hypothesis.T_map_odom for hypothesis in hypotheses])), self._base_map.field
         parts = (
@@ -282,7 +296,10 @@ class PlaceScorer:
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
         closer = scan.many.look_up(layers, poses[promising], Move.NEAR)
         poses[promising], shares[promising], scores[promising] = closer.poses, closer.shares, closer.scores
-        return replace(coarse, groups=_places(poses, scores * coarse.inside))
+        found = replace(coarse, groups=_places(poses, scores * coarse.inside))
+        around = np.zeros((len(poses), 8), dtype=np.float32)
+        around[found.first] = observe_around(layers, scan.few, poses[found.first])
+        return replace(found, shares=np.column_stack([shares, around]))
 
     def _follow(
         self, scan: ObservedScan, observed: _Observed, hypotheses: list[Hypothesis], ranks: Ints, hints: int
@@ -305,7 +322,7 @@ class PlaceScorer:
         newest = np.array([group[0] for group, _ in chosen], dtype=np.int64)
         rank, last = ranks.tolist(), len(observed.groups) - 1
         votes = np.array([min(last, *(rank[row] for row in group)) for group, _ in chosen], dtype=np.int64)
-        history = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
+        history = np.empty((len(chosen), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
             # a pose that more keyframes have moved is better: the best places are looked up anew from there
@@ -316,20 +333,21 @@ class PlaceScorer:
         return Followed([place for _, place in chosen], votes, shares, newest)
 
     def _look_back(self, T_map_odom: Floats) -> Floats32:
-        """Return the earlier keyframes' observations (P, W, 7) at new places, with the drift since undone."""
-        out = np.empty((len(T_map_odom), len(self._scans), len(Share)), dtype=np.float32)
+        """Return the earlier keyframes' observations (P, W, 15) at new places, with the drift since undone."""
+        out = np.empty((len(T_map_odom), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
         for k in reversed(range(len(self._scans))):
             scan = self._scans[k]
             observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NEAR)
-            out[:, k], T_map_odom = observed.shares, scan.transforms(observed.poses)
+            around = observe_around(self._base_map.field, scan.few, observed.poses)
+            out[:, k], T_map_odom = np.column_stack([observed.shares, around]), scan.transforms(observed.poses)
         return out
 
-    def _evidence(self, followed: Followed, observed: _Observed, scan: ObservedScan) -> Floats:
-        """Return log-likelihood ratios (P,) against the places that are not around the leader."""
+    def _evidence(self, followed: Followed, observed: _Observed, scan: ObservedScan) -> tuple[Floats, Floats]:
+        """Return log-likelihood ratios (P,) against the places that are not around the leader, and their variances."""
         mean, first = followed.observed.mean(axis=1), observed.first
         if not len(mean):
             self._scatter.append(np.full(4, np.nan))
-            return np.empty(0)
+            return np.empty(0), np.empty(0)
         scans = [*self._scans, scan]
         structure, free = np.mean([at.patches for at in scans], axis=0)
         most = Most(float(structure), float(free), surroundings(scans))
@@ -360,10 +378,10 @@ class PlaceScorer:
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
-        return ratios
+        return ratios, ratio_variances(mean, background)
 
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
-        """Return a sample (N,) of the places, and the observations (N, W, 7) of all keyframes there."""
+        """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""
         sample = np.linspace(0, len(first) - 1, min(len(first), _CHANCE)).astype(np.int64)
         history = self._look_back(scan.transforms(observed.poses[first[sample]]))
         return sample, np.concatenate([history, observed.shares[first[sample]][:, None]], axis=1)

@@ -8,13 +8,17 @@ from trackers import observed
 from coview_kernels import Move
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.background import (
+    NEARBY,
+    NEARBY_VARIANCE,
     Most,
     estimate_background,
     left_in_mean,
+    observe_around,
     observe_with_background,
     scatter,
 )
 from coview_stream.localization.evidence.background import chance_places as places_around
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios, ratio_variances
 from coview_stream.localization.evidence.observation import Share
 
 NOTHING = np.empty((0, len(Share)), dtype=np.float32)
@@ -172,3 +176,51 @@ def test_background_is_what_the_places_around_the_first_pose_explain(world_map, 
     assert observed[0, Share.NEAR] > observed[1, Share.NEAR] > chance[:, Share.NEAR].mean()
     other, _ = observe_with_background(world_map.field, seen, both[::-1])
     np.testing.assert_array_equal(other, observed[::-1])
+
+
+def rich_and_bare(rng, number=40, error=0.0):
+    """Chance places (300, 15), every other one among trees: 0.6 of a scan lies below edges there, else 0.05."""
+    edges = np.where(np.arange(300) % 2, 0.6, 0.05)
+    chance = np.column_stack([np.full((300, 2), 0.03), edges, 0.94 - edges])
+    seen = np.array([rng.multinomial(number, share) for share in chance]) / number
+    rows = np.zeros((300, NEARBY_VARIANCE.stop))
+    rows[:, [Share.ON, Share.NEAR, Share.EDGE]] = np.column_stack([seen[:, 0], seen[:, :2].sum(axis=1), seen[:, 2]])
+    rows[:, [Share.COVERED, Share.PASSED]] = 1.0, PASSED
+    rows[:, NEARBY], rows[:, NEARBY_VARIANCE] = chance, error**2
+    return rows.astype(np.float32)
+
+
+def test_chance_at_a_place_is_told_by_the_map_around_it(rng):
+    places = rich_and_bare(rng)
+    known, unknown = (estimate_background(rows, scatter(rows), rows[:0]) for rows in (places, places[:, : len(Share)]))
+    at = known.structure_at(places)
+    np.testing.assert_allclose(at[:2, 2], (0.05, 0.6), atol=0.06)
+    np.testing.assert_allclose(at.sum(axis=1), 1.0)
+    assert known.number[0] > 4.0 * unknown.number[0]  # places among trees are no scatter of chance
+    right = places[:1].copy()
+    right[0, [Share.ON, Share.NEAR, Share.EDGE]] = 0.2, 0.4, 0.4
+    gain, before = (log_likelihood_ratios(right[:, :n], kind)[0] for n, kind in ((15, known), (7, unknown)))
+    assert gain > before + 5.0
+    assert log_likelihood_ratios(places, known).max() < np.log(len(places))
+
+
+def test_evidence_is_as_uncertain_as_chance_at_its_place(rng):
+    sharp, vague = (rich_and_bare(np.random.default_rng(3), error=error) for error in (0.0, 0.02))
+    right = vague[:1].copy()
+    right[0, [Share.ON, Share.NEAR, Share.EDGE]] = 0.5, 0.7, 0.3
+    known = estimate_background(vague, scatter(vague), vague[:0])
+    np.testing.assert_array_equal(ratio_variances(sharp, known), 0.0)
+    assert ratio_variances(right, known)[0] > 1.0
+    assert ratio_variances(right, known)[0] > 10.0 * np.median(ratio_variances(vague, known))
+
+
+def test_around_a_place_are_the_shares_of_the_poses_around_it(world_map, world_drive):
+    scan = observed(world_drive.clouds[2], world_drive.T_odom_body[2])
+    pose = scan.poses(np.eye(4)[None])
+    shares = scan.few.look_up(world_map.field, places_around(pose[0])[:16:2], Move.NONE).shares
+    each = np.column_stack(
+        [shares[:, 0], shares[:, 1] - shares[:, 0], shares[:, 2], shares[:, 3] - shares[:, 1] - shares[:, 2]]
+    )
+    around = observe_around(world_map.field, scan.few, pose)[0]
+    np.testing.assert_allclose(around[:4], each.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(around[4:], each.var(axis=0, ddof=1) / 8.0, atol=1e-6)

@@ -393,3 +393,13 @@ def test_chance_reaches_a_likelihood_ratio_no_more_often_than_its_inverse():
 )
 def test_small_probabilities_in_words(probability, words):
     assert one_in(probability) == words
+
+
+@pytest.mark.parametrize(("ratio", "sigma"), [(6.0, 3.0), (9.0, 2.5), (2.0, 1.0)])
+def test_uncertain_ratios_are_averaged_over_their_errors(ratio, sigma):
+    """Two places: the first leads; the errors of both count."""
+    ratios, votes = np.array([40.0, 40.0 - ratio]), np.zeros(2, dtype=np.int64)
+    error = posterior(ratios, votes, 2, variances=np.full(2, 0.5 * sigma**2)).place[1]
+    drawn = (1.0 / (1.0 + np.exp(ratio + sigma * np.random.default_rng(4).standard_normal(2_000_000)))).mean()
+    assert error == pytest.approx(drawn, rel=0.05)
+    assert posterior(ratios, votes, 2, variances=np.zeros(2)).place == pytest.approx(posterior(ratios, votes, 2).place)

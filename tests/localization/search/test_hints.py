@@ -126,10 +126,10 @@ def lookalike_map(map_points, tmp_path_factory):
 
 @pytest.mark.slow
 def test_hint_of_lookalike_place_is_never_accepted(lookalike_map, world_drive):
-    plain = follow(Localizer(lookalike_map), world_drive, 8)
+    plain = follow(Localizer(lookalike_map), world_drive, 10)
     localizer = Localizer(lookalike_map)
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
-    fixes = follow(localizer, world_drive, 8)
+    fixes = follow(localizer, world_drive, 10)
     # a hint is one more rank for the wrong place, which may take some keyframes more to refute
     assert first_fix(plain) <= first_fix(fixes)
     for fix, truth in zip(fixes, world_drive.T_map_body, strict=False):
@@ -142,7 +142,7 @@ def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_d
     localizer = Localizer(lookalike_map)
     votes = name_instead(localizer.search, lambda places: places if len(votes) > 3 else [])
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
-    fixes = follow(localizer, world_drive, 8)
+    fixes = follow(localizer, world_drive, 10)
     assert all(f.evidence.confidence > 0.5 for f in fixes[:3])  # in the wrong one, and it was alone
     posed = first_fix(fixes)
     assert posed is not None
