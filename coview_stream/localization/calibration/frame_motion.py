@@ -23,7 +23,7 @@ import numpy as np
 from coview_stream.config import RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, log_so3, orthonormal, rot_z, transform, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, Moments, heavier
 from coview_stream.localization.calibration.odometry_history import Moment
@@ -93,7 +93,8 @@ class FrameMotion:
             seen = self._registered(reference, points, T_odom_body, estimator)
             if seen is not None:
                 both = reference.moment, moment
-                T_odom_body = _corrected(reference.T_odom_body, T_odom_body, seen, estimator, drift, both)
+                fused = _corrected(reference.T_odom_body, T_odom_body, seen, estimator, drift, both)
+                T_odom_body = orthonormal(fused)  # each keyframe is measured from the last: errors would double
         self._reference = _Reference(*surface_points(points), T_odom_body, moment)
         return T_odom_body
 

@@ -230,5 +230,5 @@ def chance_places(pose: Floats) -> Floats:
     return np.asarray(pose + np.column_stack([radius * np.cos(angle), radius * np.sin(angle), zero, turn]))
 
 
-_NEIGHBOURS = chance_places(np.zeros(4))[: 2 * _SPOKES : 2]
-"""Steps (8, 4) to the poses that tell chance at a place: 3 and 5 metres off, every other spoke."""
+_NEIGHBOURS = chance_places(np.zeros(4))[: 2 * _SPOKES]
+"""Steps (16, 4) to the poses that tell chance at a place, 3 and 5 metres off."""

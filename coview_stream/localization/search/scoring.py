@@ -364,7 +364,8 @@ class PlaceScorer:
         sample, over_time = self._over_time(observed, first, scan)
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
-            spread = np.mean(measured, axis=0) * left_in_mean(over_time[chance[sample]])
+            left = left_in_mean(over_time[chance[sample]])
+            spread = np.mean(measured, axis=0) * left
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
             background = replace(
@@ -378,7 +379,7 @@ class PlaceScorer:
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
-        return ratios, ratio_variances(mean, background)
+        return ratios, float(left[:3].mean()) * ratio_variances(mean, background)  # shrinks as the scatter does
 
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
         """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""

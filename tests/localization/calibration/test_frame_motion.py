@@ -94,3 +94,14 @@ def test_empty_frames_do_no_harm():
     nothing = np.empty((0, 3), dtype=np.float32)
     for T in STEPS:
         np.testing.assert_array_equal(motion.refine(nothing, T, estimator, DRIFT), T)
+
+
+@pytest.mark.slow
+def test_poses_stay_rigid_over_a_hundred_keyframes():
+    """Each is measured from the last; a long search would end by an error of 1e-3 otherwise."""
+    scene, back_and_forth = boxes(3), [STEPS[2], STEPS[3]]
+    clouds = [scan(scene, T, k)[::3].astype(np.float32) for k, T in enumerate(back_and_forth)]
+    motion, estimator = FrameMotion(LocalizerConfig().registration, 2.0), CalibrationEstimator()
+    for k in range(100):
+        T = motion.refine(clouds[k % len(clouds)], back_and_forth[k % len(clouds)], estimator, DRIFT)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)

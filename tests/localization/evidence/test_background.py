@@ -217,10 +217,10 @@ def test_evidence_is_as_uncertain_as_chance_at_its_place(rng):
 def test_around_a_place_are_the_shares_of_the_poses_around_it(world_map, world_drive):
     scan = observed(world_drive.clouds[2], world_drive.T_odom_body[2])
     pose = scan.poses(np.eye(4)[None])
-    shares = scan.few.look_up(world_map.field, places_around(pose[0])[:16:2], Move.NONE).shares
+    shares = scan.few.look_up(world_map.field, places_around(pose[0])[:16], Move.NONE).shares
     each = np.column_stack(
         [shares[:, 0], shares[:, 1] - shares[:, 0], shares[:, 2], shares[:, 3] - shares[:, 1] - shares[:, 2]]
     )
     around = observe_around(world_map.field, scan.few, pose)[0]
     np.testing.assert_allclose(around[:4], each.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(around[4:], each.var(axis=0, ddof=1) / 8.0, atol=1e-6)
+    np.testing.assert_allclose(around[4:], each.var(axis=0, ddof=1) / 16.0, atol=1e-6)
