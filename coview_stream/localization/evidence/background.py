@@ -12,7 +12,7 @@ shares around the place differ from those around others, and the scatter is that
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,7 +41,7 @@ _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structur
 NEARBY = slice(len(Share), len(Share) + 4)
 """Columns of an observation (15,) of a search: shares of the structure's outcomes around the place."""
 NEARBY_VARIANCE = slice(NEARBY.stop, NEARBY.stop + 4)
-"""Columns of an observation (15,) of a search: the squared standard errors of these shares."""
+"""Columns of an observation (15,) of a search: the variances of these shares among the poses around the place."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class Background:
         structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
             unexplained.
         around: (4,) the same around chance places; None where it was not observed.
+        within: (4,) variances of the neighbours of one place, of one point's.
+        between: (4,) variances of ``around`` from place to place.
         passed: probability that a free point lies on map structure.
         ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
         number: effective numbers of independent structure points and of free points.
@@ -73,21 +75,25 @@ class Background:
     number: tuple[float, float]
     open: float | Floats = OPEN
     around: Floats | None = None
+    within: Floats = field(default_factory=lambda: np.zeros(4))
+    between: Floats = field(default_factory=lambda: np.zeros(4))
 
     def structure_at(self, observed: Floats32) -> Floats:
         """Return ``structure`` at places observed (P, 15): (P, 4), by the outcomes around each; else (1, 4)."""
         return _structure_at(observed, self.structure, self.around)
 
-    def relative_variance_at(self, observed: Floats32) -> Floats:
-        """Return the squared relative standard errors (P, 4) of :meth:`structure_at`; (1, 4) zeros without ``around``.
+    def relative_errors_at(self, observed: Floats32) -> Floats:
+        """Return the relative standard errors (P, 4) of :meth:`structure_at`; (1, 4) zeros without ``around``.
 
-        Chance at a place is told by few poses around it.
+        Few poses around a place tell chance there, and none where they lie outside the survey.
         """
         if self.around is None:
             return np.zeros((1, 4))
-        nearby = len(_NEIGHBOURS) * observed[:, NEARBY] + self.around
-        variance = len(_NEIGHBOURS) ** 2 * observed[:, NEARBY_VARIANCE] / np.square(nearby)
-        return np.log1p(variance.astype(np.float64))  # of a logarithm, as shares are positive
+        told = len(_NEIGHBOURS) * observed[:, NEARBY].astype(np.float64)
+        count = told.sum(axis=1, keepdims=True) + 1.0  # all places count as one neighbour
+        share = (told + self.around) / count
+        variance = (self.within * share * (1.0 - share) * (count - 1.0) + self.between) / count**2
+        return np.asarray(np.sqrt(np.log1p(variance / np.square(share))))  # of a logarithm, as shares are positive
 
 
 def outcomes(observed: Floats32) -> Floats:
@@ -96,14 +102,14 @@ def outcomes(observed: Floats32) -> Floats:
     return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
 
 
-def observe_around(field: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
-    """Return the outcomes' mean shares (P, 8) at the neighbours of poses (P, 4), and their squared standard errors."""
+def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
+    """Return the outcomes' mean shares (P, 8) at the neighbours of poses (P, 4), and their variances there."""
     nothing = part.points.structure[:0]
     structure = replace(part, points=replace(part.points, low=nothing, free=nothing))
     neighbours = (poses[:, None] + _NEIGHBOURS).reshape(-1, 4)
-    shares = structure.look_up(field, neighbours, kernels.Move.NONE).shares
+    shares = structure.look_up(layers, neighbours, kernels.Move.NONE).shares
     each = outcomes(shares).reshape(-1, len(_NEIGHBOURS), 4)
-    return np.column_stack([each.mean(axis=1), each.var(axis=1, ddof=1) / len(_NEIGHBOURS)]).astype(np.float32)
+    return np.column_stack([each.mean(axis=1), each.var(axis=1, ddof=1)]).astype(np.float32)
 
 
 def scatter(observed: Floats32) -> Floats:
@@ -208,7 +214,13 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     spread = float(np.clip(shares.var(), 1e-4, 0.9 * mean * (1.0 - mean)))
     size = mean * (1.0 - mean) / spread - 1.0
     level = max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)
-    return Background(structure, _passed(now), level, both, around=around)
+    background = Background(structure, _passed(now), level, both, around=around)
+    if around is None or len(now) < 2:
+        return background
+    nearby = now[:, NEARBY].astype(np.float64)
+    single = np.maximum((nearby * (1.0 - nearby)).mean(axis=0), around * (1.0 - around) / len(now))
+    within = now[:, NEARBY_VARIANCE].mean(axis=0) / single
+    return replace(background, within=within, between=nearby.var(axis=0))
 
 
 def observe_with_background(

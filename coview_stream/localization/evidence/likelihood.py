@@ -88,6 +88,7 @@ def ratio_variances(observed: Floats32, background: Background) -> Floats:
     """Return the variances (P,) of log-likelihood ratios by the standard errors of chance at each place.
 
     They count as far as a place is explained by unchanged structure, at the most probable values of the nuisances.
+    Outcomes rise and fall together, with the density of the map, so their errors add up.
     """
     counts = outcomes(observed)
     chance = background.structure_at(observed)[:, None, None]
@@ -97,7 +98,7 @@ def ratio_variances(observed: Floats32, background: Background) -> Floats:
     best = (structure + np.log(nuisance_prior(background).sum(axis=2))).reshape(len(counts), -1).argmax(axis=1)
     unchanged = (right / explained).reshape(len(explained), -1, 4)
     weights = background.number[0] * counts * unchanged[np.minimum(np.arange(len(counts)), len(explained) - 1), best]
-    return np.asarray((np.square(weights) * background.relative_variance_at(observed)).sum(axis=1))
+    return np.asarray(np.square((weights * background.relative_errors_at(observed)).sum(axis=1)))
 
 
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:
@@ -165,14 +166,12 @@ def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variance
     # two recognizers rank places, and followed places keep their ranks: the sum may exceed that of one list
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
     total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
-    prior = np.append(-np.log1p(ranks) - np.log(total * starts**2), 0.0)
-    ratios = np.append(ratios, 0.0)
-    leader = int((ratios + prior).argmax())
-    gaps = ratios[leader] - ratios
+    logs = np.append(ratios - np.log1p(ranks) - np.log(total * starts**2), 0.0)
+    leader = int(logs.argmax())
+    gaps = logs[leader] - logs
     if variances is not None and leader < len(ranks):
         gaps = _mean_gaps(gaps, np.sqrt(np.append(variances, 0.0) + variances[leader]))
-    logs = prior - gaps
-    odds = np.exp(logs - logs.max())
+    odds = np.exp(-gaps)
     odds /= odds.sum()
     return Posterior(odds[:-1], float(odds[-1]))
 

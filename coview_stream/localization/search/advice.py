@@ -87,7 +87,7 @@ class AdvisedSearch(GlobalSearch):
                 yield driven * along[side], at[side].copy()
 
     def _difference(self, places: list[Pose], there: Floats) -> float:
-        """Return by how much less the likest of the other places explains the first one's view from ``there``."""
+        """Return by how much less the likest other place explains of the view that the first one has from ``there``."""
         station = int(self.base_map.station_grid.at(there[None])[0])
         eye = there.copy() if station < 0 else np.array([*there[:2], self.base_map.stations[station, 2]])
         eye[2] += EYE
@@ -95,8 +95,9 @@ class AdvisedSearch(GlobalSearch):
         if scan is None:
             return 0.0
         moved = np.array([place @ inverse(places[0]) for place in places])
-        scores = scan.few.look_up(self.base_map.field, scan.poses(moved), Move.NEAR).scores
-        return float(1.0 - scores[1:].max() / max(float(scores[0]), 1e-6))
+        seen = scan.few.look_up(self.base_map.field, scan.poses(moved), Move.NEAR)
+        inside = seen.parts[1:, -1].min()  # beyond the survey nothing speaks against a place
+        return float(inside * (seen.scores[0] - seen.scores[1:].max()))
 
 
 def serious(places: Floats) -> list[Pose]:

@@ -49,6 +49,11 @@ class Reading:
     level: Pose | None
     turn: Pose = field(default_factory=lambda: np.eye(4))
 
+    @property
+    def leans(self) -> bool:
+        """Whether it is a leaning one: earlier scans are not levelled like its own."""
+        return not np.array_equal(self.turn, np.eye(4))
+
 
 class GlobalSearch:
     """Search of the whole map, a keyframe at a time (paper, eqs 1-13); docs/method.md follows its steps.
@@ -162,7 +167,7 @@ class GlobalSearch:
                 modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
                 leader, undecided = modes.best, modes.undecided
             if scored.error < 0.5:  # a stated error that is not acted on has to be true as well
-                scans = [*self._scorer.scans[:-1], scan]
+                scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
         level = reading.level if leader is reading.leader else self._level(leader, request)

@@ -242,11 +242,12 @@ class PlaceScorer:
         followed = self._follow(scan, observed, all_hypotheses, ranks, hints)
         first = observed.first
         ratios, variances = self._evidence(followed, observed, scan)
-        order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
+        chances = posterior(ratios + prior, followed.votes, len(first), self.starts, variances)
+        order = np.lexsort((np.log1p(followed.votes) - ratios, -chances.place))
+        chances = replace(chances, place=chances.place[order])
         self._scans.append(scan)
         self._followed = followed = followed[order]
         self._thin_out()
-        chances = posterior(ratios[order] + prior, followed.votes, len(first), self.starts, variances[order])
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)

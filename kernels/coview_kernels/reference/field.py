@@ -178,6 +178,8 @@ def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, 
 
 def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -> Mask:
     """Mask (H, N) structure points (N, 3) at a pose (4,) near map structure, moved by (H, 2) rows and columns."""
+    if not len(structure) or not len(offsets):
+        return np.zeros((len(offsets), len(structure)), dtype=bool)
     placed = _placed(structure, pose)
     cell = np.floor(placed[:, 1::-1] / np.float32(CELL)).astype(np.int64)
     first = cell.min(axis=0) + offsets.min(axis=0)

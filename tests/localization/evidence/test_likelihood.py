@@ -395,10 +395,11 @@ def test_small_probabilities_in_words(probability, words):
     assert one_in(probability) == words
 
 
-@pytest.mark.parametrize(("ratio", "sigma"), [(6.0, 3.0), (9.0, 2.5), (2.0, 1.0)])
-def test_uncertain_ratios_are_averaged_over_their_errors(ratio, sigma):
-    """Two places: the first leads; the errors of both count."""
-    ratios, votes = np.array([40.0, 40.0 - ratio]), np.zeros(2, dtype=np.int64)
+@pytest.mark.parametrize(("ratio", "sigma", "rank"), [(6.0, 3.0, 0), (9.0, 2.5, 0), (2.0, 1.0, 0), (3.0, 3.0, 1)])
+def test_uncertain_ratios_are_averaged_over_their_errors(ratio, sigma, rank):
+    """Two places: the first leads; the errors of both count, and the prior within."""
+    ratios, votes = np.array([40.0, 40.0 - ratio]), np.array([0, rank])
+    ratio += np.log1p(rank)
     error = posterior(ratios, votes, 2, variances=np.full(2, 0.5 * sigma**2)).place[1]
     drawn = (1.0 / (1.0 + np.exp(ratio + sigma * np.random.default_rng(4).standard_normal(2_000_000)))).mean()
     assert error == pytest.approx(drawn, rel=0.05)

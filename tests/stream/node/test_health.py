@@ -140,6 +140,16 @@ def test_slow_endless_and_vanishing_readers_are_cut_off(server):
     flood.close()
 
 
+def test_page_of_another_site_whose_name_points_here_reads_nothing(server):
+    made, _ = server
+    connection = http.client.HTTPConnection(made.url[7:-1], timeout=10.0)
+    for page in ("/health", "/metrics"):
+        connection.request("GET", page, headers={"Host": "rebound.evil.example:9464"})
+        answer = connection.getresponse()
+        assert b"ready" not in answer.read()
+        assert answer.status == 421
+
+
 @pytest.mark.slow
 def test_slow_readers_elsewhere_leave_room_for_the_health_check_of_this_machine():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
