@@ -26,7 +26,7 @@ _PSEUDO = 6.0  # chance places that it counts as
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
 _MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
-_LEAST_DEVIATION = 0.03  # of shares, at a thousand independent points
+_LEAST_DEVIATION = 0.03  # in units of one point's sigma: a thousand independent points
 _COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _MANY = 20  # places from which the second largest share is meaningful
@@ -61,7 +61,7 @@ class Background:
         structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
             unexplained.
         around: (4,) the same around chance places; None where it was not observed.
-        within: (4,) variances of the neighbours of one place, of one point's.
+        within: (4,) variances among the neighbours of one place, in units of one point's.
         between: (4,) variances of ``around`` from place to place.
         passed: probability that a free point lies on map structure.
         ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
@@ -113,7 +113,7 @@ def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> F
 
 
 def scatter(observed: Floats32) -> Floats:
-    """Return the variances (4,) of chance places' shares (on, near, explained, passed), of one point's as the unit.
+    """Return the variances (4,) of chance places' shares (on, near, explained, passed), in units of one point's.
 
     They belong to the narrowest normal distribution that covers the tail towards the shares of a right place, at one,
     two and about three standard deviations and at the second largest share. The tail is often wider than the middle,
@@ -153,7 +153,7 @@ def _tail_variance(shares: Floats) -> Floats:
 
 
 def _deviations(observed: Floats32) -> Floats:
-    """Return the deviations (N, 4) of the shares on, near, explained and passed from chance, of one point's as unit."""
+    """Return the deviations (N, 4) of on, near, explained and passed from chance, in units of one point's sigma."""
     covered = np.maximum(observed[:, Share.COVERED], _COVERED)
     near = observed[:, Share.NEAR]
     structure = np.column_stack([observed[:, Share.ON], near, near + observed[:, Share.EDGE]]) / covered[:, None]

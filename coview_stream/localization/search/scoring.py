@@ -127,7 +127,7 @@ class Followed:
 
     Attributes:
         hypotheses: at the newest keyframe.
-        votes: (P,) newest ranks in the votes, from 0.
+        votes: (P,) ranks in the newest votes that named each, from 0.
         observed: (P, W, 15) observations at and around them at the keyframes, oldest first.
         newest: (P,) rows among the newest keyframe's poses.
     """
