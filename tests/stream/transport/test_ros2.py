@@ -61,7 +61,8 @@ class RosSite(Site):
     """A node without threads whose network is ROS; its engine knows every place at once."""
 
     def __init__(self, *args, engines=None):
-        super().__init__("r1", net=Ros2Transport(start_node(args), [KEYS]), engines=engines)
+        self.ros_node = start_node(args)
+        super().__init__("r1", net=Ros2Transport(self.ros_node, [KEYS]), engines=engines)
         self.sessions["r1"].keys = self.keys["r1"] = KEYS
         self.node.declare()
 
@@ -76,7 +77,15 @@ class RosSite(Site):
             time.sleep(0.02)
             return self.counters().odometry_received
 
+        def matched():
+            """Whether every writer of the node knows its readers: to others a pose is never sent."""
+            known = {each.topic_name: each.get_subscription_count() for each in self.ros_node.publishers}
+            return all(known.get(topic) for topic in robot.subscribed[:2]) and all(
+                count >= self.ros_node.count_subscribers(topic) for topic, count in known.items()
+            )
+
         robot.until(heard)
+        robot.until(matched)
         time.sleep(0.3)  # the other topics are found with it
 
     def tick(self):
