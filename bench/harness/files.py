@@ -52,7 +52,7 @@ def add_data(parser: ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def locked(file: Path, wait: bool = True) -> Iterator[None]:
-    """Hold the lock of a name, whose file is there meanwhile; BlockingIOError if another has it and nobody waits."""
+    """Hold a named lock file; BlockingIOError if another process holds it and ``wait`` is false."""
     file.parent.mkdir(parents=True, exist_ok=True)
     while True:
         with file.open("w") as lock:

@@ -105,20 +105,27 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
 
 
 @ti.func
+def _nine_cells(down, across, structure: ti.template(), p, x, y, z, yaw, step):
+    """Return a point's level, and its three rows and columns at a pose and the eight ``step`` metres away."""
+    c, s = ti.cos(yaw), ti.sin(yaw)
+    u, v = structure[0, p], structure[1, p]
+    level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
+    rows = ti.Vector.zero(ti.i32, 3)
+    columns = ti.Vector.zero(ti.i32, 3)
+    for k in ti.static(range(3)):
+        rows[k] = clamped(y + s * u + c * v + step * (k - 1), down)
+        columns[k] = clamped(x + c * u - s * v + step * (k - 1), across)
+    return level, rows, columns
+
+
+@ti.func
 def fine_hits(
     table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
-    c, s = ti.cos(yaw), ti.sin(yaw)
     for p in range(structure.shape[1]):
-        u, v = structure[0, p], structure[1, p]
-        level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
-        rows = ti.Vector.zero(ti.i32, 3)
-        columns = ti.Vector.zero(ti.i32, 3)
-        for k in ti.static(range(3)):
-            rows[k] = clamped(y + s * u + c * v + step * (k - 1), down)
-            columns[k] = clamped(x + c * u - s * v + step * (k - 1), across)
+        level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
                 at = 2 * place(table, across, rows[i], columns[j]) + first
@@ -131,15 +138,8 @@ def closer_hits(
     hits: ti.template(),
 ):  # fmt: skip
     """Count like :func:`fine_hits` for steps of half a cell at most: its nine poses share four cells."""
-    c, s = ti.cos(yaw), ti.sin(yaw)
     for p in range(structure.shape[1]):
-        u, v = structure[0, p], structure[1, p]
-        level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
-        rows = ti.Vector.zero(ti.i32, 3)
-        columns = ti.Vector.zero(ti.i32, 3)
-        for k in ti.static(range(3)):
-            rows[k] = clamped(y + s * u + c * v + step * (k - 1), down)
-            columns[k] = clamped(x + c * u - s * v + step * (k - 1), across)
+        level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
         # of the first and the last row and column
         cells = ti.Vector.zero(ti.i32, 4)
         for k in ti.static(range(4)):

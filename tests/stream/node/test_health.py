@@ -1,4 +1,4 @@
-"""Health of a node: live, ready and why not; metrics, notices to systemd; slow readers hold up nobody."""
+"""Health and metrics of a node, its notices to systemd, and clients that read slowly."""
 
 import contextlib
 import http.client
