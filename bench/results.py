@@ -1,16 +1,18 @@
 """Run benchmarks and write their tables into docs/results.md.
 
 ``python -m bench results [--only NAME...] [--quick]`` replaces only the tables that it runs; every table stands below
-its command, date, machine and the commit of the code (``+``: with uncommitted changes). Quick runs have tables of their
-own.
+its command, date, machine, the commit and the hash of the code (``+``: with uncommitted changes). Quick runs have
+tables of their own.
 
-``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one code, for a release: a table is
-kept in DIR as soon as it is there, a second call goes on with those that are missing, and the page is written once all
-are of one code (in DIR, if they are quick). The most valuable tables come first. Those without times run side by side,
-one on each core, the others alone; most keep the results of each drive or site in ``DIR/worlds`` as well, so that an
-interruption costs minutes (``soak``, an hour in one piece, begins anew). It says what is left, and about how long that
-takes: at most 12 hours on two cores. What a table leaves out for that stands behind ``thinned``. Tables of the page
-that no command makes are kept below the others.
+``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one code, for a release. The page is
+its memory: a table that is there, of this code and by the same command, is done, and one that is made goes into it at
+once, so that a release goes on in another DIR, or on another machine, for as long as the code's hash is the same (that
+of ``bench/results.py`` does not count, nor do comments, docstrings and pages). The most valuable tables come first.
+Those without times run side by side, one on each core, the others alone; most keep the results of each drive or site in
+``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in one piece, begins anew). It says
+which tables are missing, and about how long they take. What a table leaves out to be done in time stands behind
+``thinned``. Once all are of one code, older tables are removed; those that no command makes are kept below the others.
+A quick release has its page in DIR.
 """
 
 from __future__ import annotations
@@ -135,23 +137,55 @@ def replaced(page: str, name: str, part: str) -> str:
     return new if count else f"{page.rstrip()}\n{part}"
 
 
-_RUNNING: set[subprocess.Popen[bytes]] = set()
+class Children:
+    """The processes that measure; once they are told to end, no further one begins."""
+
+    def __init__(self) -> None:
+        self._lock, self._running, self.ended = threading.Lock(), set[subprocess.Popen[bytes]](), False
+
+    def run(self, line: Sequence[str], threads: int | None) -> int | None:
+        """Run a command in a session of its own, its output on stderr; return its exit code, None if all ended."""
+        with self._lock:
+            if self.ended:
+                return None
+            process = subprocess.Popen(line, env=environment(threads), stdout=sys.stderr, start_new_session=True)
+            self._running.add(process)
+        try:
+            code = process.wait()
+        finally:  # perhaps interrupted
+            with self._lock:
+                self._running.discard(process)
+            _kill(process)
+        return None if self.ended else code
+
+    def end(self, seconds: float = 10.0) -> None:
+        """Tell all to end; kill those that have not after so many seconds."""
+        with self._lock:
+            self.ended, running = True, list(self._running)
+        for process in running:
+            _kill(process, signal.SIGTERM)  # so that it ends the processes that it began
+        until = time.monotonic() + seconds
+        for process in running:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, until - time.monotonic()))
+            _kill(process)
 
 
-def measured(command: str, threads: int | None = None) -> str:
+def _kill(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGKILL) -> None:
+    with contextlib.suppress(ProcessLookupError):  # with the processes of its own
+        os.killpg(process.pid, how)
+
+
+def measured(command: str, threads: int | None, children: Children) -> str:
     """Run a benchmark in a process of its own; return its tables, then its targets or all rows, without padding.
 
-    Empty if it failed.
+    Empty if it failed, or was told to end.
     """
     name, *words = command.split()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows.json"
         line = [sys.executable, "-m", "bench", name, *words, "--json", str(file)]
-        process = subprocess.Popen(line, env=environment(threads), stdout=sys.stderr, start_new_session=True)
-        _RUNNING.add(process)
-        code = process.wait()
-        _RUNNING.discard(process)
-        if code not in (0, 1) or not file.is_file():
+        if children.run(line, threads) not in (0, 1) or not file.is_file():
             return ""
         rows = [Row.from_dict(values) for values in json.loads(file.read_text())]
     own = tables_of(name, rows, parser_of(name).parse_args(words))
@@ -172,129 +206,161 @@ def main(arguments: Sequence[str], *, release: bool = False) -> int:
         parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="cores (all)")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help=", ".join(TABLES))
     parser.add_argument("--quick", action="store_true", help="smaller sizes, in tables of their own")
-    parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE.relative_to(ROOT)})")
+    parser.add_argument("--page", type=Path, help=f"({PAGE.relative_to(ROOT)}; of a quick release DIR/results.md)")
     asked = parser.parse_args(arguments)
-    missing = []
     try:
         names = chosen(asked.only)
     except InputError as error:
         print(f"bench {name}: {error}", file=sys.stderr)
         return 2
-    if release:
-        return _release(asked, names)
+    asked.page = asked.page or (asked.work / PAGE.name if release and asked.quick else PAGE)
+    try:
+        return _release(asked, names) if release else _results(asked, names)
+    finally:
+        if asked.page == PAGE:  # figures of other pages
+            subprocess.run([sys.executable, PAGE.with_name("write_reference.py")], env=environment(), check=True)
+
+
+def _results(asked: Namespace, names: Sequence[str]) -> int:
+    """Make the tables one after the other."""
+    missing = []
     for name in names:
-        if not (part := _part(name, asked)):
+        if part := _part(name, asked, None, Children()):
+            _write(asked.page, replaced(text_of(asked.page), _title(name, asked), part))
+        else:
             missing.append(name)
-            continue
-        title = f"{name}, quick" if asked.quick else name
-        page = asked.page.read_text() if asked.page.is_file() else HEAD
-        with atomic_path(asked.page) as file:
-            file.write_text(replaced(page, title, part))
     print(f"{len(names) - len(missing)} tables written; not measured: {', '.join(missing) or 'none'}")
     return int(bool(missing))
 
 
-def _part(name: str, asked: Namespace, threads: int | None = None) -> str:
-    """Measure a table; return its part of the page, empty if it failed."""
+def text_of(page: Path) -> str:
+    """Return a page, or the text above the tables of a new one."""
+    return page.read_text() if page.is_file() else HEAD
+
+
+def _write(page: Path, text: str) -> None:
+    page.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(page) as file:
+        file.write_text(text)
+
+
+def _title(name: str, asked: Namespace) -> str:
+    return f"{name}, quick" if asked.quick else name
+
+
+def _command(name: str, asked: Namespace) -> str:
     of = TABLES[name]
-    command = f"{of.quick or of.command} --quick" if asked.quick else of.command
+    return f"{of.quick or of.command} --quick" if asked.quick else of.command
+
+
+def _part(name: str, asked: Namespace, threads: int | None, children: Children) -> str:
+    """Measure a table; return its part of the page, empty if it failed."""
+    of, command = TABLES[name], _command(name, asked)
     print(f"=== {command}", file=sys.stderr, flush=True)
-    load, begin = os.getloadavg()[0], time.monotonic()
-    text = measured(command, threads)
+    load, begin, version = os.getloadavg()[0], time.monotonic(), f"{commit()}, code {_code()}"
+    text = measured(command, threads, children)
     took = (time.monotonic() - begin) / 60
     print(f"=== {command}: {took:.1f} min{'' if text else ', FAILED'}", file=sys.stderr, flush=True)
-    title = f"{name}, quick" if asked.quick else name
     busy = load > BUSY and threads is None
     machine = f"{os.cpu_count()} shared cores{f', load {load:.0f} from other work' * busy}"
     thinned = f"; thinned: {of.thinned}" if of.thinned and not asked.quick else ""
-    version = f"{commit()}, code {_code()}, {took:.1f} min{thinned}"
-    return text and block(title, command, text, time.strftime("%Y-%m-%d"), version, machine)
+    about = f"{version}, {took:.1f} min{thinned}"
+    return text and block(_title(name, asked), command, text, time.strftime("%Y-%m-%d"), about, machine)
 
 
 def _release(asked: Namespace, names: Sequence[str]) -> int:
-    """Make the tables of this code that are missing in the folder; write the page if then none is."""
+    """Make the tables that the page does not have of this code; remove older ones if then none is missing."""
     os.environ["COVIEW_BENCH"] = str(asked.work / "worlds")
-    code = _code()
-    tables = asked.work / f"tables-{code}{'-quick' * asked.quick}"
-    tables.mkdir(parents=True, exist_ok=True)
-    files = {name: tables / f"{name.replace(' ', '_')}.md" for name in TABLES}
-
-    stopped = threading.Event()
+    code, children, lock = _code(), Children(), threading.Lock()
 
     def make(name: str, threads: int | None) -> None:
         part = ""
-        if _code() == code and not stopped.is_set():
+        if _code() == code and not children.ended:
             try:
-                part = _part(name, asked, threads)
+                part = _part(name, asked, threads, children)
             except Exception:  # the other tables go on
                 traceback.print_exc()
-        if part and _code() == code and not stopped.is_set():  # an interrupted soak tells of what it did
-            with atomic_path(files[name]) as file:
-                file.write_text(part)
+        if part and _code() == code:
+            with lock:
+                text = counted(replaced(text_of(asked.page), _title(name, asked), part), code, asked)
+                _write(asked.page, text)
 
     if not any(data().glob("surveys/*.laz")):
         print(f"bench release: no surveys in {data()} (COVIEW_DATA): all sites are simulated", file=sys.stderr)
-    left = [name for name in names if not files[name].is_file()]
+    left = [name for name in names if name not in done(text_of(asked.page), code, asked)]
     print(f"code {code}: {len(left)} of {len(names)} tables to make{_about(left, asked)}", file=sys.stderr, flush=True)
     for beside, some in itertools.groupby(left, lambda name: TABLES[name].beside):
         with ThreadPoolExecutor(max(1, asked.jobs) if beside else 1) as pool:
             try:
                 list(pool.map(make, some, itertools.repeat(1 if beside else None)))
             except BaseException:  # interrupted, or told to end
-                stopped.set()
                 pool.shutdown(wait=False, cancel_futures=True)
-                for process in list(_RUNNING):  # with the processes of its own
-                    with contextlib.suppress(ProcessLookupError):
-                        os.killpg(process.pid, signal.SIGTERM)
+                children.end()
                 raise
     if _code() != code:
         print("bench release: the code changed meanwhile; begin again", file=sys.stderr)
         return 2
-    missing = [name for name, file in files.items() if not file.is_file()]
-    print(f"code {code}: {len(files) - len(missing)} of {len(files)} tables; missing: {', '.join(missing) or 'none'}")
+    page = text_of(asked.page)
+    there, parts = done(page, code, asked), parts_of(page)
+    missing = [
+        f"{name} (of other code)" if _title(name, asked) in parts else name for name in TABLES if name not in there
+    ]
+    print(f"code {code}: {len(there)} of {len(TABLES)} tables; missing: {'; '.join(missing) or 'none'}")
     if not missing:
-        page = tables / "results.md" if asked.quick else asked.page
-        text = introduction(asked.page) + "".join(file.read_text() for file in files.values()) + without(asked.page)
-        with atomic_path(page) as file:
-            file.write_text(text)
-        if page == PAGE:  # figures of other pages
-            subprocess.run([sys.executable, PAGE.with_name("write_reference.py")], env=environment(), check=True)
-        print(page)
+        _write(asked.page, counted(introduction(page) + "".join(there.values()) + without(page), code, asked))
+        print(asked.page)
     return int(bool(missing))
 
 
+def parts_of(page: str) -> dict[str, str]:
+    """Return a page's tables by title."""
+    found = re.finditer(r"(?s)\n<!-- results: ([^\n]+) -->\n.*?<!-- end -->\n", page)
+    return {part[1]: part[0] for part in found}
+
+
+def done(page: str, code: str, asked: Namespace) -> dict[str, str]:
+    """Return the tables of a page that their commands of today have made of a code, by name."""
+    parts = {name: parts_of(page).get(_title(name, asked), "") for name in TABLES}
+    return {
+        name: part for name, part in parts.items()
+        if re.search(rf"\n`python -m bench {re.escape(_command(name, asked))}`, .*, code {code}, ", part)
+    }  # fmt: skip
+
+
+def counted(page: str, code: str, asked: Namespace) -> str:
+    """Return the page with a line above its tables that says how many of them are of a code."""
+    head = re.sub(r"\n\d+ of \d+ tables are of code \w+\.\n", "", introduction(page)).rstrip()
+    line = f"\n\n{len(done(page, code, asked))} of {len(TABLES)} tables are of code {code}.\n"
+    return head + line + page.removeprefix(introduction(page))
+
+
 def _about(names: Sequence[str], asked: Namespace) -> str:
-    """Say how long tables will take, as earlier ones in the folder took, or else as :data:`TABLES` says."""
-    minutes = {name: 0.5 if asked.quick else TABLES[name].minutes for name in names}
-    for file in sorted(asked.work.glob("tables-*/*.md"), key=os.path.getmtime):
-        found = re.match(
-            r"(?s)\n<!-- results: ([^\n]*?)(, quick)? -->[^`]*`[^`]*`[^\n]*, ([\d.]+) min", file.read_text()
-        )
-        if found and found[1] in minutes and bool(found[2]) == asked.quick:
-            minutes[found[1]] = float(found[3])
-    hours = [value / 60 / (asked.jobs if TABLES[name].beside else 1) for name, value in minutes.items()]
-    return f", about {sum(hours):.1f} h"
+    """Say how long tables will take, as those of the page took, or else as :data:`TABLES` says."""
+    parts, hours = parts_of(text_of(asked.page)), 0.0
+    for name in names:
+        took = re.search(r", code \w+, ([\d.]+) min", parts.get(_title(name, asked), ""))
+        minutes = float(took[1]) if took else 0.5 if asked.quick else TABLES[name].minutes
+        hours += minutes / 60 / (asked.jobs if TABLES[name].beside else 1)
+    return f", about {hours:.1f} h"
 
 
-def without(page: Path) -> str:
+def without(page: str) -> str:
     """Return a page's tables that no command of :data:`TABLES` makes; they name their own commit."""
-    text = page.read_text() if page.is_file() else ""
     made = {entry.command.split()[0] for entry in TABLES.values()}
 
     def outdated(name: str, part: str) -> bool:
         by = re.search(r"`python -m bench (\w+)([^`]*)`", part.partition("\n|")[0])
         return name in TABLES or name.endswith(", quick") or bool(by and by[1] in made and "FILE" not in by[2])
 
-    parts = re.findall(r"(?s)\n<!-- results: ([^\n]+) -->\n(.*?)<!-- end -->\n", text)
-    kept = [(name, part) for name, part in parts if not outdated(name, part)]
-    return "".join(f"\n<!-- results: {name} -->\n{part}<!-- end -->\n" for name, part in kept)
+    return "".join(part for name, part in parts_of(page).items() if not outdated(name, part))
+
+
+def introduction(page: str) -> str:
+    """Return a page's text above its first table."""
+    return page.partition("\n<!-- results: ")[0]
 
 
 def _code() -> str:
-    """Short hash of the product, the kernels and the benchmarks."""
-    return fingerprint("coview_stream", "coview_kernels", "bench")
-
-
-def introduction(page: Path) -> str:
-    """Return a page's text above its first table."""
-    return page.read_text().partition("\n<!-- results: ")[0] if page.is_file() else HEAD
+    """Short hash of the product, the kernels and the benchmarks; this file only says by which commands."""
+    parts = (path.relative_to(ROOT) for path in sorted((ROOT / "bench").iterdir()) if path.name != "results.py")
+    return fingerprint("coview_stream", "coview_kernels", *map(str, parts))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
-import dis
 import fcntl
 import functools
 import hashlib
@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from types import CodeType
 from typing import Any, TypeVar
 
 import coview_kernels
@@ -101,21 +100,15 @@ def fingerprint(*parts: str) -> str:
 
 @functools.cache
 def code_of(content: bytes, suffix: str = ".py") -> bytes:
-    """Return the instructions of a Python source, the same for every comment and layout; any other file as it is."""
-    return repr(_operations(compile(content, "", "exec", optimize=2))).encode() if suffix == ".py" else content
+    """Return a Python source without comments, layout and strings that stand alone; any other file as it is."""
+    return ast.unparse(_Prose().visit(ast.parse(content))).encode() if suffix == ".py" else content
 
 
-def _operations(code: CodeType) -> tuple[object, ...]:
-    """Return the instructions of a code object with all that they name, without places in the source."""
-    constants = (
-        _operations(value) if isinstance(value, CodeType)
-        else sorted(map(repr, value)) if isinstance(value, frozenset)  # in the same order in every process
-        else value
-        for value in code.co_consts
-    )  # fmt: skip
-    # a docstring leaves an instruction that does nothing
-    pairs = [code.co_code[k : k + 2] for k in range(0, len(code.co_code), 2) if code.co_code[k] != dis.opmap["NOP"]]
-    return b"".join(pairs), code.co_names, code.co_varnames, code.co_freevars, *constants
+class _Prose(ast.NodeTransformer):
+    """Removes docstrings."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
 
 
 def isolated(work: Callable[..., Result], *args: Any) -> Result:

@@ -3,6 +3,9 @@
 import json
 import math
 import re
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -50,10 +53,11 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
 
 def test_prose_does_not_change_the_hash_of_code():
     source = (
-        b'"""One."""\ndef f(a):\n    """Two."""\n    try:\n'
+        b'"""One."""\nA = 1\n"""Units of A."""\ndef f(a):\n    """Two."""\n    try:\n'
         b'        return a in {"b", "c"}  # why\n    except OSError:\n        pass\n'
     )
     prose = source.replace(b'    """Two."""\n', b"").replace(b"  # why", b"").replace(b"One", b"Three\n\n")
+    prose = prose.replace(b'"""Units of A."""\n', b"")
     assert code_of(source) == code_of(prose)
     for old, new in ((b'"c"', b'"d"'), (b"return a", b"return not a"), (b"OSError", b"KeyError"), (b"(a)", b"(a, b)")):
         assert code_of(source) != code_of(source.replace(old, new))
@@ -94,16 +98,11 @@ def test_a_wrong_command_is_refused_in_one_line(planted, capsys, arguments, word
 
 
 def test_only_tables_that_were_run_change_the_page():
-    page = results.HEAD + results.block("fake", "fake --quick", "old", "2026-01-01", "abc1234")
-    other = results.block("other", "other", "kept", "2026-01-02", "abc1234")
-    again = results.replaced(
-        page + other, "fake", results.block("fake", "fake --quick", "new", "2026-02-01", "def5678")
-    )
-    assert "old" not in again
-    assert "new" in again
-    assert other in again
-    added = results.replaced(again, "third", results.block("third", "third", "more", "2026-02-01", "def5678"))
-    assert added.startswith(again.rstrip())
+    texts = (("a", "old"), ("b", "kept"), ("a", "new"), ("c", "more"))
+    old, other, new, third = (results.block(name, name, text, "2026-01-01", "abc1234") for name, text in texts)
+    page = results.HEAD + old + other
+    assert results.replaced(page, "a", new) == results.HEAD + new + other
+    assert results.replaced(page, "c", third) == f"{page.rstrip()}\n{third}"
     with pytest.raises(InputError, match="no table"):
         results.chosen(["nothing"])
 
@@ -111,9 +110,9 @@ def test_only_tables_that_were_run_change_the_page():
 @pytest.fixture
 def two_tables(monkeypatch, tmp_path):
     """A release of two tables, whose code and measured texts the test sets."""
-    said = SimpleNamespace(code="1", ran=[], texts={"a": "of a", "b": "of b"}, work=tmp_path, page=tmp_path / "page.md")
+    said = SimpleNamespace(code="1", ran=[], texts={"a": "of a", "b": "of b"}, page=tmp_path / "page.md")
 
-    def measured(command, threads):
+    def measured(command, threads, children):
         said.ran.append((command, threads))
         return said.texts[command]() if callable(said.texts[command]) else said.texts[command]
 
@@ -122,34 +121,42 @@ def two_tables(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(results, "fingerprint", lambda *parts: said.code)
     monkeypatch.setattr(results, "measured", measured)
-    said.release = lambda: results.main(
-        ["--work", str(tmp_path), "--page", str(said.page), "--jobs", "1"], release=True
+    said.release = lambda work="one", *more: results.main(
+        ["--work", str(tmp_path / work), "--page", str(said.page), "--jobs", "1", *more], release=True
     )
     return said
 
 
-def test_a_release_goes_on_with_missing_tables_and_writes_a_page_of_one_code(two_tables, capsys):
+def test_a_release_goes_on_from_its_page_in_any_folder_and_removes_older_tables_at_its_end(two_tables, capsys):
     old = {"a": "a", "a, quick": "a", "older name": "a --fast", "by hand": "more"}
     parts = [results.block(name, by, f"kept of {name}", "2026-01-01", "abc1234") for name, by in old.items()]
     two_tables.page.write_text("# Mine\n" + "".join(parts))
-    two_tables.texts["b"] = ""
+    two_tables.texts["a"] = ""
     assert two_tables.release() == 1
     out, err = capsys.readouterr()
-    assert "code 1: 1 of 2 tables; missing: b, c" in out
+    assert "code 1: 1 of 2 tables; missing: a (of other code)" in out
     assert "code 1: 2 of 2 tables to make, about 1.1 h" in err
-    assert "older name" in two_tables.page.read_text()
-    two_tables.texts["b"] = "of b"
-    assert two_tables.release() == 0
-    assert two_tables.ran == [("a", None), ("b", 1), ("b", 1)]
     page = two_tables.page.read_text()
-    assert page.startswith("# Mine\n\n<!-- results: a -->")
+    assert page.startswith("# Mine\n\n1 of 2 tables are of code 1.\n\n<!-- results: a -->")
+    assert page.count("kept of") == 4
+    two_tables.texts["a"] = "of a"
+    assert two_tables.release("another") == 0
+    assert two_tables.ran == [("a", None), ("b", 1), ("a", None)]
+    assert "1 of 2 tables to make, about 1.0 h" in capsys.readouterr().err
+    page = two_tables.page.read_text()
+    assert page.startswith("# Mine\n\n2 of 2 tables are of code 1.\n\n<!-- results: a -->")
     assert page.endswith(parts[-1])
     assert page.count("kept of") == 1
     assert ", code 1, 0.0 min; thinned: half\n\nof a\n" in page
-    assert "1 of 2 tables to make, about 0.1 h" in capsys.readouterr().err
+    assert two_tables.release("third") == 0
+    assert two_tables.page.read_text() == page
     two_tables.code = "2"
     assert two_tables.release() == 0
     assert two_tables.ran[3:] == [("a", None), ("b", 1)]
+    assert "2 of 2 tables are of code 2.\n" in two_tables.page.read_text()
+    results.TABLES["b, c"] = results.Table("a", 6)  # another command: the table on the page is not it
+    assert two_tables.release() == 0
+    assert two_tables.ran[5:] == [("a", None)]
 
 
 def test_a_release_refuses_two_codes_and_goes_on_after_a_table_that_fails(two_tables, capsys):
@@ -159,7 +166,20 @@ def test_a_release_refuses_two_codes_and_goes_on_after_a_table_that_fails(two_ta
     two_tables.texts["a"] = lambda: setattr(two_tables, "code", "3") or "other"
     assert two_tables.release() == 2
     assert "the code changed meanwhile" in capsys.readouterr().err
-    assert not two_tables.page.exists()
+    assert "other" not in two_tables.page.read_text()
+
+
+def test_processes_end_with_an_interrupted_release_and_none_begins_after_it(tmp_path):
+    children, begun = results.Children(), tmp_path / "begun"
+    deaf = f"import signal, time; signal.signal(15, signal.SIG_IGN); open({str(begun)!r}, 'w'); time.sleep(60)"
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(children.run, [sys.executable, "-c", deaf], None)
+        while not begun.exists():
+            time.sleep(0.01)
+        children.end(0.1)
+        assert running.result(timeout=30) is None
+    assert children.run([sys.executable, "-c", "pass"], None) is None
+    assert results.Children().run([sys.executable, "-c", "raise SystemExit(3)"], 1) == 3
 
 
 def test_an_interrupted_release_keeps_no_table_that_was_cut_short(two_tables):
@@ -169,16 +189,17 @@ def test_an_interrupted_release_keeps_no_table_that_was_cut_short(two_tables):
     two_tables.texts["a"] = cut
     with pytest.raises(KeyboardInterrupt):
         two_tables.release()
-    assert not list(two_tables.work.glob("tables-*/*.md"))
+    assert not two_tables.page.exists()
     assert two_tables.ran == [("a", None)]
 
 
-def test_every_table_has_a_command_that_its_benchmark_understands():
-    for entry in results.TABLES.values():
-        for command in (entry.command, entry.quick or entry.command):
-            name, *words = command.split()
-            if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
-                bench.parser_of(name).parse_args(words)
+def test_every_benchmark_has_a_table_and_understands_its_commands():
+    commands = [line.split() for entry in results.TABLES.values() for line in (entry.command, entry.quick) if line]
+    assert {name for name, *_ in commands} == set(BENCHMARKS)
+    for name, *words in commands:
+        if not BENCHMARKS[name].module.startswith(("stream", "soak")):  # psutil: extra bench
+            bench.parser_of(name).parse_args(words)
+            assert callable(BENCHMARKS[name].load().rows)
 
 
 def test_pages_take_figures_from_tables_that_a_release_makes():
@@ -188,12 +209,6 @@ def test_pages_take_figures_from_tables_that_a_release_makes():
 
 def test_all_tables_end_in_twelve_hours_on_two_cores():
     assert sum(entry.minutes / (2 if entry.beside else 1) for entry in results.TABLES.values()) < 12 * 60
-
-
-def test_every_benchmark_loads():
-    for entry in BENCHMARKS.values():
-        if not entry.module.startswith(("stream", "soak")):  # they watch processes with psutil: extra bench
-            assert callable(entry.load().rows)
 
 
 @pytest.mark.slow

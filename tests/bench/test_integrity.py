@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -31,14 +30,6 @@ def test_upper_bound_is_clopper_pearsons(events, runs, bound):
     assert upper(events, runs) == pytest.approx(bound, rel=5e-3)
 
 
-@pytest.mark.parametrize(("events", "runs"), [(1, 20), (7, 20), (19, 20)])
-def test_a_bound_leaves_five_percent_of_the_binomial(events, runs):
-    def at_most(k, p):
-        return sum(math.comb(runs, j) * p**j * (1 - p) ** (runs - j) for j in range(k + 1))
-
-    assert at_most(events, upper(events, runs)) == pytest.approx(0.05)
-
-
 def test_a_bound_of_nothing_is_one_and_impossible_counts_are_refused():
     assert upper(0, 0) == 1.0
     with pytest.raises(ValueError, match="5 events of 4 runs"):
@@ -53,10 +44,7 @@ def test_a_fix_is_right_within_three_metres_and_five_degrees(metres, degrees, ou
     truth = pose_from(rot_z(1.0), np.array([5.0, 6.0, 7.0]))
     told = truth @ pose_from(rot_z(np.radians(degrees)), np.array([metres, 0.0, 0.0]))
     assert judged(told, truth) == {"outcome": outcome}
-
-
-def test_every_fix_is_false_where_no_pose_is_right():
-    assert judged(np.eye(4), None) == {"outcome": "false"}
+    assert judged(told, None) == {"outcome": "false"}
 
 
 def test_failed_runs_and_those_without_a_way_do_not_count():
