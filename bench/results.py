@@ -93,7 +93,7 @@ TABLES = {
     ),
     **{
         f"ablation, {group}": Table(f"ablation --only {group}", 8, True, f"ablation --only {group} --sites kitti04")
-        for group in ("channels", "registration", "localizer", "elsewhere")
+        for group in ("channels", "localizer", "elsewhere")
     },
     "changed ground": Table("ground", 15, True),
     "overlap": Table(

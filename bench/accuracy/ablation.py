@@ -1,11 +1,11 @@
 """What each choice of the method is worth, group by group, on sites that separate.
 
-Every variant changes one choice. Choices of the search are judged at single keyframes, those of registration from known
-starts, the others by the whole localizer, also on maps of other sites (``elsewhere``). Sites: an airborne-like map of 6
-pulses per square metre, streets of equal houses, a sparse sensor, a dirty world, forests, one changed since the survey,
-and real runs (``--data``). The first row of a group is the default. ``spacing`` is the first paper's Fig. 9, which
-``--picture`` draws. Learned features, descriptors and both are rows of ``python -m bench forest``; odometry alone, map
-alone and no graph are rows of ``python -m bench forest_drives``. Results stay in ``--work``.
+Every variant changes one choice. Choices of the search are judged at single keyframes, the others by the whole
+localizer, also on maps of other sites (``elsewhere``). Sites: an airborne-like map of 6 pulses per square metre,
+streets of equal houses, a sparse sensor, a dirty world, forests, one changed since the survey, and real runs
+(``--data``). The first row of a group is the default. ``spacing`` is the first paper's Fig. 9, which ``--picture``
+draws. Learned features, descriptors and both are rows of ``python -m bench forest``; odometry alone, map alone and no
+graph are rows of ``python -m bench forest_drives``. Results stay in ``--work``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 
 from bench.accuracy import paper
-from bench.accuracy.choices import OFF, Choice, LocalizerChoice, RegistrationChoice, Site, uncalibrated, unverified
+from bench.accuracy.choices import Choice, LocalizerChoice, Site, uncalibrated, unverified
 from bench.harness.files import add_data, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs, listed
 from bench.harness.worlds import prepare
@@ -39,8 +39,6 @@ _ROWS = KINDS["town"]._replace(
     plots=(Plot(buildings.house, 1.0, (10.0, 10.0), (9.0, 9.0)),), setback=(4.0, 4.0), gap=(5.0, 5.0), vacant=0.0,
     infill=0.0, trees=0.0005, hedges=0.0,
 )  # fmt: skip
-
-_CONVERGED = 0.3  # metres; a registration within this has found the place
 
 _LENGTH = 24.0  # metres driven in a simulated site
 _WORLD: dict[str, Any] = {"size": 180.0, "length": _LENGTH, "speed": 3.0, "changed": 0.2}
@@ -85,16 +83,6 @@ SEARCH: dict[str, dict[str, Choice]] = {
 }
 """Choices of the search."""
 
-REGISTRATION = {
-    "default: plane, 70 %": RegistrationChoice(),
-    **{f"plane, {keep:.0%}": RegistrationChoice(RegistrationConfig(keep=keep)) for keep in (0.5, 0.6, 0.8, 0.9, 1.0)},
-    "plane, 15 iterations": RegistrationChoice(RegistrationConfig(iterations=15)),
-    "plane, ground and structure trimmed together": RegistrationChoice(apart=False),
-    "point, same kernel": RegistrationChoice(way="points"),
-    "the paper's: plain, point, 60 %": RegistrationChoice(RegistrationConfig(keep=0.6), "paper"),
-}
-"""Choices of the registration."""
-
 LOCALIZER = {
     "default": LocalizerChoice(),
     **{
@@ -113,10 +101,10 @@ LOCALIZER = {
 ELSEWHERE = {name: LOCALIZER[name] for name in ("default", "1 keyframes vote", "verification off", "risk 0.4")}
 """Those that may let a wrong place through: runs on the map of the next site."""
 
-GROUPS = (*SEARCH, "registration", "localizer", "elsewhere")
+GROUPS = (*SEARCH, "localizer", "elsewhere")
 SITES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(GROUPS, ("airborne-like", "sparse", "changed", *REAL)),
-    **dict.fromkeys(("registration", "localizer"), ("airborne-like", "repetitive", "sparse", "dirty", *REAL[:2])),
+    "localizer": ("airborne-like", "repetitive", "sparse", "dirty", *REAL[:2]),
     "channels": ("airborne-like", "repetitive", "sparse", "forest", "changed", "stand", *REAL),
     "elsewhere": ("airborne-like", "repetitive", "sparse", "dirty"),
     "spacing": ("airborne-like", "sparse", *REAL[:2]),
@@ -184,9 +172,7 @@ def measure(
 
     def make(group: str) -> dict[str, Any]:
         begin, out = time.process_time(), {}
-        if group == "registration":
-            out = {variant: {"errors": site().registrations(choice)} for variant, choice in REGISTRATION.items()}
-        elif group == "localizer":
+        if group == "localizer":
             out = {variant: site().located(choice) for variant, choice in LOCALIZER.items()}
         elif group == "elsewhere":
             out = {variant: site().elsewhere(choice, other) for variant, choice in ELSEWHERE.items()}
@@ -236,22 +222,6 @@ def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) 
             details[f"{way}, ms"] = float(np.mean([answer[way]["keyframe_ms"] for answer in answers]))
         details["stations"] = float(np.mean([each["stations"] for each in every]))
     return informs(f"ablation/{group}, {name}: top-1", 100.0 * details["top1"], "%", details)
-
-
-def registration_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Row of a choice of the registration; mean errors of what is right, and each site's median of all."""
-    every = [one for each in by_site.values() for one in each["errors"]]
-    good = [one for one in every if one["metres"] < _CONVERGED]
-    details: dict[str, Any] = {"group": "registration", "variant": name}
-    for off in OFF:
-        some = [one for one in every if one["off"] == off]
-        details[f"{off:g}"] = f"{sum(one['metres'] < _CONVERGED for one in some)} of {len(some)}"
-    for key in ("metres", "degrees"):
-        details[key] = float(np.mean([one[key] for one in good] or [np.nan]))
-    details["ms"] = float(np.median([one["ms"] for one in every] or [np.nan]))
-    for site, each in by_site.items():
-        details[site] = float(np.median([one["metres"] for one in each["errors"]] or [np.nan]))
-    return informs(f"ablation/registration, {name}: converged", 100.0 * len(good) / max(1, len(every)), "%", details)
 
 
 def localizer_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
@@ -306,9 +276,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         variants = next(iter(measured.values()))
         for variant in variants:
             by_site = {name: each[variant] for name, each in measured.items()}
-            if group == "registration":
-                row = registration_row(variant, by_site)
-            elif group == "localizer":
+            if group == "localizer":
                 row = localizer_row(variant, by_site)
             elif group == "elsewhere":
                 row = elsewhere_row(variant, by_site)
@@ -329,10 +297,6 @@ COLUMNS = {
         *_SHARES, ("mean first fix m", "first", 1), ("latest", "worst", 1), ("false frames", "false", None),
     ),
     "spacing": (*_SHARES, *((way, way, 2) for way in paper.WAYS), ("stations", "stations", 0), ("ms", "ms", 0)),
-    "registration": (
-        ("variant", "variant", None), *((f"right from {off:g} m", f"{off:g}", None) for off in OFF),
-        ("e_t m", "metres", 3), ("e_r deg", "degrees", 2), ("ms", "ms", 0),
-    ),
     "localizer": (
         ("variant", "variant", None), ("runs", "right", None), ("false frames", "false", None),
         ("median first fix m", "first", 1), ("latest", "worst", 1), ("e_t m", "e_t", 3), ("e_r deg", "e_r", 2),

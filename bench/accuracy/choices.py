@@ -1,8 +1,7 @@
-"""Choices of the method, and how they are measured on one site: the search, registration, the whole localizer.
+"""Choices of the method, and how they are measured on one site: the search, the whole localizer.
 
 A choice of the search is judged at every keyframe by exact distances: whether the best place of this keyframe is right,
-one of its ten best, the best of five keyframes together. Registration starts half a metre or a metre, and three
-degrees, from the truth. The localizer runs as ``coview-stream locate`` does.
+one of its ten best, the best of five keyframes together. The localizer runs as ``coview-stream locate`` does.
 """
 
 from __future__ import annotations
@@ -11,53 +10,26 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
 
-import coview_kernels as kernels
-from bench.accuracy import paper
 from coview_stream import BaseMap
 from coview_stream.basemap.stations import StationGrid, describe_storeys, find_stations
 from coview_stream.clouds import read_tum
-from coview_stream.config import (
-    Channel,
-    ConsensusConfig,
-    DescriptorConfig,
-    KeyframeConfig,
-    LocalizerConfig,
-    RegistrationConfig,
-)
-from coview_stream.config.localizer import MIN_PAIRS
+from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig, LocalizerConfig
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.rasters import argsmallest
-from coview_stream.geometry.transforms import (
-    Points,
-    Pose,
-    inverse,
-    pose_from,
-    rot_z,
-    to_local,
-    transform,
-    wrap_angle,
-    yaw_of,
-)
+from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.offline import locate
-from coview_stream.localization.registration.clouds import (
-    LocalMap,
-    LocalMaps,
-    RegistrationCloud,
-    prepare_scan,
-    voxelized,
-)
-from coview_stream.localization.registration.register import RESIDUAL_SCALE, register
+from coview_stream.localization.registration.clouds import voxelized
 from coview_stream.localization.search import acceptance
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -68,7 +40,6 @@ from coview_stream.report.evaluation import driven, evaluate
 
 NEAR, ALIGNED = 3.0, float(np.radians(9.0))  # a place is right within one and a half blocks and shifts
 WINDOW, BEST = 5, 10  # keyframes that vote together, best places of one
-OFF, TURNED = (0.5, 1.0), float(np.radians(3.0))  # how far registrations start from the truth, metres and radians
 
 _DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
 _SAMPLE = 100_000  # distances that a median is taken of
@@ -172,38 +143,6 @@ class Site:
                 counts["coarse"] += right(together.hypotheses()[0].T_map_odom, seen)
         return counts | {"seconds": seconds, "stations": float(len(grid))}
 
-    @cached_property
-    def starts(self) -> list[tuple[KeyframeView, float, Pose]]:
-        """Every second keyframe with metres, and a ``T_map_odom`` (4, 4) that puts the robot so far off."""
-        out = []
-        for k, seen in enumerate(self.keyframes(2.0)[1::2]):
-            heading, turn = 2.399963 * k, TURNED * (-1.0) ** k  # the golden angle covers all directions
-            there = transform(seen.T_map_odom, seen.position[None])[0]
-            for off in OFF:
-                away = there + off * np.array([np.cos(heading), np.sin(heading), 0.0])
-                T = pose_from(rot_z(turn), away) @ pose_from(np.eye(3), -there) @ seen.T_map_odom
-                out.append((seen, off, T))
-        return out
-
-    def registrations(self, choice: RegistrationChoice) -> list[dict[str, float]]:
-        """Register all starts; metres ``off``, errors at the robot, and milliseconds of processor time."""
-        maps, out = LocalMaps(self.map, choice.config.source_range), []
-        for seen, off, start in self.starts:
-            source = prepare_scan(seen.submap, seen.position, choice.config)
-            target = maps.around(transform(start, seen.position[None])[0])
-            if target is None:
-                continue
-            if not choice.apart:
-                source = replace(source, above=np.ones(len(source.points), dtype=bool))
-            target.prepare()
-            begin = time.process_time()
-            T = choice.register(source, start, target, seen.position)
-            ms = 1e3 * (time.process_time() - begin)
-            turn = pose_from(np.eye(3), seen.position)
-            metres, degrees = paper.errors((start if T is None else T) @ turn, seen.T_map_odom @ turn)
-            out.append({"off": off, "metres": metres, "degrees": degrees, "ms": ms})
-        return out
-
     def _map(self, channels: Sequence[Channel]) -> BaseMap:
         """Return the map as if it had been built with other channels."""
         descriptor = replace(self.map.descriptor_config, channels=tuple(channels))
@@ -235,42 +174,6 @@ class Site:
             "e_t": errors.translation.mean if errors.translation else None,
             "e_r": errors.rotation.mean if errors.rotation else None,
         }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class RegistrationChoice:
-    """Registration with some of its choices made otherwise.
-
-    Attributes:
-        config: overlap and the rest.
-        way: ``product``; ``points``, by the same kernel from point to point, which needs finer stops; ``paper``, plain
-            trimmed ICP from point to point, without scales or weights.
-        apart: False: points on the ground and above it are trimmed together.
-    """
-
-    config: RegistrationConfig = field(default_factory=RegistrationConfig)
-    way: Literal["product", "points", "paper"] = "product"
-    apart: bool = True
-
-    def register(self, source: RegistrationCloud, start: Pose, target: LocalMap, centre: Floats) -> Pose | None:
-        """Return ``T_map_odom`` (4, 4) from a start; ``centre`` (3,) is the robot's position."""
-        if self.way == "paper":
-            points, near = source.points.astype(np.float64), target.points.astype(np.float64)
-            return paper.trimmed_icp(points, near, start, self.config.keep)
-        if self.way == "product":
-            found = register(source, start, target, self.config, self.config.search, centre=centre)
-        else:
-            scales, keep = self.config.search, self.config.keep
-            shares = [*([1.0] * (len(scales) - 1)), keep]  # coarse scales keep all, as the product's
-            steps = [
-                kernels.Scale(m, max(RESIDUAL_SCALE, m / 3.0), 1e-4, 1e-5, 1, share)
-                for m, share in zip(scales, shares, strict=True)
-            ]
-            found = kernels.align_planes(
-                target.grid, np.zeros_like(target.normals), source.points, source.above, start, centre, steps,
-                iterations=200, min_pairs=MIN_PAIRS,
-            )  # fmt: skip
-        return None if found is None else found.T_map_source
 
 
 @dataclass(frozen=True)

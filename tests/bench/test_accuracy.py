@@ -118,7 +118,7 @@ def test_totals_count_a_lost_run_as_endless_and_without_poses():
 
 
 def test_every_group_begins_with_the_default_and_changes_it_otherwise():
-    for group, choices in (*ablation.SEARCH.items(), (None, ablation.REGISTRATION), (None, ablation.LOCALIZER)):
+    for group, choices in (*ablation.SEARCH.items(), (None, ablation.LOCALIZER)):
         first, *others = choices.items()
         assert first[0].startswith("default")
         assert first[1] == type(first[1])()
@@ -147,12 +147,6 @@ def test_rows_of_the_ablation_add_sites_up():
     assert (row.details["right"], row.details["e_t"], row.details["first"]) == ("1 of 3", 0.02, np.inf)
     row = ablation.elsewhere_row("d", {"x": {"posed": 3, "frames": 9}, "y": {"posed": 0, "frames": 4}})
     assert (row.ours, row.details["false"], row.details["runs"]) == (3, "3 of 13", "1 of 2")
-    tries = [
-        {"off": 0.5, "metres": 0.1, "degrees": 0.2, "ms": 4.0},
-        {"off": 1.0, "metres": 0.9, "degrees": 9.0, "ms": 6.0},
-    ]
-    row = ablation.registration_row("c", {"x": {"errors": tries}})
-    assert [row.details[key] for key in ("0.5", "1", "metres", "ms", "x")] == ["1 of 1", "0 of 1", 0.1, 5.0, 0.5]
 
 
 @pytest.mark.parametrize(
