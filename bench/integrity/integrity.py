@@ -6,12 +6,18 @@ eight more on each real run there. The table of families says what is found wher
 results of a site stay in ``--work`` until the code changes: the benchmark goes on where it ended, ``--minutes`` bounds
 one call, and any number of calls may share the folder at once. Runs share sites, at most eight of them one map, but
 never map and drive; beside the share of false runs stands the share of sites with a false run. Bounds are
-Clopper-Pearson's, at 95 %, and hold for these families, surveys and this simulator. Stated errors of all searched
-keyframes are noted, and whether the most probable place was right: how often they hold.
+Clopper-Pearson's, at 95 %, and hold for these families, surveys and this simulator. Stated errors of searched keyframes
+are noted, and whether the most probable place was right: how often they hold.
+
+``--kept FILE`` keeps in one small file what was found at the sites that are done, to go on with the others on another
+machine: JSON, a line for each run below one that names the code and the data, compressed by xz. A file of other code or
+data is refused.
 """
 
 from __future__ import annotations
 
+import json
+import lzma
 import math
 import os
 import sys
@@ -19,14 +25,16 @@ import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from bench.harness.files import data, fingerprint, folder
+from bench.harness.files import data, fingerprint, folder, locked
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan, real_runs
-from bench.integrity.run import Result, everywhere
+from bench.integrity.run import Result, before, everywhere
 from bench.integrity.surveys import files
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 
 OUTCOMES = ("right", "false", "none")  # of a run that counts; a failed run, or one without a street, does not
@@ -171,25 +179,62 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--families", metavar="A,B", help="parts of families' names: only these of the runs planned")
     parser.add_argument("--minutes", type=float, default=math.inf, metavar="M", help="begin no map after so long")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (all cores)")
+    parser.add_argument("--kept", type=Path, metavar="FILE.jsonl.xz", help="go on with this file, on any machine")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Make the missing runs, then yield the counts and their verdicts."""
-    code = f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
+    code = code_of_runs()
     sites = chosen(planned(asked.count or (QUICK if asked.quick else RUNS)), asked.families)
-    total, begin, results, made = sum(map(len, sites)), time.monotonic(), list[Result](), 0
-    for result, new in everywhere(sites, folder() / "integrity", code, asked.jobs, begin + 60 * asked.minutes):
-        results.append(result)
-        made += new
-        left = (time.monotonic() - begin) / made * (total - len(results)) / 60 if made else math.nan
-        outcome = f"{result['outcome']} {result.get('reason', '')}"
-        if new:
-            about = f"{len(results)}/{total} {left:4.0f} min left: {result['key']}: {outcome}"
-            print(about, file=sys.stderr, flush=True)
+    total, begin, made = sum(map(len, sites)), time.monotonic(), 0
+    there = kept(asked.kept, code) if asked.kept else {}
+    left = [site for site in sites if not all(run.key in there for run in site)]
+    results = [before(run) | there[run.key] for site in sites if site not in left for run in site]
+    for some, new in everywhere(left, folder() / "integrity", code, asked.jobs, begin + 60 * asked.minutes):
+        results += some
+        if asked.kept and some and not any(result["outcome"] == "failed" for result in some):
+            keep(asked.kept, code, some)
+        made += len(some) * new
+        minutes = (time.monotonic() - begin) / made * (total - len(results)) / 60 if made else math.nan
+        for result in some * new:
+            about = f"{result['key']}: {result['outcome']} {result.get('reason', '')}"
+            print(f"{len(results)}/{total} {minutes:4.0f} min left: {about}", file=sys.stderr, flush=True)
     if len(results) < total:
         yield informs("integrity/runs that are missing yet", total - len(results), "")
     yield from verdicts(results)
     yield informs("integrity/runs", len(results), "", {"results": results})
+
+
+def code_of_runs() -> str:
+    """Return the hash of the code that results depend on."""
+    return f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
+
+
+_FOUND = ("key", "place", "outcome", "state", "metres", "risk", "searched")  # of a result, all that the tables need
+
+
+def kept(file: Path, code: str) -> dict[str, Result]:
+    """Return what the runs of a file found, by key; nothing without a file, InputError if it is of other code."""
+    if not file.is_file():
+        return {}
+    with lzma.open(file, "rt") as lines:
+        if (head := json.loads(next(lines))) != (ours := _head(code)):
+            raise InputError(f"--kept {file}: of {head}, not {ours}: name another file, or remove it")
+        return {result["key"]: result for result in map(json.loads, lines)}
+
+
+def keep(file: Path, code: str, results: Iterable[Result]) -> None:
+    """Add results to a file."""
+    with locked(file.with_name(f"{file.name}.lock")):
+        new = ({name: result[name] for name in _FOUND if name in result} for result in results)
+        lines = [_head(code), *(kept(file, code) | {result["key"]: result for result in new}).values()]
+        with atomic_path(file) as part, lzma.open(part, "wt") as out:
+            out.writelines(json.dumps(line, separators=(",", ":")) + "\n" for line in lines)
+
+
+def _head(code: str) -> dict[str, object]:
+    real = (*files(), *sorted(data().glob("*/base.laz")))
+    return {"code": code, "bytes": {str(file.relative_to(data())): file.stat().st_size for file in real}}
 
 
 def planned(count: int) -> list[Site]:

@@ -17,7 +17,7 @@ import numpy as np
 from bench.harness.files import data, remembered, thread_settings
 from bench.integrity import surveys
 from bench.integrity.kinds import built, draw, surveyed
-from bench.integrity.plan import FAMILIES, Run, Site
+from bench.integrity.plan import FAMILIES, STATED, Run, Site
 from bench.integrity.sites import beside_border, lane, rebuilt, shifted
 from coview_stream import BaseMap, Localizer
 from coview_stream.clouds.trajectory import read_tum
@@ -185,9 +185,10 @@ class Robot:
 
 
 def first_fix(robot: Robot, drive: Drive) -> Result:
-    """Follow a drive to its first fix; return outcome, last reason and searched keyframes.
+    """Follow a drive to its first fix; return outcome, last reason and some of the searched keyframes.
 
-    ``searched`` has for each the metres driven, the stated error, and whether the most probable place was right.
+    ``searched`` has the first, and the first with a stated error below each of :data:`STATED`: the metres driven, the
+    stated error, and whether the most probable place was right.
     """
     robot.localizer.reset()
     said, way, searched = "", drive.driven, list[tuple[float, float, bool]]()
@@ -201,7 +202,8 @@ def first_fix(robot: Robot, drive: Drive) -> Result:
         truth = None if drive.truth is None else drive.truth[k]
         if place is not None:
             right = judged(place.T_map_body, truth)["outcome"] == "right"
-            searched.append((round(float(way[k]), 2), place.error, right))
+            if not searched or any(place.error < limit <= min(at[1] for at in searched) for limit in STATED):
+                searched.append((round(float(way[k]), 2), place.error, right))
         said = fix.evidence.reason if fix.evidence is not None else said
         out |= {"state": fix.state.value, "reason": said, "metres": round(float(way[k]), 2), "frames": k + 1}
         if fix.T_map_body is not None:
@@ -220,8 +222,10 @@ def judged(T_map_body: Pose, truth: Pose | None) -> Result:
     return {"outcome": "right" if metres < NEAR_METRES and degrees < NEAR_DEGREES else "false"}
 
 
-def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: float) -> Iterator[tuple[Result, bool]]:
-    """Yield results as they come, each with whether it was made now; those of a site stay ``below``.
+def everywhere(
+    sites: Sequence[Site], below: Path, code: str, jobs: int, until: float
+) -> Iterator[tuple[list[Result], bool]]:
+    """Yield the results of sites as they come, with whether they were made now; they stay ``below``.
 
     ``jobs`` processes with one thread each begin no further site after ``until`` (``time.monotonic``). Sites that
     another call has begun come last, as it leaves them.
@@ -236,7 +240,7 @@ def everywhere(sites: Sequence[Site], below: Path, code: str, jobs: int, until: 
                 left = []
                 for done in as_completed(waiting):
                     results, new = done.result()
-                    yield from ((result, new) for result in results)
+                    yield results, new
                     left += [] if results else [waiting[done]]
         finally:
             pool.shutdown(cancel_futures=True)
@@ -254,8 +258,7 @@ def on_site(
     Runs of a site with a ``failed`` one are made again next time. None is returned of a site that another process
     makes, unless we ``wait``, or that was to begin after ``until``.
     """
-    about = [{"key": run.key, "class": FAMILIES[run.family], "place": place(run), **asdict(run)} for run in site]
-    new = []
+    about, new = [before(run) for run in site], []
 
     def one(run: Run, robot: Robot) -> Result:
         try:
@@ -269,7 +272,7 @@ def on_site(
             raise _UnkeptError([])
         new.append(site)
         robot = Robot(map_of(site[0]))
-        results = [run | one(case, robot) for run, case in zip(about, site, strict=True)]
+        results = [run | {"place": place(case)} | one(case, robot) for run, case in zip(about, site, strict=True)]
         if any(result["outcome"] == "failed" for result in results):
             raise _UnkeptError(results)
         return {"runs": results}
@@ -288,6 +291,11 @@ def on_site(
 
 def _failed(error: Exception) -> Result:
     return {"outcome": "failed", "reason": f"{type(error).__name__}: {error}"}
+
+
+def before(run: Run) -> Result:
+    """Return a result before the run."""
+    return {"key": run.key, "class": FAMILIES[run.family], **asdict(run)}
 
 
 def place(run: Run) -> str:

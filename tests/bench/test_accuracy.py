@@ -117,15 +117,6 @@ def test_totals_count_a_lost_run_as_endless_and_without_poses():
     assert (row.details["found"], row.details["first_fix_m"], row.details["rmse_t"]) == ("1 of 3", np.inf, 0.03)
 
 
-def test_every_group_begins_with_the_default_and_changes_it_otherwise():
-    for group, choices in (*ablation.SEARCH.items(), (None, ablation.LOCALIZER)):
-        first, *others = choices.items()
-        assert first[0].startswith("default")
-        assert first[1] == type(first[1])()
-        assert all(choice != first[1] for _, choice in others)
-        assert len({repr(choice) for choice in choices.values()}) == len(choices), group
-
-
 def test_every_group_of_the_ablation_has_sites_and_a_table_of_results():
     assert set(ablation.SITES) == set(ablation.GROUPS)
     assert {site for names in ablation.SITES.values() for site in names} == {*ablation.WORLDS, *ablation.REAL}

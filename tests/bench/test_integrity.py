@@ -1,3 +1,5 @@
+import math
+from argparse import Namespace
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -6,12 +8,12 @@ import pytest
 
 from bench.harness import files
 from bench.harness.files import locked
-from bench.harness.rows import upper
-from bench.integrity import challenge, run
-from bench.integrity.integrity import RUNS, Tally, chosen, classes, planned, reliability_table
+from bench.harness.rows import informs, upper
+from bench.integrity import challenge, integrity, run
+from bench.integrity.integrity import RUNS, Tally, chosen, classes, code_of_runs, keep, planned, reliability_table
 from bench.integrity.kinds import CALIBRATION, REPORTED, draw
 from bench.integrity.plan import FAMILIES, STATED, Run, plan, real_runs
-from bench.integrity.run import altered, drive_of, judged
+from bench.integrity.run import altered, before, drive_of, judged
 from coview_stream.clouds import write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
@@ -43,20 +45,14 @@ def test_a_bound_of_nothing_is_one_and_impossible_counts_are_refused():
 def test_a_fix_is_right_within_three_metres_and_five_degrees(metres, degrees, outcome):
     truth = pose_from(rot_z(1.0), np.array([5.0, 6.0, 7.0]))
     told = truth @ pose_from(rot_z(np.radians(degrees)), np.array([metres, 0.0, 0.0]))
-    assert judged(told, truth) == {"outcome": outcome}
-    assert judged(told, None) == {"outcome": "false"}
+    assert (judged(told, truth)["outcome"], judged(told, None)["outcome"]) == (outcome, "false")
 
 
-def test_failed_runs_and_those_without_a_way_do_not_count():
+def test_failed_runs_and_those_without_a_way_do_not_count_and_those_without_a_fix_by_their_last_state():
     runs = [result("1", "right"), result("2", "failed"), result("3", "no way"), result("4", "none", reason="x")]
-    tally = Tally.of(runs)
-    assert (tally.runs, tally.right, tally.false, tally.searching) == (2, 1, 0, 1)
-    assert tally.found == 0.5
-
-
-def test_runs_without_a_fix_are_counted_by_their_last_state():
-    tally = Tally.of(result(str(k), "none", state=state) for k, state in enumerate(("AMBIGUOUS", "LOST", "SEARCHING")))
-    assert (tally.ambiguous, tally.searching) == (1, 2)
+    tally = Tally.of([*runs, result("5", "none", state="LOST"), result("6", "none", state="AMBIGUOUS")])
+    assert (tally.runs, tally.right, tally.false, tally.ambiguous, tally.searching) == (4, 1, 0, 1, 2)
+    assert tally.found == 0.25
 
 
 def test_shifted_buildings_are_counted_with_the_rest_and_without():
@@ -193,6 +189,22 @@ def test_a_site_that_another_process_makes_is_not_made_again_nor_one_after_the_t
     assert len(run.on_site(site, below, "a")[0]) == 2
     assert calls == [site[0]]
     assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_kept_runs_are_not_made_again_and_those_of_other_code_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_DATA", str(tmp_path))
+    kept, searched = tmp_path / "kept.jsonl.xz", [[0.0, 0.02, False]]
+    found = {"outcome": "right", "state": "TRACKING", "metres": 4.0, "frames": 6, "searched": searched}
+    results = [before(case) | found for site in plan("reported", 10) for case in site]
+    asked = Namespace(count=10, families=None, minutes=math.inf, jobs=1, kept=kept)
+    for some in (results[:8], results[8:]):
+        keep(kept, code_of_runs(), some)
+    made = [informs("x", 10, "", {"results": results})]
+    assert integrity.tables(list(integrity.rows(asked)), asked) == integrity.tables(made, asked)
+    kept.unlink()
+    keep(kept, "other", results)
+    with pytest.raises(InputError, match=r"kept.jsonl.xz: of .*'other'"):
+        list(integrity.rows(asked))
 
 
 def test_runs_are_chosen_by_family_and_an_unknown_one_is_refused():
