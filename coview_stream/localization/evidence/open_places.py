@@ -3,12 +3,15 @@
 Ground and free space of a scan agree with the map at the right place, and at every open place. How rare open places are
 decides how much that agreement is worth (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
 plain, as much as ten nats in hills. They are counted twice, and the larger share holds: among the places that the
-search scores, hundreds that votes have named, and among stations all over the map, thousands that nothing has chosen.
+search scores, hundreds that votes have named, and among poses at stations all over the map, thousands a keyframe that
+nothing has chosen. A place has to stay open over the whole drive: poses that are open so far are followed from keyframe
+to keyframe, and new ones are looked up at the earlier keyframes as well.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,22 +19,56 @@ import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.evidence.background import OPEN, Background
 from coview_stream.localization.evidence.likelihood import NUISANCES, clear_and_level
-from coview_stream.localization.evidence.observation import ScanPart, Share
+from coview_stream.localization.evidence.observation import ObservedScan, ScanPart, Share
 
 _STATIONS = 4096  # that a keyframe is observed from
-_MOST = 8 * _STATIONS  # stations of a search: rarer open places are not told from none
+_FOLLOWED = 96  # poses at stations that the next keyframe observes, and of each keyframe that earlier ones observe
 _PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
 _STEPS = 5  # of expectation and maximization
 _EVERY = 8  # one of so many structure points is looked up
 _BLOCK = 512  # places at a time: intermediate arrays stay in the cache
 _SEED = 20240
-_NOTHING = np.empty((0, len(Share)), dtype=np.float32)
 SIGHT = 35.0
 """Metres from the leader within which places have its ground and its free space in common."""
 
 
+@dataclass(frozen=True)
+class _Drives:
+    """Drives that end at stations, as odometry has them.
+
+    Attributes:
+        poses: (S, 4) at the newest keyframe.
+        weights: (S,) how many drives each stands for.
+        observed: (S, W, 7) observations at the keyframes, oldest first.
+    """
+
+    poses: Floats
+    weights: Floats
+    observed: Floats32
+
+    @classmethod
+    def none(cls, keyframes: int = 0) -> _Drives:
+        return cls(np.empty((0, 4)), np.empty(0), np.empty((0, keyframes, len(Share)), dtype=np.float32))
+
+    def __add__(self, other: _Drives) -> _Drives:
+        if not len(self.poses):
+            return other
+        both = (np.concatenate([getattr(part, name) for part in (self, other)]) for name in self.__dataclass_fields__)
+        return _Drives(*both)
+
+    def sampled(self, probable: Floats, random: np.random.Generator) -> _Drives:
+        """Return :data:`_FOLLOWED` drives at most, drawn by their probability (S,) to be open, that stand for all."""
+        chances = self.weights * probable
+        step = chances.sum() / _FOLLOWED
+        if len(chances) <= _FOLLOWED or not step > 0.0:
+            return self
+        drawn = np.searchsorted(np.cumsum(chances), step * (random.random() + np.arange(_FOLLOWED)))
+        rows, count = np.unique(np.minimum(drawn, len(chances) - 1), return_counts=True)
+        return _Drives(self.poses[rows], count * step / probable[rows], self.observed[rows])
+
+
 class OpenPlaces:
-    """Count of open places at stations all over a map, keyframe by keyframe."""
+    """Count of open places at stations all over a map, over the keyframes of a search."""
 
     def __init__(self) -> None:
         self.clear()
@@ -39,25 +76,50 @@ class OpenPlaces:
     def clear(self) -> None:
         """Forget all counts."""
         self._random = np.random.default_rng(_SEED)
-        self._count, self._open = 0, np.zeros((1, 1))  # stations; sum of their probabilities (Q, L)
-        self.add(_NOTHING, np.empty((0, 2)))
+        self._count = 0  # drives so far
+        self._drives, self._probable = _Drives.none(), np.empty(0)
+        self._at = np.empty((0, 2))  # stations of the newest keyframe
+        self._newest: tuple[_Drives, Sequence[ObservedScan], ObservedScan, kernels.FieldMap] | None = None
 
-    def look(self, field: kernels.FieldMap, stations: Floats32, part: ScanPart, height: float) -> None:
-        """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading."""
-        if self._count >= _MOST or not len(stations):
-            return self.add(_NOTHING, np.empty((0, 2)))
-        chosen = self._random.integers(len(stations), size=_STATIONS)
-        heading = self._random.uniform(-np.pi, np.pi, _STATIONS)
+    def look(
+        self, field: kernels.FieldMap, stations: Floats32, scans: Sequence[ObservedScan], scan: ObservedScan,
+        height: float,
+    ) -> None:  # fmt: skip
+        """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading.
+
+        Drives that ended at the last one of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
+        """
+        part = _ground(scan)
+        if len(scans) and len(self._drives.poses):
+            kept = self._drives.sampled(self._probable, self._random)
+            there = scan.poses(scans[-1].transforms(kept.poses))
+            observed = part.look_up(field, there, kernels.Move.NEAR)
+            history = np.concatenate([kept.observed, observed.shares[:, None]], axis=1)
+            self._drives = _Drives(observed.poses, kept.weights, history)
+        count = _STATIONS if len(stations) else 0
+        chosen = self._random.integers(max(len(stations), 1), size=count)
+        heading = self._random.uniform(-np.pi, np.pi, count)
         order = np.argsort(chosen, kind="stable")  # neighbours are looked up in turn: they lie in the same memory
         at = stations[chosen[order]].astype(np.float64)
         poses = np.column_stack([at[:, :2], at[:, 2] + height, heading[order]])
-        # structure only moves the scan as it moves those at scored places
-        ground = replace(part, points=replace(part.points, structure=part.points.structure[::_EVERY]))
-        return self.add(ground.look_up(field, poses, kernels.Move.NEAR).shares, at[:, :2])
+        observed = part.look_up(field, poses, kernels.Move.NEAR)
+        if len(scans):
+            drives = _Drives(observed.poses, np.ones(count), observed.shares[:, None])
+            self._newest, self._at = (drives, scans, scan, field), at[:, :2]
+            self._count += count
+        else:
+            self.add(observed.shares, at[:, :2])
 
     def add(self, observed: Floats32, at: Floats) -> None:
-        """Add a keyframe's observations (S, 7) at stations (S, 2) that nothing has chosen."""
-        self._newest, self._at, self._before = observed, at, (self._count, self._open)
+        """Add a first keyframe's observations (S, 7) at stations (S, 2) that nothing has chosen."""
+        poses = np.column_stack([at, np.zeros_like(at)])
+        self._drives = self._drives + _Drives(poses, np.ones(len(at)), observed[:, None])
+        self._at, self._count = at, self._count + len(at)
+
+    def forget(self, keyframe: int) -> None:
+        """Drop a keyframe's observations."""
+        rest = np.arange(self._drives.observed.shape[1]) != keyframe
+        self._drives = replace(self._drives, observed=self._drives.observed[:, rest])
 
     def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
         """Return the probability (Q, L) that a chance place is open, by the nuisances.
@@ -67,17 +129,42 @@ class OpenPlaces:
             background: of the other shares.
             leader: x, y, ... of the leader: stations as near are left out as well.
         """
-        newest = self._newest
-        if leader is not None:
-            newest = newest[np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT]
-        scored, anywhere = _odds_against(chance, background), _odds_against(newest, background)
-        self._count = self._before[0] + len(anywhere)
+        self._look_back(background)
+        weights, count = self._drives.weights.astype(np.float32), float(self._count)
+        if leader is not None and count:
+            weights *= np.linalg.norm(self._drives.poses[:, :2] - leader[:2], axis=1) > SIGHT
+            count *= float((np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT).mean())
+        scored = _odds_against(chance, background)
+        anywhere = _odds_against(self._drives.observed.mean(axis=1), background)
         named = rate = np.full(scored.shape[1:], OPEN, dtype=np.float32)
         for _ in range(_STEPS):
-            named = _expected(scored, named) / np.float32(len(chance) + 1)  # one more is not open
-            self._open = self._before[1] + _expected(anywhere, rate)
-            rate = ((self._open + OPEN * _PRESUMED) / (self._count + _PRESUMED)).astype(np.float32)
+            named = _probability(scored, named).sum(axis=0) / np.float32(len(chance) + 1)  # one more is not open
+            probable = _probability(anywhere, rate)
+            counted = np.tensordot(weights, probable, axes=1)
+            rate = ((counted + OPEN * _PRESUMED) / (count + _PRESUMED)).astype(np.float32)
+        self._probable = probable.max(axis=(1, 2)).astype(np.float64)
         return np.maximum(rate, named).astype(np.float64)
+
+    def _look_back(self, background: Background) -> None:
+        """Look up the earlier keyframes at the newest drives, those that may be open by the newest keyframe."""
+        if self._newest is None:
+            return
+        newest, scans, scan, field = self._newest
+        self._newest = None
+        odds = _odds_against(newest.observed[:, 0], background)
+        newest = newest.sampled(_probability(odds, np.float32(OPEN)).max(axis=(1, 2)).astype(np.float64), self._random)
+        observed, T_map_odom = newest.observed, scan.transforms(newest.poses)
+        for earlier in reversed(scans):
+            there = _ground(earlier).look_up(field, earlier.poses(T_map_odom), kernels.Move.NEAR)
+            observed = np.concatenate([there.shares[:, None], observed], axis=1)
+            T_map_odom = earlier.transforms(there.poses)
+        self._drives = self._drives + replace(newest, observed=observed)
+
+
+def _ground(scan: ObservedScan) -> ScanPart:
+    """Return few points of a scan: structure only moves it, as it moves scans at scored places."""
+    points = scan.few.points
+    return replace(scan.few, points=replace(points, structure=points.structure[::_EVERY]))
 
 
 def _odds_against(observed: Floats32, background: Background) -> Floats32:
@@ -89,9 +176,8 @@ def _odds_against(observed: Floats32, background: Background) -> Floats32:
     return np.exp(out, out=out)
 
 
-def _expected(odds_against: Floats32, share: Floats32) -> Floats32:
-    """Return the expected number (Q, L) of open places among P with these odds, where a ``share`` (Q, L) of all is."""
+def _probability(odds_against: Floats32, share: Floats32) -> Floats32:
+    """Return the probabilities (P, Q, L) that places with these odds are open, where a ``share`` (Q, L) of all is."""
     probability = odds_against * ((1.0 - share) / np.maximum(share, np.float32(1e-10)))
     probability += 1.0
-    np.reciprocal(probability, out=probability)
-    return np.asarray(probability.sum(axis=0))
+    return np.reciprocal(probability, out=probability)

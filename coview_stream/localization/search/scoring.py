@@ -269,6 +269,7 @@ class PlaceScorer:
         steps = np.linalg.norm(np.diff([scan.body for scan in self._scans], axis=0), axis=1)
         least = 1 + int((steps[:-1] + steps[1:]).argmin())
         del self._scans[least], self._scatter[least]
+        self._open.forget(least)
         rest = np.arange(self._followed.observed.shape[1]) != least
         self._followed = replace(self._followed, observed=self._followed.observed[:, rest])
 
@@ -348,6 +349,7 @@ class PlaceScorer:
         mean, first = followed.observed.mean(axis=1), observed.first
         if not len(mean):
             self._scatter.append(np.full(4, np.nan))
+            self._open.clear()
             return np.empty(0), np.empty(0)
         scans = [*self._scans, scan]
         structure, free = np.mean([at.patches for at in scans], axis=0)
@@ -361,8 +363,12 @@ class PlaceScorer:
         anywhere = self._base_map.stations
         if self.area is not None:
             anywhere = anywhere[self.area.holds(anywhere)]
-        self._open.look(self._base_map.field, anywhere, scan.few, float(np.median(above)) if len(above) else 0.0)
+        height = float(np.median(above)) if len(above) else 0.0
+        self._open.look(self._base_map.field, anywhere, self._scans, scan, height)
         sample, over_time = self._over_time(observed, first, scan)
+        # over all keyframes, of followed places; over the newest one, of others
+        scored = observed.shares[first]
+        scored[np.isin(first, followed.newest)] = mean
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             left = left_in_mean(over_time[chance[sample]])
@@ -370,7 +376,7 @@ class PlaceScorer:
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
             background = replace(
-                background, open=self._open.share(observed.shares[first][elsewhere], background, leader)
+                background, open=self._open.share(scored[elsewhere], background, leader)
             )
             ratios = log_likelihood_ratios(mean, background)
             if last:

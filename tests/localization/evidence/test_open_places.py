@@ -72,8 +72,25 @@ def test_stations_of_a_level_site_are_open_to_a_robot_on_its_ground(world_map, w
     """The small world is level; a robot that is held forty metres above its place has the ground of none."""
     scan, places = (observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False), OpenPlaces())
     level = world_drive.T_map_body[0][2, 3] - world_map.stations[0, 2]
-    places.look(world_map.field, world_map.stations, scan.few, level)
+    places.look(world_map.field, world_map.stations, [], scan, level)
     found = places.share(ROUGH[:300], KNOWN)
     places.clear()
-    places.look(world_map.field, world_map.stations, scan.few, level + 40.0)
+    places.look(world_map.field, world_map.stations, [], scan, level + 40.0)
     assert found.min() > 10.0 * places.share(ROUGH[:300], KNOWN).max()
+
+
+@pytest.mark.parametrize("climb", [0.0, 5.0])
+def test_a_place_counts_while_all_keyframes_find_it_open(climb, world_map, world_drive):
+    """A few drives stand for all level ones; of a drive that climbs none is left, and the keyframe it began at tells."""
+    first = observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False)
+    T = np.array(world_drive.T_map_body[4])
+    T[2, 3] += climb
+    then = observed(world_drive.clouds[4], T, voxels=False)
+    level = world_drive.T_map_body[0][2, 3] - world_map.stations[0, 2]
+    places, background = OpenPlaces(), replace(KNOWN, ground=(4.0, 4.0))
+    places.look(world_map.field, world_map.stations, [], first, level)
+    once = places.share(ROUGH[:300], background).max()
+    places.look(world_map.field, world_map.stations, [first], then, level)
+    twice = places.share(ROUGH[:300], background).max()
+    assert once > 0.5
+    assert twice == pytest.approx(once, rel=0.3) if climb == 0.0 else twice < 0.1 * once, (once, twice)
