@@ -87,7 +87,7 @@ class OpenPlaces:
     ) -> None:  # fmt: skip
         """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading.
 
-        Drives that ended at the last one of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
+        Drives that ended at the last of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
         """
         part = _ground(scan)
         if len(scans) and len(self._drives.poses):
@@ -176,8 +176,8 @@ def _odds_against(observed: Floats32, background: Background) -> Floats32:
     return np.exp(out, out=out)
 
 
-def _probability(odds_against: Floats32, share: Floats32) -> Floats32:
+def _probability(odds_against: Floats32, share: Floats32 | np.float32) -> Floats32:
     """Return the probabilities (P, Q, L) that places with these odds are open, where a ``share`` (Q, L) of all is."""
     probability = odds_against * ((1.0 - share) / np.maximum(share, np.float32(1e-10)))
     probability += 1.0
-    return np.reciprocal(probability, out=probability)
+    return np.asarray(np.reciprocal(probability, out=probability))

@@ -375,9 +375,7 @@ class PlaceScorer:
             spread = np.mean(measured, axis=0) * left
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
-            background = replace(
-                background, open=self._open.share(scored[elsewhere], background, leader)
-            )
+            background = replace(background, open=self._open.share(scored[elsewhere], background, leader))
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break

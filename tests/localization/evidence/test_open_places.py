@@ -81,7 +81,7 @@ def test_stations_of_a_level_site_are_open_to_a_robot_on_its_ground(world_map, w
 
 @pytest.mark.parametrize("climb", [0.0, 5.0])
 def test_a_place_counts_while_all_keyframes_find_it_open(climb, world_map, world_drive):
-    """A few drives stand for all level ones; of a drive that climbs none is left, and the keyframe it began at tells."""
+    """A few drives stand for all that are level; of those that climb hardly any is left."""
     first = observed(world_drive.clouds[0], world_drive.T_map_body[0], voxels=False)
     T = np.array(world_drive.T_map_body[4])
     T[2, 3] += climb
