@@ -5,6 +5,8 @@ Every message names the file, field or key and the remedy. The command prints it
 
 from __future__ import annotations
 
+import shlex
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +19,11 @@ from typing import Any
 def printable(text: object) -> str:
     """Return text of anyone's file or message in a form safe for a terminal: no control characters, one line."""
     return "".join(c if c.isprintable() else " " for c in str(text))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return ``1 frame`` or ``2 frames``."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
 class CoViewWarning(UserWarning):
@@ -77,6 +84,9 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
 
 
+PIP_INSTALL = f"{shlex.quote(sys.executable or 'python')} -m pip install"
+"""Command that installs for the running interpreter; a bare ``pip`` may be another one's."""
+
 EXTRA_OF = {
     "scipy": "node",
     "tqdm": "node",
@@ -119,7 +129,7 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
         if absent and library in EXTRA_OF:
             raise DependencyError(_not_installed(library, purpose, EXTRA_OF[library])) from error
         missing = "is not installed" if absent else f"cannot be loaded ({error})"
-        raise DependencyError(f"{purpose}: {_spelt(library)} {missing}; pip install '{requirement}'") from error
+        raise DependencyError(f"{purpose}: {_spelt(library)} {missing}; {PIP_INSTALL} '{requirement}'") from error
 
 
 def require_installed(module: str, purpose: str) -> None:
@@ -156,15 +166,15 @@ def install_command(extra: str) -> str:
     try:
         own = distribution("coview-stream")
     except PackageNotFoundError:  # run by its path
-        return f"pip install '{Path(__file__).resolve().parents[1]}[{extra}]'"
+        return f"{PIP_INSTALL} '{Path(__file__).resolve().parents[1]}[{extra}]'"
     source = loads(own.read_text("direct_url.json") or "{}")
     address = str(source.get("url", ""))
     if "vcs_info" in source:
         address = f"{source['vcs_info'].get('vcs')}+{address}@{source['vcs_info'].get('commit_id')}"
     if address.startswith("file://"):
         editable = "-e " if source.get("dir_info", {}).get("editable") else ""
-        return f"pip install {editable}'{unquote(address.removeprefix('file://'))}[{extra}]'"
-    return f"pip install 'coview-stream[{extra}]" + (f" @ {address}'" if address else f"=={own.version}'")
+        return f"{PIP_INSTALL} {editable}'{unquote(address.removeprefix('file://'))}[{extra}]'"
+    return f"{PIP_INSTALL} 'coview-stream[{extra}]" + (f" @ {address}'" if address else f"=={own.version}'")
 
 
 def _not_installed(library: str, purpose: str, extra: str) -> str:

@@ -172,7 +172,7 @@ def ground_filter(points: Points, method: Method = "auto") -> Literal["cloth", "
     if method == "cloth" and not cloth_available():
         raise DependencyError(
             "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "
-            "to 3.12: pip install cloth-simulation-filter there, or use method='morphological'"
+            "to 3.12: install it there, or use method='morphological'"
         )
     if method != "auto":
         return method

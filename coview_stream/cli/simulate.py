@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from coview_stream.cli.options import add_shared, add_world, mount_of
-from coview_stream.errors import ConfigError, InputError, require_library
+from coview_stream.errors import ConfigError, InputError, counted, require_library
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     )
     progress = args.progress or sys.stderr.isatty()
     world = simulate(args.out, config, progress=progress, overwrite=args.overwrite)
-    facts = f"{world.base_points} map points, {world.frames} frames, {world.distance:.1f} m driven"
+    facts = f"{world.base_points} map points, {counted(world.frames, 'frame')}, {world.distance:.1f} m driven"
     print(f"{world.directory}: {facts}")
     if args.mount is not None:
         print(f"frames are the sensor's: coview-stream locate ... --mount={args.mount}")
@@ -95,5 +95,5 @@ def run(args: argparse.Namespace) -> int:
     if args.mcap is not None:
         from coview_stream.viewers.foxglove_sink import record_world
 
-        print(f"{args.mcap}: {record_world(args.out, args.mcap, config.mount)} frames")
+        print(f"{args.mcap}: {counted(record_world(args.out, args.mcap, config.mount), 'frame')}")
     return 0

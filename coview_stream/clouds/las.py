@@ -20,7 +20,7 @@ import numpy.typing as npt
 from coview_stream.clouds.cloud import CloudBuilder
 from coview_stream.clouds.reference_system import flaw_of_system, stated_system, unchecked_system
 from coview_stream.clouds.survey_unit import InMetres, SurveyUnit, unit_of_system
-from coview_stream.errors import CloudError, require_library, warn
+from coview_stream.errors import PIP_INSTALL, CloudError, require_library, warn
 from coview_stream.geometry.arrays import Floats
 
 CHUNK = 1_000_000
@@ -104,7 +104,7 @@ def system_of(path: Path, header: Any) -> tuple[str | None, SurveyUnit | None]:
     if flaw is not None:
         raise CloudError(f"{path}: {flaw}")
     if unchecked_system(text):
-        warn(f"{path}: says {text}, whose units were not looked up; pip install 'pyproj>=3.6'")
+        warn(f"{path}: says {text}, whose units were not looked up; {PIP_INSTALL} 'pyproj>=3.6'")
     return text, unit
 
 

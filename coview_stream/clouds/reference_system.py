@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.errors import InputError, printable, require_library
+from coview_stream.errors import PIP_INSTALL, InputError, printable, require_library
 from coview_stream.geometry.arrays import Floats
 
 _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
@@ -66,7 +66,7 @@ def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high:
         return None
     remedy = f"reproject it to {_metric_system(system, low, high)}"
     if "feet" in flaw and text and importlib.util.find_spec("pyproj") is None:
-        remedy = "pip install 'pyproj>=3.6', by which they are converted"
+        remedy = f"{PIP_INSTALL} 'pyproj>=3.6', by which they are converted"
     return f"{flaw} according to its reference system; {remedy}"
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coview_stream.config.checks import check_types, require
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
@@ -101,7 +101,7 @@ def parse_mount(text: str) -> Mount:
     except ValueError as error:
         raise ConfigError(f"{given}: {shape}") from error
     if len(numbers) not in (3, 6):
-        raise ConfigError(f"{given}: {len(numbers)} number{'s' * (len(numbers) != 1)}; {shape}")
+        raise ConfigError(f"{given}: {counted(len(numbers), 'number')}; {shape}")
     if not all(math.isfinite(number) for number in numbers):
         raise ConfigError(f"{given}: not finite; {shape}")
     if max(abs(angle) for angle in numbers[:3]) > 360.0:

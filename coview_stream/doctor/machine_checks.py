@@ -24,7 +24,7 @@ import numpy as np
 from coview_kernels.runtime import cores
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.doctor.finding import Finding
-from coview_stream.errors import install_command
+from coview_stream.errors import PIP_INSTALL, install_command
 
 GB = 1e9
 MIN_MEMORY = 0.6 * GB
@@ -139,7 +139,7 @@ def kernels_finding(result: dict[str, Any], forced: bool) -> Finding:
         text += f"; wrong results from {', '.join(result['differing'])}"
         return Finding("FAIL", "kernels", text, "set COVIEW_KERNELS=numpy, and report it with this output")
     if result["backend"] == "numpy":
-        remedy = "unset COVIEW_KERNELS" if forced else "`pip install quadrants`"
+        remedy = "unset COVIEW_KERNELS" if forced else f"`{PIP_INSTALL} quadrants`"
         return Finding("warn", "kernels", text, f"slower than need be: {remedy}")
     return Finding("ok", "kernels", f"{text}; results as from their NumPy twins")
 
@@ -147,7 +147,7 @@ def kernels_finding(result: dict[str, Any], forced: bool) -> Finding:
 def zenoh_finding(result: dict[str, Any]) -> Finding:
     """Judge zenoh, which all live commands need."""
     if "error" in result:
-        return Finding("FAIL", "zenoh", str(result["error"]), "`pip install 'eclipse-zenoh>=1.10'`")
+        return Finding("FAIL", "zenoh", str(result["error"]), f"`{PIP_INSTALL} 'eclipse-zenoh>=1.10'`")
     version = str(result["version"])
     parts = version.split(".")[:2]
     if all(part.isdigit() for part in parts) and tuple(map(int, parts)) < _MIN_ZENOH:

@@ -15,7 +15,7 @@ from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.frame_checks import SeenFrame, frame_findings
 from coview_stream.doctor.machine_checks import GB, MIN_MEMORY
-from coview_stream.errors import CloudError, CoViewError, MapError, RunError, install_command
+from coview_stream.errors import CloudError, CoViewError, MapError, RunError, counted, install_command
 from coview_stream.geometry.protection import one_in
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def run_findings(
 def stamps_finding(run: Run) -> Finding:
     """Judge the time between frames, to find milliseconds or nanoseconds in place of seconds."""
     step = float(np.median(np.diff(run.stamps))) if len(run) > 1 else float("nan")
-    found = f"{len(run)} frames, {step:.4g} s from one to the next"
+    found = counted(len(run), "frame") + f", {step:.4g} s from one to the next" * (len(run) > 1)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
         if step > factor * 1e-2:
             return Finding("FAIL", "stamps", found, f"they look like {unit}: write seconds")

@@ -12,7 +12,7 @@ import numpy as np
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.las import las_writer, require_laspy
 from coview_stream.clouds.trajectory import write_tum
-from coview_stream.errors import CloudError, DependencyError, require_library, warn
+from coview_stream.errors import CloudError, counted, require_library, warn
 from coview_stream.fusion.fuse import GONE, NEW, RECORD, SAME, Fused
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.report.plots import MAX_BASE_POINTS, draw_base_map, figure, legend_below, map_figure_size
@@ -109,9 +109,7 @@ def _wkt(crs: str | None) -> str | None:
     try:
         systems = require_library("pyproj", "pyproj>=3.6", "reference systems")
         return str(systems.CRS.from_user_input(crs).to_wkt("WKT1_GDAL"))
-    except DependencyError:
-        warn(f"the cloud does not state its reference system, {crs}, for want of pyproj; pip install 'pyproj>=3.6'")
-    except Exception as error:  # pyproj raises many
+    except Exception as error:  # pyproj raises many, and may be missing
         warn(f"the cloud does not state its reference system, {crs} ({error})")
     return None
 
@@ -143,11 +141,11 @@ def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
     lines = [f"{'0 base map':<18} {len(fused.base_map.points):,} points"]
     for k, (name, added) in enumerate(zip(names, fused.added, strict=True), start=1):
         left = [
-            f"{count} frames {why}"
+            f"{counted(count, 'frame')} {why}"
             for count, why in ((added.without_pose, "without a pose left out"), (added.damaged, "damaged"))
             if count
         ]
-        text = ", ".join([f"{added.points:,} points of {added.frames} frames", *left])
+        text = ", ".join([f"{added.points:,} points of {counted(added.frames, 'frame')}", *left])
         lines.append(f"{f'{k} {name}':<18} {text}")
     lines.append(f"{'blind spots':<18} about {fused.filled:,.0f} m2 of surface filled")
     lines.append(f"{'moving':<18} {fused.moving:,} voxels that rays went through")

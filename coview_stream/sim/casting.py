@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coview_kernels import cast_rays, triangle_tree
-from coview_stream.errors import DependencyError, install_command
+from coview_stream.errors import PIP_INSTALL, DependencyError, install_command
 from coview_stream.geometry.arrays import Floats32, Indices
 from coview_stream.sim.mesh import Mesh
 
@@ -67,14 +67,14 @@ def _remedy(error: ImportError) -> str:
     reason = str(error)
     for library, package in _DEBIAN_PACKAGES.items():
         if library in reason:
-            extra = " or `pip install libusb-package`" if library.startswith("libusb") else ""
+            extra = f" or `{PIP_INSTALL} libusb-package`" if library.startswith("libusb") else ""
             return (
                 f"Open3D cannot load the system library {library} ({reason}); install it, on Debian and "
                 f"Ubuntu with `apt-get install {package}`{extra}"
             )
     if isinstance(error, ModuleNotFoundError) and error.name == "open3d":
         return f"Open3D is not installed; {install_command('open3d')}"
-    return f"Open3D cannot be loaded ({reason}); reinstall it with `pip install --force-reinstall open3d-cpu`"
+    return f"Open3D cannot be loaded ({reason}); reinstall it with `{PIP_INSTALL} --force-reinstall open3d-cpu`"
 
 
 class FirstHits(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.summary import MapView
-from coview_stream.errors import ConfigError, DependencyError, InputError, require_library
+from coview_stream.errors import PIP_INSTALL, ConfigError, DependencyError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
@@ -142,7 +142,8 @@ def _start_viewer() -> int:
         (folder / name for folder in folders for name in ("rerun", "rerun.exe") if (folder / name).exists()), None
     )
     if viewer is None:
-        raise DependencyError("--rerun: its viewer is not installed; pip install --force-reinstall 'rerun-sdk>=0.20'")
+        remedy = f"{PIP_INSTALL} --force-reinstall 'rerun-sdk>=0.20'"
+        raise DependencyError(f"--rerun: its viewer is not installed; {remedy}")
     command, nothing = [str(viewer), "--bind", _HOST, "--port", str(port)], subprocess.DEVNULL
     # in a session of its own it stays when we end
     process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)

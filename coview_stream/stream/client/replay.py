@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from coview_stream.errors import CloudError, ConfigError
+from coview_stream.errors import CloudError, ConfigError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, interpolate
 from coview_stream.messages.json_messages import read_object
@@ -186,9 +186,9 @@ class ReplayReport:
     def text(self) -> str:
         """Summarize in a few lines."""
         rate = f" ({(self.frames - 1) / self.seconds:.2f} Hz)" if self.frames > 1 and self.seconds else ""
+        sent = f"{counted(self.frames, 'frame')}{rate} and {counted(self.odometry, 'odometry sample')} sent"
         lines = [
-            f"{self.frames} frames{rate} and {self.odometry} odometry samples sent in {self.seconds:.1f} s"
-            + ("" if self.finished else ", ended early"),
+            f"{sent} in {self.seconds:.1f} s" + ("" if self.finished else ", ended early"),
             f"put {_percentiles(self.put_ms)}; behind schedule {_percentiles(self.late_ms)}",
         ]
         late = sum(ms > 1e3 * _LATE for ms in self.late_ms)
