@@ -10,21 +10,21 @@ import numpy as np
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.map_arrays import MemoryArrays, MemoryTile, map_arrays
-from coview_stream.basemap.progress import Progress, staged_bar
 from coview_stream.basemap.sources import Source, short_names, warn_of_other_systems
 from coview_stream.basemap.stations import below_another, describe_storeys, find_stations
 from coview_stream.basemap.tiles import scaled_normals, sort_by_tile
 from coview_stream.clouds.cloud import merge
 from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
+from coview_stream.clouds.progress import Progress, staged_bar
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
 
 _MIN_POINTS = 1000  # fewer are no site
 
 _SHARES = {
-    "reading": 0.04, "cleaning and normals": 0.18, "ground": 0.07, "describing stations": 0.03,
-    "learned features": 0.53, "likelihood field": 0.15,
+    "reading": 0.04, "cleaning, finding normals": 0.18, "finding the ground": 0.07, "describing stations": 0.03,
+    "computing learned features": 0.53, "computing the likelihood field": 0.15,
 }  # fmt: skip
 """Of the time of a build, for its bar: as of a street survey of 0.2 km2."""
 
@@ -42,7 +42,7 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
 
         for view in VIEW_NAMES:  # before the clouds are read: they may be missing
             network(view)
-    shares = {name: share for name, share in _SHARES.items() if config.learned or name != "learned features"}
+    shares = {name: share for name, share in _SHARES.items() if config.learned or name != "computing learned features"}
     with staged_bar(shares, progress) as stage:
         return _build(sources, config, stage)
 
@@ -71,7 +71,7 @@ def _build(sources: list[Source], config: MapConfig, stage: Callable[[str], Prog
     shift = np.round(np.median(raw[:: max(1, len(raw) // 100_000)], axis=0).astype(np.float64) / 10.0) * 10.0
     raw -= shift.astype(np.float32)
 
-    step = stage("cleaning and normals")
+    step = stage("cleaning, finding normals")
     points = voxel_grid(raw, config.voxel)
     del raw
     step(1, 3)
@@ -85,7 +85,7 @@ def _build(sources: list[Source], config: MapConfig, stage: Callable[[str], Prog
     step(2, 3)
     normals, planarity = estimate_normals(points, config.normal_neighbours, config.normal_radius)
     step(3, 3)
-    step = stage("ground")
+    step = stage("finding the ground")
     stations = find_stations(points, config.block, config.levels)
     if not len(stations):
         raise MapError(
@@ -100,10 +100,10 @@ def _build(sources: list[Source], config: MapConfig, stage: Callable[[str], Prog
     if config.learned:
         from coview_stream.descriptors.feature_map import feature_arrays
 
-        step = stage("learned features")
+        step = stage("computing learned features")
         learned = feature_arrays(points, step)
     sorted_points, packed, index = sort_by_tile(points, scaled_normals(normals, planarity), config.tile)
-    step = stage("likelihood field")
+    step = stage("computing the likelihood field")
     made, _ = map_arrays(MemoryTile(config, sorted_points, packed, stations, described), MemoryArrays())
     step(1, 1)
     arrays: Arrays = {

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap.ground import ground_mask
-from coview_stream.basemap.progress import Progress
+from coview_stream.clouds.progress import Progress
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
 from coview_stream.errors import MapError

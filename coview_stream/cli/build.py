@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from coview_stream.cli.map_argument import check_map_name
-from coview_stream.errors import CoViewError
+from coview_stream.errors import CoViewError, warn
 
 if TYPE_CHECKING:
     from coview_stream.basemap.signature import SigningKey
@@ -156,7 +156,6 @@ def _build_file(
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.summary import summary
-    from coview_stream.errors import warn
 
     file_format.check_target(output)
     begin = time.perf_counter()
@@ -167,10 +166,7 @@ def _build_file(
         f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {output.stat().st_size} bytes"
         + ("" if key is None else f", signed with {key.fingerprint}")
     )
-    covered = summary(base_map)
-    for warning in covered.warnings:
-        warn(warning)
-    print(_told(covered, args.crs))
+    _tell(summary(base_map), args.crs)
     return 0
 
 
@@ -179,7 +175,6 @@ def _build_site(
 ) -> int:
     from coview_stream.basemap.site.executors import DaskExecutor, Executor, ProcessExecutor
     from coview_stream.basemap.site.site_build import build_site
-    from coview_stream.errors import warn
 
     begin = time.perf_counter()
     workers = args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1)
@@ -198,18 +193,17 @@ def _build_site(
         f"{site.nbytes} bytes" + ("" if key is None else f", signed with {key.fingerprint}")
     )
     print(f"{len(site.tiles)} tiles of {site.tile:g} m, {built.reused} as they were; manifest {site.sha256[:12]}")
-    covered = built.summary()
-    for warning in covered.warnings:
-        warn(warning)
-    print(_told(covered, args.crs))
+    _tell(built.summary(), args.crs)
     for line in built.skipped:
         print(f"left out: {line}", file=sys.stderr)
     return 1 if built.skipped else 0
 
 
-def _told(covered: MapSummary, crs: str | None) -> MapSummary:
-    """Return a summary that does not ask for the unit where ``--crs`` has stated it."""
-    return replace(covered, crs=f"unknown, converted from {crs}") if crs in ("feet", "us-feet") else covered
+def _tell(covered: MapSummary, crs: str | None) -> None:
+    """Print a summary, which does not ask for the unit where ``--crs`` has stated it."""
+    for warning in covered.warnings:
+        warn(warning)
+    print(replace(covered, crs=f"unknown, converted from {crs}") if crs in ("feet", "us-feet") else covered)
 
 
 @contextlib.contextmanager

@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
     """Convert, and print the sizes."""
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.progress import progress_bar
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.basemap.site.convert import join, lighten, split
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.errors import ConfigError, naming_missing_libraries
 
     key = None if args.sign is None else SigningKey(args.sign)

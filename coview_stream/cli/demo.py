@@ -124,34 +124,24 @@ def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
 
 def _offline(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
     """Localize the run without a network, frame by frame."""
-    from tqdm import tqdm
-
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.localization.offline import locate
-    from coview_stream.localization.result import Fix
 
-    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown, leave=False) as bar:
-
-        def step(done: int, total: int, fix: Fix | None) -> None:
-            bar.update(done - bar.n)
-            if fix is not None:
-                bar.set_postfix_str(fix.state.reported)
-
-        return locate(base_map, recorded, progress=step)
+    with progress_bar("locating", shown, "frame") as bar:
+        return locate(base_map, recorded, None, lambda done, total, fix: bar(done, total, fix and fix.state.reported))
 
 
 def _live(recorded: Run, out: Path, shown: bool, web: str | None) -> RunResult:
     """Serve, replay and watch the run as three processes; return what was published, frame by frame."""
-    from tqdm import tqdm
-
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.localization.offline import from_stream
 
     stamps = recorded.stamps.tolist()
-    with tqdm(total=len(recorded), desc="driving", unit="frame", disable=not shown, leave=False) as bar:
+    with progress_bar("driving", shown, "frame") as bar:
 
         def show(record: dict[str, Any]) -> None:
             if "counters" in record:
-                bar.update(int(record["counters"]["received"]) - bar.n)
-                bar.set_postfix_str(str(record["state"]))
+                bar(int(record["counters"]["received"]), len(stamps), str(record["state"]))
 
         (out / "logs").mkdir(exist_ok=True)
         recorded_live = record_live(out / "site.coview", recorded.path, out / "logs", show, web)

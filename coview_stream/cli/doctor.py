@@ -83,7 +83,7 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
 
 
 def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
-    from coview_stream.basemap.progress import progress_bar
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
     from coview_stream.doctor.finding import Finding, from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory

@@ -35,11 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the cloud, the names of its sources and the picture; print what was added."""
-    from tqdm import tqdm
-
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.config.mount import Mount
-    from coview_stream.errors import require_library
+    from coview_stream.errors import counted, require_library
     from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
     from coview_stream.fusion.fused_file import check_name, summary, write_fused, write_trajectories
     from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
@@ -69,14 +68,7 @@ def run(args: argparse.Namespace) -> int:
     runs = [LocalizedRun(pair, base_map, open_it, args.cloud_delay or 0.0) for pair in pairs]
     for note in (note for each in runs for note in each.notes):
         print(note, file=sys.stderr)
-    with tqdm(unit="frame", disable=not (args.progress or sys.stderr.isatty()), leave=False) as bar:
-
-        def follow(what: str, done: int, total: int) -> None:
-            if done == 1 and not bar.disable:
-                bar.reset(total)
-                bar.set_description(what)
-            bar.update(done - bar.n)
-
+    with progress_bar("fusing", args.progress or None, "frame") as follow:
         joint = None
         if args.joint:
             from coview_stream.fusion.joint import adjust
@@ -94,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if args.picture is not None:
         from coview_stream.fusion.fused_file import draw_fused
 
-        draw_fused(fused, args.picture, f"{args.map.stem} and {len(runs)} run{'s' * (len(runs) != 1)}")
+        draw_fused(fused, args.picture, f"{args.map.stem} and {counted(len(runs), 'run')}")
     print(summary(fused, [str(pair.run) for pair in pairs], args.changes))
     print(f"{args.output}: {len(fused):,} points; sources are named in {args.output.name}.json")
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,21 +81,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _ambiguity(base_map: BaseMap, acceptance: AcceptanceConfig, args: argparse.Namespace) -> object:
     """Return the map's ambiguity, numbers for JSON or a sentence; draw it if a picture is asked for."""
-    from tqdm import tqdm
-
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
     from coview_stream.localization.search.ambiguity import ambiguity
     from coview_stream.report import ambiguity as report
 
-    with tqdm(desc="looking", unit="place", disable=not sys.stderr.isatty(), leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            if done < bar.n:  # places to drive from, after those to look from
-                bar.reset(total)
-                bar.set_description("driving")
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with progress_bar("looking, then driving", unit="place") as step:
         found = ambiguity(base_map, LocalizerConfig(acceptance=acceptance), progress=step)
     if args.output:
         report.plot_ambiguity(found, base_map, args.output, args.map.name)

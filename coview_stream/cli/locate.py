@@ -40,14 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Localize and write; exit code 1 if no frame could be localized."""
-    from tqdm import tqdm
-
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.progress import progress_bar
+    from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import DESCRIPTORS_PNG, FILTERED, TRAJECTORY_PNG, locate, summary, write
-    from coview_stream.localization.result import Fix
     from coview_stream.odometry.lidar_odometry import LidarOdometry
     from coview_stream.recordings.open_run import open_run
     from coview_stream.report.export import chosen_formats, export, reference_for, trajectory_of
@@ -79,14 +76,10 @@ def run(args: argparse.Namespace) -> int:
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = replace(config, reloc=args.reloc if missing is None else "coview")
-    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown) as bar:
-
-        def step(done: int, total: int, fix: Fix | None) -> None:
-            bar.update(done - bar.n)
-            if fix is not None:
-                bar.set_postfix_str(fix.state.reported)
-
-        located = locate(base_map, recorded, config, step, guess, args.smooth)
+    with progress_bar("locating", shown, "frame") as bar:
+        located = locate(
+            base_map, recorded, config, lambda *at: bar(*at[:2], at[2] and at[2].state.reported), guess, args.smooth
+        )
     write(located, base_map, args.output)
     written = ["trajectory.tum", *([FILTERED] if args.smooth else []), "result.json"]
     if formats:

@@ -21,7 +21,7 @@ from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
 from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text, suffix_of
 from coview_stream.clouds.survey_unit import InMetres, SurveyUnit
-from coview_stream.errors import CloudError
+from coview_stream.errors import CloudError, counted, warn
 from coview_stream.geometry.arrays import Reals
 
 _FORMATS = {
@@ -65,18 +65,19 @@ def is_cloud_name(path: str | os.PathLike[str]) -> bool:
 def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Return the files that names, folders and patterns (``tiles/*.laz``) mean, in natural order within each.
 
-    A folder means the clouds directly in it, by their suffix. A named file is returned with any suffix, for its
-    reader to judge. CloudError if a folder or a pattern holds no cloud.
+    A folder means the clouds directly in it, by their suffix; those of its subfolders are warned of. A named file is
+    returned with any suffix, for its reader to judge. CloudError if a folder or a pattern holds no cloud.
     """
     out: list[Path] = []
     for path in map(Path, given):
         if path.is_dir():
             files = sorted(filter(is_cloud_name, path.iterdir()), key=natural_key)
+            within = sorted(filter(is_cloud_name, path.glob("*/**/*")))
             if not files:
-                folders = (folder for folder in sorted(path.iterdir()) if folder.is_dir())
-                within = next((folder for folder in folders if any(map(is_cloud_name, folder.iterdir()))), None)
-                remedy = "name another folder, or the files" if within is None else f"did you mean {within}?"
+                remedy = f"did you mean {within[0].parent}?" if within else "name another folder, or the files"
                 raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {remedy}")
+            if within:
+                warn(f"{path}: {counted(len(within), 'cloud')} in subfolders, not read: name {within[0].parent}, too?")
             out += files
         elif not path.exists() and glob.has_magic(str(path)):  # the shell has not expanded it
             names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern

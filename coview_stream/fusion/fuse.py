@@ -63,8 +63,8 @@ def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple
     return inside, tuple(cells[inside].astype(np.int64).T)
 
 
-Progress = Callable[[str, int, int], None]
-"""Called with (name of the step, frames done, frames)."""
+Progress = Callable[[int, int, str], None]
+"""Called with (frames done, frames, name of the step)."""
 
 _CHUNK = 500_000
 _LOOKS = 3  # through a point, before it counts as absent
@@ -167,7 +167,7 @@ def fuse(
             if frame is not None:
                 sightings.look(frame)
             if progress:
-                progress(f"rays of run {number}", done, len(run))
+                progress(done, len(run), f"rays of run {number}")
     through, seen = sightings.given(sightings.through), sightings.given(sightings.seen)
     n = len(points)
     moving = _seen_through(through[:n], seen[:n], _THROUGH_MOVING)
@@ -216,7 +216,7 @@ def _surfaces(
                 table.add(kernels.transform_unique(near, frame.T_map_body, config.voxel)[0], frame.stamp, source)
                 count += 1
             if progress:
-                progress(f"run {source}", done, len(run))
+                progress(done, len(run), f"run {source}")
         taken.append(count)
     return table, taken
 

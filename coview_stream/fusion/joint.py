@@ -114,7 +114,7 @@ def adjust(
     for number, run in enumerate(runs):
         submaps += submaps_of(run, number, base_map.origin)
         if progress:
-            progress("submaps", number + 1, len(runs))
+            progress(number + 1, len(runs), "submaps")
     registrar = Registrar(submaps, LocalMaps(base_map, 40.0))
     on_map = [constraint for k in range(len(submaps)) if (constraint := registrar.to_map(k))]
     pairs, candidates = [], overlapping(submaps)
@@ -123,7 +123,7 @@ def adjust(
         if constraint is not None:
             pairs.append(constraint)
         if progress:
-            progress("overlaps", done, len(candidates))
+            progress(done, len(candidates), "overlaps")
     held_out, used = pairs[::_HELD_OUT], [pair for k, pair in enumerate(pairs) if k % _HELD_OUT]
     steps = _odometry(submaps, on_map)
     before = np.array([submap.T_map_body for submap in submaps])

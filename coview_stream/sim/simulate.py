@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.clouds.files import write_cloud
+from coview_stream.clouds.progress import Progress, progress_bar
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config.checks import within
 from coview_stream.config.mount import Mount
@@ -127,19 +128,19 @@ def simulate(
     out = Path(out)
     with _staging(out, overwrite) as staging:
         scene = scene_of(config)
-        with _bar("airborne scan", 100, progress) as bar:
-            base = base_map(scene, config, bar.update)
+        with progress_bar("airborne scan", progress) as step:
+            base = base_map(scene, config, step)
         write_cloud(staging / "base.laz", base, origin=config.origin)
         stamps, truth, odometry = trajectories(scene, config)
         (staging / "run" / "frames").mkdir(parents=True)
         still = config.dirt.motion is None or SENSORS[config.sensor]().stop
         with (
             nullcontext() if still else Recording(staging / "sweeps") as recording,
-            _bar("drive", len(truth), progress) as bar,
+            progress_bar("drive", progress, "frame") as step,
         ):
             for k, points in enumerate(frames(scene, config, truth, odometry, recording)):
                 write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
-                bar.update()
+                step(k + 1, len(truth))
         write_tum(staging / "run" / "odometry.tum", stamps, odometry)
         in_map = truth.copy()
         in_map[:, :3, 3] += config.origin
@@ -157,11 +158,8 @@ def scene_of(config: SimulationConfig) -> Scene:
     return scene if years is None else aged(scene, years, _dirt_stream(config, Stream.YEARS))[0]
 
 
-def base_map(scene: Scene, config: SimulationConfig, step: Callable[[int], object] | None = None) -> Floats:
-    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added).
-
-    ``step`` is called with the per cent that were flown since the last call.
-    """
+def base_map(scene: Scene, config: SimulationConfig, step: Progress | None = None) -> Floats:
+    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added)."""
     dirt = config.dirt
     caster: MeshCaster = Caster(scene.mapped)
     if dirt.seasons is not None:
@@ -172,12 +170,11 @@ def base_map(scene: Scene, config: SimulationConfig, step: Callable[[int], objec
         uneven = _dirt_stream(config, Stream.DENSITY)
         thinning = None if dirt.density is None else Thinning(dirt.density, uneven)
         scanned = spoilt_strips(scanned, dirt.strips, thinning, _dirt_stream(config, Stream.STRIPS))
-    strips, before = [], 0
+    strips = []
     for done, points in scanned:
         strips.append(points)
         if step is not None:
-            step(int(100 * done) - before)
-        before = int(100 * done)
+            step(int(100 * done), 100)
     if scene.passage is not None:
         strips.append(_indoors(scene, scene.passage, _stream(config, _INDOORS)))
     return np.concatenate(strips)
@@ -280,11 +277,3 @@ def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
         raise InputError(f"{out}: cannot be written ({reason}); check the path and the disk") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-
-
-def _bar(phase: str, total: int, shown: bool) -> Any:
-    """Return a progress bar on stderr, a context manager; none unless ``shown``."""
-    from tqdm import tqdm
-
-    layout = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left"
-    return tqdm(total=total, desc=phase, leave=False, disable=not shown, bar_format=layout)

@@ -11,7 +11,7 @@ import pytest
 from coview_stream.clouds import merge, read_cloud, write_cloud
 from coview_stream.clouds.files import expand_cloud_paths
 from coview_stream.clouds.pcd import lzf_decompress
-from coview_stream.errors import CloudError
+from coview_stream.errors import CloudError, CoViewWarning
 
 POINTS = np.random.default_rng(1).normal(0, 20, (300, 3)).astype(np.float32)
 UTM = np.array([351_154.5, 4_025_876.25, 14.0])
@@ -145,6 +145,9 @@ def test_patterns_and_names_may_be_mixed_and_named_files_are_left_to_their_reade
 
 def test_folder_or_pattern_without_clouds_says_so(folder, tmp_path):
     with pytest.raises(CloudError, match=r"holds no cloud .*did you mean .*tiles\?"):
+        expand_cloud_paths([tmp_path])
+    (tmp_path / "site.laz").touch()
+    with pytest.warns(CoViewWarning, match="3 clouds in subfolders, not read"):
         expand_cloud_paths([tmp_path])
     (tmp_path / "empty").mkdir()
     with pytest.raises(CloudError, match=r"holds no cloud .*name another folder"):

@@ -17,7 +17,6 @@ from coview_kernels import StationCodes
 from coview_stream.basemap.file_format import MAX_AREA, Arrays
 from coview_stream.basemap.likelihood_field import LAYERS, field_arrays, layers_arrays
 from coview_stream.basemap.map_arrays import TOO_LARGE, EarlierMap, cells_of, map_arrays
-from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.layers import decode, most_bytes, read_cloud_layer, read_stations_layer
 from coview_stream.basemap.site.manifest import Manifest, TileEntry
@@ -25,6 +24,7 @@ from coview_stream.basemap.site.site_grid import HALO, SiteGrid
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.stations import Described, describe_storeys
 from coview_stream.basemap.tiles import Key, sort_by_tile, unit_normals
+from coview_stream.clouds.progress import Progress
 from coview_stream.config import MapConfig, config_of_map
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints

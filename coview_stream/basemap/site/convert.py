@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.file_format import Arrays, check_target, save
-from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, assemble, layer_of
@@ -25,6 +24,7 @@ from coview_stream.basemap.site.site_grid import TILE, SiteGrid
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.basemap.site.tile_build import put_layer, write_tile
 from coview_stream.basemap.tiles import Key, unit_normals
+from coview_stream.clouds.progress import Progress
 from coview_stream.config import config_of_map
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats32, Int8s, Ints

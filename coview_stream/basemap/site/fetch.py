@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-from coview_stream.basemap.progress import Progress
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.manifest import (
     FILE,
@@ -31,6 +30,7 @@ from coview_stream.basemap.site.manifest import (
 from coview_stream.basemap.site.site_grid import Around, part_file
 from coview_stream.basemap.site.store import TileStore, cache_bound, cache_folder, evict, layer_path
 from coview_stream.clouds.fetch import open_web_file
+from coview_stream.clouds.progress import Progress
 from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
 
 _PIECE = 1 << 20

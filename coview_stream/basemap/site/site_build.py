@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from coview_stream.basemap.ground import ground_filter
-from coview_stream.basemap.progress import Progress, staged_bar
 from coview_stream.basemap.signature import SigningKey
 from coview_stream.basemap.site.executors import Executor
 from coview_stream.basemap.site.manifest import Manifest, TileEntry, in_order, is_site
@@ -24,6 +23,7 @@ from coview_stream.basemap.site.tile_build import Parts, ThinJob, TileJob, build
 from coview_stream.basemap.sources import Given, Source, short_names, sources_of, warn_of_other_systems
 from coview_stream.basemap.summary import MapSummary, too_thin
 from coview_stream.clouds.cloud_head import CloudHead, check_together
+from coview_stream.clouds.progress import Progress, staged_bar
 from coview_stream.clouds.reference_system import short_name
 from coview_stream.config import MapConfig, config_of_map
 from coview_stream.errors import CoViewError, InputError, MapError, warn
@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats
 WORK = ".build"
 """Folder in a site's directory for intermediate results; its small records stay after the build."""
 
-_SHARES = {"looking": 0.01, "measuring": 0.04, "reading": 0.15, "thinning": 0.15, "building tiles": 0.65}
+_SHARES = {"reading heads": 0.01, "finding extents": 0.04, "reading": 0.15, "thinning": 0.15, "building tiles": 0.65}
 """Of the time of a build, for its bar."""
 
 _MIN_POINTS = 1000  # as for a map in one file
@@ -176,7 +176,7 @@ def check_directory(directory: Path) -> None:
 def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], Floats, Floats]:
     """Return the readable sources, and the corners of their extent."""
     names = list(sources)
-    heads = run("looking", Source.head, list(sources.values()), names)
+    heads = run("reading heads", Source.head, list(sources.values()), names)
     usable = {name: source for name, source in sources.items() if name not in run.left_out}
     if not usable:
         raise MapError(f"{names[0]}: no source could be read")
@@ -184,7 +184,7 @@ def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], F
     warn_of_other_systems(list(usable.values()), heads)
     unknown = [source for source, head in zip(usable.values(), heads, strict=True) if head.low is None]
     extents = [(head.low, head.high) for head in heads if head.low is not None and head.high is not None]
-    measured = run("measuring", extent_of, unknown, [str(source.path) for source in unknown])
+    measured = run("finding extents", extent_of, unknown, [str(source.path) for source in unknown])
     lows, highs = zip(*extents, *measured, strict=True)
     return usable, np.min(lows, axis=0), np.max(highs, axis=0)
 

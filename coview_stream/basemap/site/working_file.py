@@ -12,7 +12,6 @@ from pathlib import Path
 from coview_stream.basemap.file_format import Arrays, Loaded, check_arrays, open_file, save
 from coview_stream.basemap.likelihood_field import FIELD_ARRAYS, LAYERS
 from coview_stream.basemap.map_arrays import EarlierMap
-from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey
 from coview_stream.basemap.site.array_files import ArrayFiles
 from coview_stream.basemap.site.assemble import PARAMETER, VERSION, assemble, field_layers
@@ -31,6 +30,7 @@ from coview_stream.basemap.site.store import (
     write_record,
 )
 from coview_stream.basemap.tiles import Key
+from coview_stream.clouds.progress import progress_bar
 from coview_stream.config import Channel, config_of_map
 from coview_stream.errors import CoViewError, MapError, warn
 

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
-from coview_stream.basemap.progress import Progress
+from coview_stream.clouds.progress import Progress
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.descriptors.coview import EYE
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices, Ints

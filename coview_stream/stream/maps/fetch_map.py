@@ -12,10 +12,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from coview_stream.basemap.joined import JOINED_SUFFIX
-from coview_stream.basemap.progress import progress_bar
 from coview_stream.basemap.signature import VerifyKey, read_verify_key
 from coview_stream.basemap.site.fetch import Mirror, ObjectStoreSource, SiteSource, WebSource
 from coview_stream.basemap.site.site_grid import PART_SUFFIX, Around
+from coview_stream.clouds.progress import progress_bar
 from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import ConfigError
 from coview_stream.stream.maps.zenoh_source import ZenohSource

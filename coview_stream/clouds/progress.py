@@ -1,4 +1,4 @@
-"""Progress of long work on maps, and its bar on stderr."""
+"""Progress of long work, and its bar on stderr."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ Progress = Callable[[int, int], None]
 
 
 @contextmanager
-def progress_bar(title: str, show: bool | None = None, unit: str = "", scale: bool = False) -> Iterator[Progress]:
-    """Show a bar on stderr, and yield the function that moves it.
+def progress_bar(
+    title: str, show: bool | None = None, unit: str = "", scale: bool = False
+) -> Iterator[Callable[..., None]]:
+    """Show a bar on stderr, and yield the function that moves it: a :data:`Progress`; a third argument is a note.
 
     Args:
         title: of the bar.
@@ -28,9 +30,11 @@ def progress_bar(title: str, show: bool | None = None, unit: str = "", scale: bo
     shown = sys.stderr.isatty() if show is None else show
     with tqdm(total=1, desc=title, unit=unit, unit_scale=scale, disable=not shown, leave=False) as bar:
 
-        def step(done: int, total: int) -> None:
+        def step(done: int, total: int, note: str | None = None) -> None:
             bar.total = total
             bar.update(done - bar.n)
+            if note is not None:
+                bar.set_postfix_str(note)
 
         yield step
 
@@ -55,7 +59,7 @@ def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[st
             before = sum(share for name, share in list(shares.items())[: list(shares).index(stage)])
             bar.set_description(stage)
             if show and not terminal and (seconds := time.monotonic() - start) > _SHORT:
-                sys.stderr.write(f"{stage}, {seconds:.0f} s after the start\n")
+                sys.stderr.write(f"after {seconds:.0f} s: {stage}\n")
                 sys.stderr.flush()
             bar.update(max(0.0, before - bar.n))
 
