@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,13 @@ def summary(result: Ambiguity, base_map: BaseMap) -> str:
     """Summarize in one line the shares of stations from which a robot is found at once, later, and not."""
     if not len(result):
         return "no stations"
-    never = float(np.isinf(result.drive).mean())
-    parts = [f"{_percent(result.share(0.0))} of {len(result):,} places are told apart at once"]
-    later = float(np.isfinite(result.drive).mean()) - result.share(0.0)
-    if later > 0.0:
-        metres = float(np.max(result.drive[np.isfinite(result.drive)]))
-        parts.append(f"{_percent(later)} after driving up to {metres:.0f} m")
-    if never > 0.0:
-        parts.append(f"{_percent(never)} stay ambiguous for {FARTHEST:.0f} m or to the end of the way")
+    metres = float(np.max(result.drive, initial=0.0, where=np.isfinite(result.drive)))
+    at_once, later, never = _percents([result.share(0.0), result.share(metres), 1.0])
+    parts = [f"{at_once} of {len(result):,} places are told apart at once"]
+    if metres > 0.0:
+        parts.append(f"{later} after driving up to {metres:.0f} m")
+    if np.isinf(result.drive).any():
+        parts.append(f"{never} stay ambiguous for {FARTHEST:.0f} m or to the end of the way")
     text = ", ".join(parts)
     if result.wrong.any():
         text += f"; at {int(result.wrong.sum())} another place would be taken"
@@ -46,7 +46,7 @@ def summary(result: Ambiguity, base_map: BaseMap) -> str:
     if slow.any():
         x, y = _worst(result, slow) + base_map.origin[:2]
         text += f"; worst around {x:.0f}, {y:.0f}"
-    return f"{text} (risk {result.risk:g}, {_percent(result.changed)} of the site presumed changed)"
+    return f"{text} (risk {result.risk:g}, {_percents([result.changed])[0]} of the site presumed changed)"
 
 
 def facts(result: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
@@ -85,11 +85,10 @@ def plot_ambiguity(result: Ambiguity, base_map: BaseMap, path: str | os.PathLike
         shift = draw_base_map(axes, base)
         at = result.position + base_map.origin - shift
         size = float(np.clip(16_000.0 / max(len(at), 1), 6.0, 30.0))
-        before = -math.inf
-        for limit, colour in _LIMITS.items():
+        before, shares = -math.inf, _percents([result.share(limit) for limit in _LIMITS])
+        for (limit, colour), share in zip(_LIMITS.items(), shares, strict=True):
             here = (result.drive > before) & (result.drive <= limit)
-            label = f"{_name(before, limit)}: {_percent(float(here.mean()) if len(result) else 0.0)}"
-            before = limit
+            label, before = f"{_name(before, limit)}: {share}", limit
             if here.any():
                 axes.scatter(at[here, 0], at[here, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
         if not len(result):
@@ -112,11 +111,8 @@ def _worst(result: Ambiguity, slow: Bools) -> Floats:
     return np.asarray(np.median(xy[worst], axis=0))
 
 
-def _percent(share: float) -> str:
-    """Format a share; "0 %" and "100 %" mean none and all."""
-    percent = 100.0 * share
-    if 0.0 < percent < 0.5:
-        return "under 1 %"
-    if 99.5 <= percent < 100.0:
-        return "over 99 %"
-    return f"{percent:.0f} %"
+def _percents(until: Sequence[float]) -> list[str]:
+    """Format the parts of a whole, given the shares up to the end of each, so that they add up; "0 %" means none."""
+    parts = zip(np.diff(until, prepend=0.0), np.diff(np.rint(100.0 * np.array(until)), prepend=0.0), strict=True)
+    limits = {0.0: "under 1 %", 100.0: "over 99 %"}
+    return [limits.get(part, f"{part:.0f} %") if 0.0 < share < 1.0 else f"{part:.0f} %" for share, part in parts]
