@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap, station_descriptors
 from coview_stream.basemap.file_format import release_arrays
-from coview_stream.errors import InputError, naming_missing_libraries
+from coview_stream.errors import InputError, counted, naming_missing_libraries
 from coview_stream.geometry.arrays import Bools, Floats, Reals
 from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, RunResult
 from coview_stream.report.evaluation import MAX_ROTATION, MAX_TRANSLATION
@@ -196,11 +196,12 @@ def plot_trajectory(
             line = np.asarray(truth, dtype=np.float64) - shift
             axes.plot(line[:, 0], line[:, 1], color=TRUTH, linewidth=1.0, linestyle=(0, (4, 2)), label="truth")
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
+        _draw_line(axes, positions[:, :2] - shift[:2], drawn)
         if places is not None:
             _draw_places(axes, np.asarray(places, dtype=np.float64), shift)
         elif not drawn.any():
             draw_notice(axes, "not localized: no frame has a pose")
-        axes.set_title("Trajectory")
+        axes.set_title("Trajectory" if drawn.any() else "Not localized")
         legend_below(drawing, axes)
 
 
@@ -212,7 +213,7 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
             continue
         at = positions[here & drawn]
         without = int((here & ~drawn).sum())
-        label = f"{name}: {int(here.sum())} frames" + (f", {without} without a pose" if without else "")
+        label = f"{name}: {counted(int(here.sum()), 'frame')}" + (f", {without} without a pose" if without else "")
         colour = STATE_COLOURS.get(str(name), ACCENT)
         axes.scatter(at[:, 0], at[:, 1], s=12, color=colour, linewidths=0, label=label, zorder=3)
     if drawn.any():
@@ -220,12 +221,25 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
         axes.scatter(x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
 
 
+def _draw_line(axes: Any, positions: Reals, drawn: Bools) -> None:
+    """Join positions (K, 2), NaN where there is none: with a dotted line there, behind a cross where poses end."""
+    lost, ends = STATE_COLOURS["LOST"], positions[:-1][drawn[:-1] & ~drawn[1:]]
+    axes.plot(*positions[drawn].T, color=lost, linestyle=":", zorder=1)
+    axes.plot(*positions.T, color=STATE_COLOURS["TRACKING"], zorder=2)
+    if len(ends):
+        label = f"poses end ({len(ends)} x), dotted to the next"
+        axes.scatter(*ends.T, s=70, marker="x", color=lost, label=label, zorder=4)
+
+
 def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
     """Draw places (P, 6) as discs, the larger the more probable, with a line ahead, as long as 3 % of the picture."""
     places = places[places[:, 4] >= _UNLIKELY * places[0, 4]]
     x, y, yaw, probability = places[:, 0] - shift[0], places[:, 1] - shift[1], places[:, 3], places[:, 4]
-    label = f"places that the last frame may be at, the first with {probability[0]:.0%}"
+    label = "places that may fit, no pose; probability"
     style = {"color": STATE_COLOURS["AMBIGUOUS"], "zorder": 4}
+    for *at, p in zip(x, y, probability, strict=True):
+        text = f"{p:.0%}" if p >= 0.005 else "<1%"
+        axes.annotate(text, at, (6, 4), textcoords="offset points", fontsize=8, zorder=5)
     axes.scatter(x, y, s=20.0 + 200.0 * probability, edgecolors=TRUTH, linewidths=0.6, label=label, **style)
     axes.quiver(x, y, np.cos(yaw), np.sin(yaw), scale=30, width=0.004, headwidth=3, **style)
 

@@ -55,6 +55,9 @@ def test_trajectory_is_coloured_by_state(base, tmp_path):
     picture = pixels(tmp_path / "t.png")
     assert has_colour(picture, plots.STATE_COLOURS["TRACKING"])
     assert not has_colour(picture, plots.STATE_COLOURS["LOST"])
+    line[20:25] = np.nan
+    plots.plot_trajectory(base, line, states, tmp_path / "interrupted.png")
+    assert has_colour(pixels(tmp_path / "interrupted.png"), plots.STATE_COLOURS["LOST"])
 
 
 def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, said):
