@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from coview_stream.report.evaluation import ErrorStats, Evaluation
 from coview_stream.cli.options import add_shared
+from coview_stream.errors import InputError, counted
 
 HELP = "compare a trajectory with the truth: errors, success, share localized, false frames"
 
@@ -30,13 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the evaluation; exit code 0 for a bad trajectory, too: the comparison is done."""
     from coview_stream.clouds.trajectory import read_tum
-    from coview_stream.errors import InputError
     from coview_stream.report.evaluation import constant_offset, evaluate, frame_errors
 
     estimate, truth = read_tum(args.estimate), read_tum(args.truth)
     if not len(truth[0]):
         raise InputError(f"{args.truth}: holds no pose; give the trajectory that was really driven")
     evaluation = evaluate(estimate, truth)
+    if evaluation.unmatched and not evaluation.posed:
+        fault = "have no stamp in common: is the truth of this run, and in seconds of the same clock?"
+        raise InputError(f"{args.estimate} and {args.truth} {fault}")
     if args.plot is not None:
         from coview_stream.report.plots import plot_errors
 
@@ -53,19 +56,17 @@ def table(evaluation: Evaluation) -> str:
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     rows = [
         ("success", "yes" if evaluation.success else "no"),
-        ("localized", f"{evaluation.share_localised:.1%} of {evaluation.frames} frames"),
-        ("false frames", f"{evaluation.false_frames} of {evaluation.posed} poses"),
+        ("localized", f"{evaluation.share_localised:.1%} of {counted(evaluation.frames, 'frame')}"),
+        ("false frames", f"{evaluation.false_frames} of {counted(evaluation.posed, 'pose')}"),
         ("first pose", first),
     ]
     if evaluation.unmatched:
-        rows.append(("not compared", f"{evaluation.unmatched} poses without a true one at that time"))
+        rows.append(("not compared", f"{counted(evaluation.unmatched, 'pose')} without a true one at that time"))
     if evaluation.translation and evaluation.rotation:
         rows.append(("translation error", _errors_text(evaluation.translation, "m")))
         rows.append(("rotation error", _errors_text(evaluation.rotation, "deg")))
     if evaluation.false_frames:
         rows.append(("worst pose", f"{evaluation.worst_t_m:.2f} m, {evaluation.worst_r_deg:.2f} deg"))
-    if evaluation.unmatched and not evaluation.posed:
-        rows.append(("stamps", "none in common: is the truth of this run, and in seconds of the same clock?"))
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
 
 

@@ -40,9 +40,14 @@ def test_empty_trajectory_is_never_localized(truth, tmp_path, capsys):
     assert (tmp_path / "errors.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("content", ["", "1 2 3\n", "nonsense\n", None])
+OTHER_RUN = "1700000000 0 0 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize("content", ["", "1 2 3\n", "nonsense\n", None, OTHER_RUN])
 def test_bad_ground_truth_is_one_line(truth, tmp_path, refused, content):
     bad = tmp_path / "bad.tum"
     if content is not None:
         bad.write_text(content)
-    assert "bad.tum" in refused("eval", truth, bad)
+    error = refused("eval", truth, bad)
+    assert "bad.tum" in error
+    assert ("truth.tum and " in error) == (content == OTHER_RUN)
