@@ -25,7 +25,7 @@ def main(base: Path, scan: Path) -> Fix:
     if fix.T_map_body is None:
         print(f"{fix.state.reported}: {fix.evidence.reason if fix.evidence else 'no evidence'}")
     else:
-        print(f"{fix.state.reported}, wrong {one_in(1.0 - fix.confidence)}; from the scan's frame into the map's:")
+        print(f"{fix.state.reported}, wrong {one_in(1.0 - fix.confidence)}; from the levelled scan into the map:")
         print(fix.T_map_body.round(3))
     return fix
 

@@ -19,7 +19,7 @@ from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
-from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.errors import CloudError, InputError, RunError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import LEVELS, ProtectionLevel, one_in
 from coview_stream.geometry.transforms import Poses, pose_from, pose_from_tum
@@ -217,7 +217,7 @@ class RunResult:
             "reason": self.reason or None,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
-            "calibration": calibration_json(self.calibration, evidence, self.mount),
+            "calibration": calibration_json(self.calibration, evidence, self.mount, self.frames == 1),
             "mount": None if self.mount is None else self.mount.to_json(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "confidence": None if self.first is None else self.first.confidence,
@@ -375,7 +375,8 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
 def summary(located: RunResult) -> str:
     """Sum up a result in a few lines for a person."""
     posed = located.posed
-    lines = [f"{'state':<18} {located.state.reported}", f"{'localized':<18} {len(posed)} of {located.frames} frames"]
+    share = f"{len(posed)} of {counted(located.frames, 'frame')}"
+    lines = [f"{'state':<18} {located.state.reported}", f"{'localized':<18} {share}"]
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
@@ -386,20 +387,20 @@ def summary(located: RunResult) -> str:
             counts = Counter(pose.kind for pose in located.smoothed)
             lines.append(f"{'smoothed':<18} {', '.join(f'{counts[kind]} {_KINDS[kind]}' for kind in PoseKind)}")
         if located.calibration is not None:
-            says = calibration_says(located.calibration, located.fixes[-1].evidence, located.mount)
+            says = calibration_says(located.calibration, located.fixes[-1].evidence, located.mount, located.frames == 1)
             lines.extend(f"{'calibration':<18} {clause}" for clause in says)
     elif located.reason:
         lines.append(f"{'reason':<18} {located.reason}")
     begin = located.fixes[0].stamp if located.fixes else 0.0
     for cause, told in located.faults.items():
-        span = f"{told.frames} frames from {told.first - begin:.1f} s to {told.last - begin:.1f} s"
+        span = f"{counted(told.frames, 'frame')} from {told.first - begin:.1f} s to {told.last - begin:.1f} s"
         never_mended = cause is RejectionReason.CONVENTIONS and bool(posed) and posed[-1].stamp < told.last
         doubtful = "; poses before it are not to be trusted" * never_mended
         lines.append(f"{'FAULT ' + cause.value:<18} {span}: {told.reason}{doubtful}")
     if located.smoothed is not None and not posed:
         lines.append(f"{'smoothed':<18} nothing: there was no fix to smooth from")
     if located.skipped:
-        lines.append(f"{'skipped':<18} {len(located.skipped)} frames; first: {located.skipped[0]}")
+        lines.append(f"{'skipped':<18} {counted(len(located.skipped), 'frame')}; first: {located.skipped[0]}")
     if located.seconds:
         p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
         lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
@@ -423,7 +424,7 @@ def _interrupted(located: RunResult) -> list[str]:
     gaps, begin = located.interruptions, located.fixes[0].stamp
     longest = sorted(gaps, key=lambda gap: -gap.frames)[:_TOLD]
     lines = [
-        f"{gap.frames} frames from {gap.first - begin:.1f} s to {gap.last - begin:.1f} s: {gap.reason}"
+        f"{counted(gap.frames, 'frame')} from {gap.first - begin:.1f} s to {gap.last - begin:.1f} s: {gap.reason}"
         for gap in gaps
         if gap in longest
     ]

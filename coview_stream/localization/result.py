@@ -102,19 +102,22 @@ class KeyframeEvidence:
 
 
 def calibration_says(
-    calibration: Calibration, evidence: KeyframeEvidence | None, mount: Mount | None = None
+    calibration: Calibration, evidence: KeyframeEvidence | None, mount: Mount | None = None, one_scan: bool = False
 ) -> list[str]:
     """Return the clauses of a calibration; none while clouds or odometry are at fault, which may have spoilt it."""
-    return [] if evidence is not None and evidence.cause in FAULTS else calibration.describe(mount)
+    return [] if evidence is not None and evidence.cause in FAULTS else calibration.describe(mount, one_scan)
 
 
 def calibration_json(
-    calibration: Calibration | None, evidence: KeyframeEvidence | None, mount: Mount | None = None
+    calibration: Calibration | None,
+    evidence: KeyframeEvidence | None,
+    mount: Mount | None = None,
+    one_scan: bool = False,
 ) -> dict[str, Any] | None:
     """Plain data of a calibration, None for none; ``says`` are its clauses beside the newest ``evidence``."""
     if calibration is None:
         return None
-    return calibration.to_json() | {"says": calibration_says(calibration, evidence, mount)}
+    return calibration.to_json() | {"says": calibration_says(calibration, evidence, mount, one_scan)}
 
 
 def _number(value: float | None, form: str) -> float | None:

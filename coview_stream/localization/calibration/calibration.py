@@ -38,6 +38,7 @@ _MOVED = {
     "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
 }  # fmt: skip
 """Least sigmas of a calibration from before the node started."""
+_ONE_SCAN = "is it the vehicle or the sensor? set --mount only if the lean stays in a run with odometry"
 HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
 """Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
 _RANGES = {
@@ -179,10 +180,10 @@ class Calibration:
         moved = (grown * _ACCELERATION) ** 2
         return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])
 
-    def describe(self, mount: Mount | None = None) -> list[str]:
+    def describe(self, mount: Mount | None = None, one_scan: bool = False) -> list[str]:
         """Return one clause of text per noticeable correction.
 
-        Signs are as in ``--mount``; ``mount`` is already applied to the clouds.
+        Signs are as in ``--mount``; ``mount`` is already applied to the clouds. Of ``one_scan`` no motion was seen.
         """
         clauses: list[str] = []
         given = mount or Mount()
@@ -200,7 +201,8 @@ class Calibration:
             if abs(angle) >= _LEAN
         ]
         if leans:
-            clauses.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; {remedy}")
+            whose, advice = ("cloud", _ONE_SCAN) if one_scan else ("sensor", remedy)
+            clauses.append(f"{whose} leans {' and '.join(leans)}{beyond}: corrected; {advice}")
         if abs(self.heading) >= max(_TURNED, _TOLD * self.sigma_heading):
             side = "left" if self.heading > 0 else "right"
             angle = f"{abs(math.degrees(self.heading)):.1f} +- {math.degrees(self.sigma_heading):.1f} deg"

@@ -31,6 +31,7 @@ def test_lean_is_reported_as_the_mount_that_silences_it():
     leaning = Calibration(pitch=np.radians(2.9))
     assert leaning.describe() == ["sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0,0,0,0 to silence this"]
     assert "--mount=180,2.9,0,0,0,0 " in leaning.describe(Mount(roll=np.pi))[0]
+    assert "is it the vehicle or the sensor?" in leaning.describe(one_scan=True)[0]
 
 
 @pytest.mark.parametrize(
