@@ -11,6 +11,7 @@ from hypothesis import settings
 from trackers import follow
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.cli import main
 from coview_stream.clouds.files import write_cloud
 from coview_stream.localization.localizer import Localizer
 
@@ -144,3 +145,19 @@ def world_run(world_drive, tmp_path_factory):
 def elsewhere_run(elsewhere, tmp_path_factory):
     """A run outside the map, on disk; read only."""
     return small_world.write_run(tmp_path_factory.mktemp("elsewhere") / "run", elsewhere, 3)
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must be refused: exit code 2, one line on stderr, which is returned, and nothing on stdout."""
+
+    def run(*words):
+        capsys.readouterr()
+        assert main([*map(str, words)]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("coview-stream: error: ")
+        assert captured.err.count("\n") == 1
+        return captured.err
+
+    return run

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import re
+import shutil
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -50,26 +53,37 @@ def run(args: argparse.Namespace) -> int:
         if topic in known:
             print(f"\nits page: `{PROGRAM} help {topic}.md`")
     elif topic.removesuffix(".md") in known:
-        print(known[topic.removesuffix(".md")].read_text(encoding="utf-8"), end="")
+        print(readable(known[topic.removesuffix(".md")].read_text(encoding="utf-8")))
     else:
         remedy = did_you_mean(topic, list(dict.fromkeys([*COMMANDS, *known])))
-        if (page := page_about(topic)) is not None:
+        if (page := page_titled(topic)) is not None:
             near = f"{remedy} or " if remedy.endswith("?") else ""
             remedy = f"{near}see `{PROGRAM} help {page}.md`"
         raise ConfigError(f"no command or page is called {topic!r}; {remedy}")
     return 0
 
 
-def page_about(word: str) -> str | None:
-    """Return the page with a word in a section's title, else the one that has it most often; None if none has."""
-    word, found = _squeezed(word), dict[str, tuple[bool, int]]()
+def readable(page: str) -> str:
+    """Return a page for a terminal: links by their names, a table's rows as paragraphs, a line for each cell."""
+    lines, names = list[str](), list[str]()
+    for line in re.sub(r"!?\[([^\]]*)\]\((?!http)[^)\s]*\)", r"\1", page).splitlines():
+        cells = [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        if not line.startswith("|"):
+            lines, names = [*lines, line], []
+        elif not names:
+            names = ["", *(f"{cell}: " if cell else "" for cell in cells[1:])]
+        elif not set(line) <= set("|-: "):
+            width = shutil.get_terminal_size().columns
+            for name, cell, first in zip(names, cells, ("", *["    "] * len(cells)), strict=False):
+                lines += textwrap.wrap(name + cell, width, initial_indent=first, subsequent_indent="    ")
+            lines.append("")
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(lines))
+
+
+def page_titled(word: str) -> str | None:
+    """Return the first page with a word in a title, whose blanks do not count: ros2 is ROS 2; None if none has it."""
     for name, path in pages().items():
-        text = path.read_text(encoding="utf-8")
-        titles = [line for line in text.splitlines() if line.startswith("##")]
-        found[name] = any(word in _squeezed(title) for title in titles), _squeezed(text).count(word)
-    best = max(found, key=lambda name: found[name], default=None)
-    return None if best is None or found[best] == (False, 0) else best
-
-
-def _squeezed(text: str) -> str:
-    return "".join(text.split()).casefold()  # ros2 is ROS 2
+        titles = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+        if any(word.casefold() in "".join(title.split()).casefold() for title in titles):
+            return name
+    return None

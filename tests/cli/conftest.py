@@ -1,4 +1,4 @@
-"""Refusals of the command line."""
+"""Commands as processes, and another in the place of one."""
 
 import contextlib
 import subprocess
@@ -7,24 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from coview_stream.cli import main
 from coview_stream.clouds.python_child import python_command, python_environment
-
-
-@pytest.fixture
-def refused(capsys):
-    """Run a command that must be refused: exit code 2, one line on stderr, which is returned, and nothing on stdout."""
-
-    def run(*words):
-        capsys.readouterr()
-        assert main([*map(str, words)]) == 2
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith("coview-stream: error: ")
-        assert captured.err.count("\n") == 1
-        return captured.err
-
-    return run
 
 
 @pytest.fixture

@@ -153,11 +153,8 @@ def test_invalid_simulation_config_is_refused(field, value):
     "options",
     [["--scene", "moon"], ["--size", "5"], ["--utm", "--origin", "1", "2", "3"], ["--drift", "-1"], ["--seed", "x"]],
 )
-def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, capsys):
-    assert main(["simulate", str(tmp_path / "w"), *options]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("coview-stream: error: ")
-    assert err.count("\n") == 1
+def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, refused):
+    refused("simulate", tmp_path / "w", *options)
     assert list(tmp_path.iterdir()) == []
 
 
