@@ -36,7 +36,7 @@ def test_las_has_sources_stamps_and_reference_system(site, world_run, tmp_path, 
     assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", "-o", str(out), *more]) == 0
     assert (tmp_path / "f.png").stat().st_size > 10_000
     said = capsys.readouterr().out
-    assert "1 frames without a pose" in said
+    assert "1 frame without a pose" in said
     assert "blind spots" in said
     las = laspy.read(out)
     assert las.header.parse_crs().to_epsg() == 25832
