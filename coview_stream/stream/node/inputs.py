@@ -293,7 +293,7 @@ class Inputs:
         if counters.engine_errors:
             return f"frames at which the engine failed: {counters.engine_errors}; see errors"
         if counters.rejected:
-            return f"{counters.rejected} frames were of no use; see errors"
+            return f"frames of no use: {counters.rejected}; see errors"
         if counters.late or counters.no_odometry:
             return "odometry and clouds have no common stamps: are both of one clock?"
         return "no frame has been processed yet"

@@ -140,7 +140,7 @@ def test_slow_send_does_not_delay_later_deadlines(run):
     assert times == pytest.approx([0.0, 0.17, 0.2, 0.35])
     assert list(report.late_ms) == pytest.approx([0, 70, 0, 0], abs=1e-6)
     assert report.put_ms[0] == pytest.approx(170)
-    assert "1 frames were sent more than 20 ms late" in report.text()
+    assert "more than 20 ms late: 1 frame;" in report.text()
 
 
 def test_replay_stops_when_cancelled(run):
@@ -180,7 +180,7 @@ def test_single_cloud_is_replayed(run_folder):
     single = open_run(run_folder / "frames" / "000002.ply")
     report, sent = recorded(single, ReplayConfig())
     assert [kind for _, kind, _ in sent] == ["odom", "cloud"]
-    assert report.text().startswith("1 frames and 1 odometry")
+    assert report.text().startswith("1 frame and 1 odometry")
     _, sent = recorded(single, ReplayConfig(loop=True), TestClock(end=0.35))
     clouds = [m.stamp_ns for _, kind, m in sent if kind == "cloud"]
     assert clouds == [0, 100_000_000, 200_000_000, 300_000_000]

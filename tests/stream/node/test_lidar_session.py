@@ -112,7 +112,7 @@ def test_before_the_first_pose_the_reason_names_clouds_not_odometry(robot):
     robot.saw(0.0)
     assert robot.session.state()[1] == "no frame has been processed yet"
     robot.session.handle_failure(robot.session.take_job("odometry"), "no ground to take gravity from", rejected=True)
-    assert robot.session.state()[1] == "1 frames were of no use; see errors"
+    assert robot.session.state()[1] == "frames of no use: 1; see errors"
 
 
 def test_lidar_odometry_restart_restarts_search():
