@@ -77,7 +77,7 @@ def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
                 remedy = f"did you mean {within[0].parent}?" if within else "name another folder, or the files"
                 raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {remedy}")
             if within:
-                warn(f"{path}: {counted(len(within), 'cloud')} in subfolders, not read: name {within[0].parent}, too?")
+                warn(f"{path}: {counted(len(within), 'cloud')} in subfolders, not read; '{path}/**/*' names all")
             out += files
         elif not path.exists() and glob.has_magic(str(path)):  # the shell has not expanded it
             names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern
