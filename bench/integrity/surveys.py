@@ -112,6 +112,7 @@ def _cells(xyz: Floats, size: float) -> int:
     return len(np.unique(np.floor(xyz[:, :2] / size), axis=0))
 
 
+@lru_cache(maxsize=2)
 def _square(seed: int, apart: int | None) -> tuple[Survey, Bools]:
     """Return the points of a square and around it, its middle at zero, and which of them are the map's half."""
     file, middle, yaw = _place(seed, apart)
@@ -137,8 +138,8 @@ class Ground(Site):
 
 
 @lru_cache(maxsize=2)
-def world(seed: int, route_seed: int, apart: int | None = None) -> Scene | None:
-    """Return the world of a square's other half, with a way through it that ``route_seed`` draws, if there is one."""
+def _stage(seed: int, apart: int | None) -> tuple[Floats, Floats, SceneState, Bools]:
+    """Return a square's axis and heights, all that stands on its other half, and where a robot may drive."""
     points, of_map = _square(seed, apart)
     seen = points.chosen(~of_map)
     count = int(2 * _HALF / _CELL)
@@ -160,11 +161,16 @@ def world(seed: int, route_seed: int, apart: int | None = None) -> Scene | None:
     away = ndimage.distance_transform_edt(~stands) * _CELL
     inside = np.abs(axis) < SIZE / 2 - 10.0
     free = (away > _FREE) & (away < _NEAR) & (np.hypot(*np.gradient(heights, _CELL)) < _STEEP)
-    route = _way(free & inside[:, None] & inside, axis, np.random.default_rng([route_seed, _ROUTE]))
-    if route is None:
-        return None
     now = SceneState(join([height_field(axis, heights), solid]), leaves)
-    return Scene("survey", SIZE, now, now, Ground(axis, heights), route, ())
+    return axis, heights, now, free & inside[:, None] & inside
+
+
+@lru_cache(maxsize=2)
+def world(seed: int, route_seed: int, apart: int | None = None) -> Scene | None:
+    """Return the world of a square's other half, with a way through it that ``route_seed`` draws, if there is one."""
+    axis, heights, now, free = _stage(seed, apart)
+    route = _way(free, axis, np.random.default_rng([route_seed, _ROUTE]))
+    return None if route is None else Scene("survey", SIZE, now, now, Ground(axis, heights), route, ())
 
 
 def moved(scene: Scene, shift: Floats) -> Scene:
