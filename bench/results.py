@@ -65,22 +65,24 @@ TABLES = {
     "conditions": Table("conditions", 15, True, f"conditions {SETS_OF_TWO}"),
     "forest": Table("forest", 12, True),
     "tracking": Table("tracking", 40, True),
-    "dirt": Table("accuracy --only dirt --drives 2", 30, True, "accuracy --only dirt", "two of the four drives"),
+    "dirt": Table("accuracy --only dirt --drives 1", 15, True, "accuracy --only dirt", "one of the four drives"),
     "protection": Table(
         "protection --worlds 26", 70, True, "protection --worlds 1",
         "26 of 30 worlds of each family; 999 blocks, which a risk of 1e-3 needs, are in 25",
     ),
-    "faults": Table("faults", 25, True),
+    "faults": Table(
+        "faults --worlds town forest kitti04 handheld_livox", 17, True, "faults", "four of the six worlds"
+    ),
     "conditions beside the paper": Table(
         "conditions --conditions base --paper", 3, True, "conditions --conditions base --sets kitti04 --paper"
     ),
     "forest_drives": Table("forest_drives --plots docs/images", 50, True, "forest_drives"),
-    "challenge": Table("challenge --count 40", 20, True, "challenge", "40 of 100 runs"),
+    "challenge": Table("challenge --count 20", 10, True, "challenge", "20 of 100 runs"),
     "exposure": Table("exposure --worlds 26", 1, False, f"exposure --worlds 1 {SETS_OF_TWO}"),  # of results of those
-    "peers": Table("peers --places 12 --limit 90", 40, quick="peers --limit 60", thinned="12 places of each world"),
+    "peers": Table("peers --places 6 --limit 90", 20, True, "peers --limit 60", "6 of 20 places of each world"),
     "search": Table("search", 4),
     "engine": Table("engine", 3),
-    "memory": Table("memory", 15),
+    "memory": Table("memory --km2 0.05 1", 8, False, "memory", "the largest of three maps, which city has"),
     "start": Table("start", 3),
     "soak": Table("soak --minutes 60", 62, quick="soak --minutes 0.5 --every 10"),
     "city": Table("city --side 2 4", 30),
@@ -89,7 +91,7 @@ TABLES = {
     "throughput": Table("engine --throughput", 7),
     "registration": Table("registration", 5),
     "fleet": Table("fleet", 4),
-    "fuzz": Table("fuzz --seconds 30", 10, quick="fuzz --seconds 2", thinned="half a minute for each target"),
+    "fuzz": Table("fuzz --seconds 10", 8, True, "fuzz --seconds 2", "ten seconds for each target"),
     "ablation, spacing": Table(
         "ablation --only spacing --picture docs/images/spacing.png", 5, False, "ablation --only spacing --sites kitti04"
     ),
@@ -99,8 +101,8 @@ TABLES = {
     },
     "changed ground": Table("ground", 15, True),
     "overlap": Table(
-        "conditions --overlaps 5 20 35 50 65 85 --sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
-        13, True, "conditions --overlaps 35 --sets kitti04",
+        "conditions --overlaps 5 20 35 65 --sets handheld_livox kitti04 town-vlp16-4201 village-bpearl-4203",
+        9, True, "conditions --overlaps 35 --sets kitti04",
     ),
     "airborne-like maps": Table(
         "conditions --conditions base --densities 4 8 20 --paper", 12, True,
