@@ -59,7 +59,7 @@ SETS_OF_TWO = "--sets kitti04 handheld_livox --conditions base pitch:3"
 
 TABLES = {
     "integrity": Table(
-        "integrity --kept docs/integrity.jsonl.xz", 220, quick="integrity --count 6", thinned="a frame every 0.8 m"
+        "integrity --kept docs/integrity.jsonl.xz", 275, quick="integrity --count 6", thinned="a frame every 0.8 m"
     ),
     "accuracy": Table("accuracy --only worlds", 60, True),
     "conditions": Table("conditions", 15, True, f"conditions {SETS_OF_TWO}"),
