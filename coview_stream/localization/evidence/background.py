@@ -30,7 +30,7 @@ _LEAST_DEVIATION = 0.03  # in units of one point's sigma: a thousand independent
 _COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _MANY = 20  # places from which the second largest share is meaningful
-_CALIBRATED = 2.0
+_CALIBRATED = 1.75
 """Factor on the number of independent observations by the scatter: searches on maps of other sites then state an error
 below e in less than a share e of them (``python -m bench.integrity.calibrate``)."""
 OPEN = 0.01
