@@ -3,8 +3,8 @@
 Ground and free space of a scan agree with the map at the right place, and at every open place. How rare open places are
 decides how much that agreement is worth (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
 plain, as much as ten nats in hills. They are counted twice, and the larger share holds: among the places that the
-search scores, hundreds that votes have named, and among poses at stations all over the map, thousands a keyframe that
-nothing has chosen. A place has to stay open over the whole drive: poses that are open so far are followed from keyframe
+search scores, hundreds that votes have named, and among poses at stations all over the map, thousands at each keyframe,
+chosen at random. A place has to stay open over the whole drive: poses that are open so far are followed from keyframe
 to keyframe, and new ones are looked up at the earlier keyframes as well.
 """
 
@@ -34,7 +34,7 @@ SIGHT = 35.0
 
 @dataclass(frozen=True)
 class _Drives:
-    """Drives that end at stations, as odometry has them.
+    """Drives from stations at random headings, as odometry has them.
 
     Attributes:
         poses: (S, 4) at the newest keyframe.
@@ -47,8 +47,8 @@ class _Drives:
     observed: Floats32
 
     @classmethod
-    def none(cls, keyframes: int = 0) -> _Drives:
-        return cls(np.empty((0, 4)), np.empty(0), np.empty((0, keyframes, len(Share)), dtype=np.float32))
+    def none(cls) -> _Drives:
+        return cls(np.empty((0, 4)), np.empty(0), np.empty((0, 1, len(Share)), dtype=np.float32))
 
     def __add__(self, other: _Drives) -> _Drives:
         if not len(self.poses):
@@ -103,18 +103,17 @@ class OpenPlaces:
         at = stations[chosen[order]].astype(np.float64)
         poses = np.column_stack([at[:, :2], at[:, 2] + height, heading[order]])
         observed = part.look_up(field, poses, kernels.Move.NEAR)
-        if len(scans):
-            drives = _Drives(observed.poses, np.ones(count), observed.shares[:, None])
-            self._newest, self._at = (drives, scans, scan, field), at[:, :2]
-            self._count += count
-        else:
-            self.add(observed.shares, at[:, :2])
+        if not len(scans):
+            return self.add(observed.shares[:, None], observed.poses)
+        drives = _Drives(observed.poses, np.ones(count), observed.shares[:, None])
+        self._newest = drives, scans, scan, field
+        self._at, self._count = at[:, :2], self._count + count
+        return None
 
-    def add(self, observed: Floats32, at: Floats) -> None:
-        """Add a first keyframe's observations (S, 7) at stations (S, 2) that nothing has chosen."""
-        poses = np.column_stack([at, np.zeros_like(at)])
-        self._drives = self._drives + _Drives(poses, np.ones(len(at)), observed[:, None])
-        self._at, self._count = at, self._count + len(at)
+    def add(self, observed: Floats32, poses: Floats) -> None:
+        """Add drives at random: their observations (S, W, 7) at all keyframes, and poses (S, 4) at the newest."""
+        self._drives = self._drives + _Drives(poses, np.ones(len(poses)), observed)
+        self._at, self._count = poses[:, :2], self._count + len(poses)
 
     def forget(self, keyframe: int) -> None:
         """Drop a keyframe's observations."""
@@ -133,6 +132,7 @@ class OpenPlaces:
         weights, count = self._drives.weights.astype(np.float32), float(self._count)
         if leader is not None and count:
             weights *= np.linalg.norm(self._drives.poses[:, :2] - leader[:2], axis=1) > SIGHT
+            # drives of earlier keyframes end all over the map as the newest ones do
             count *= float((np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT).mean())
         scored = _odds_against(chance, background)
         anywhere = _odds_against(self._drives.observed.mean(axis=1), background)

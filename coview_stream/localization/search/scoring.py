@@ -366,16 +366,14 @@ class PlaceScorer:
         height = float(np.median(above)) if len(above) else 0.0
         self._open.look(self._base_map.field, anywhere, self._scans, scan, height)
         sample, over_time = self._over_time(observed, first, scan)
-        # over all keyframes, of followed places; over the newest one, of others
-        scored = observed.shares[first]
-        scored[np.isin(first, followed.newest)] = mean
+        scored = over_time.mean(axis=1)
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             left = left_in_mean(over_time[chance[sample]])
             spread = np.mean(measured, axis=0) * left
             now = observed.shares[first][chance]
             background = estimate_background(now, spread, mean[distant], most)
-            background = replace(background, open=self._open.share(scored[elsewhere], background, leader))
+            background = replace(background, open=self._open.share(scored[elsewhere[sample]], background, leader))
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break

@@ -226,18 +226,18 @@ def smallest_error(places, stations, rng, times=1.0):
     Each observation is counted ``times``. The ``stations`` (S, W, 7) are others.
     """
     count, keyframes, _ = places.shape
-    opened = OpenPlaces()
     votes, spreads, smallest = rng.permutation(count), [], 1.0
     for k in range(keyframes):
         now, mean = places[:, k], places[:, : k + 1].mean(axis=1)
         others = np.ones(count, dtype=bool)
         spreads.append(scatter(now))
-        opened.add(stations[:, k], np.full((len(stations), 2), np.inf))
+        opened = OpenPlaces()
+        opened.add(stations[:, : k + 1], np.full((len(stations), 4), np.inf))
         for last in (False, True):
             spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
             known = estimate_background(now[others], spread, mean[others])
             known = replace(known, number=(times * known.number[0], times * known.number[1]))
-            known = replace(known, open=opened.share(now[others], known))
+            known = replace(known, open=opened.share(mean[others], known))
             ratios = log_likelihood_ratios(mean, known)
             if not last:  # the leader is not among what it is compared with
                 others = np.arange(count) != np.argmin(np.log1p(votes) - ratios)
