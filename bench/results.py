@@ -7,7 +7,8 @@ tables of their own.
 ``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one code, for a release. The page is
 its memory: a table that is there, of this code and by the same command, is done, and one that is made goes into it at
 once, so that a release goes on in another DIR, or on another machine, for as long as the code's hash is the same (that
-of ``bench/results.py`` does not count, nor do comments, docstrings and pages). The most valuable tables come first.
+of ``bench/results.py`` does not count, nor do comments, docstrings and pages; it is one minor version of Python's).
+Remove the file of the kept runs of ``integrity`` when the code has changed. The most valuable tables come first.
 Those without times run side by side, one on each core, the others alone; most keep the results of each drive or site in
 ``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in one piece, begins anew). It says
 which tables are missing, and about how long they take. What a table leaves out to be done in time stands behind
@@ -49,7 +50,7 @@ class Table(NamedTuple):
     """How a table is made."""
 
     command: str
-    minutes: float  # about, on quiet cores, until the folder of a release says how long it took here
+    minutes: float  # about, on quiet cores, until the page says how long it took
     beside: bool = False  # runs beside others, on a core of its own: no time in it has a target
     quick: str = ""  # the command beside --quick, if it is another one
     thinned: str = ""  # what is left out, so that all ends in twelve hours
@@ -218,11 +219,10 @@ def main(arguments: Sequence[str], *, release: bool = False) -> int:
         print(f"bench {name}: {error}", file=sys.stderr)
         return 2
     asked.page = asked.page or (asked.work / PAGE.name if release and asked.quick else PAGE)
-    try:
-        return _release(asked, names) if release else _results(asked, names)
-    finally:
-        if asked.page == PAGE:  # figures of other pages
-            subprocess.run([sys.executable, PAGE.with_name("write_reference.py")], env=environment(), check=True)
+    code = _release(asked, names) if release else _results(asked, names)
+    if asked.page == PAGE:  # figures of other pages
+        subprocess.run([sys.executable, PAGE.with_name("write_reference.py")], env=environment(), check=False)
+    return code
 
 
 def _results(asked: Namespace, names: Sequence[str]) -> int:

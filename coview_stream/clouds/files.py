@@ -21,7 +21,7 @@ from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
 from coview_stream.clouds.rows import TEXT_SUFFIXES, read_bin, read_npy, read_text, suffix_of
 from coview_stream.clouds.survey_unit import InMetres, SurveyUnit
-from coview_stream.errors import CloudError, counted, warn
+from coview_stream.errors import CloudError, warn
 from coview_stream.geometry.arrays import Reals
 
 _FORMATS = {
@@ -72,12 +72,12 @@ def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
     for path in map(Path, given):
         if path.is_dir():
             files = sorted(filter(is_cloud_name, path.iterdir()), key=natural_key)
-            within = sorted(filter(is_cloud_name, path.glob("*/**/*")))
+            within = next(filter(is_cloud_name, path.glob("*/**/*")), None)
             if not files:
-                remedy = f"did you mean {within[0].parent}?" if within else "name another folder, or the files"
+                remedy = f"did you mean {within.parent}?" if within else "name another folder, or the files"
                 raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {remedy}")
             if within:
-                warn(f"{path}: {counted(len(within), 'cloud')} in subfolders, not read; '{path}/**/*' names all")
+                warn(f"{path}: clouds in subfolders, such as {within}, are not read; '{path}/**/*' names all")
             out += files
         elif not path.exists() and glob.has_magic(str(path)):  # the shell has not expanded it
             names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern

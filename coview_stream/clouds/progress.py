@@ -31,6 +31,8 @@ def progress_bar(
     with tqdm(total=1, desc=title, unit=unit, unit_scale=scale, disable=not shown, leave=False) as bar:
 
         def step(done: int, total: int, note: str | None = None) -> None:
+            if done < bar.n:
+                bar.reset()  # the time that is left is of this step
             bar.total = total
             bar.update(done - bar.n)
             if note is not None:

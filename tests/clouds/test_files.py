@@ -147,7 +147,7 @@ def test_folder_or_pattern_without_clouds_says_so(folder, tmp_path):
     with pytest.raises(CloudError, match=r"holds no cloud .*did you mean .*tiles\?"):
         expand_cloud_paths([tmp_path])
     (tmp_path / "site.laz").touch()
-    with pytest.warns(CoViewWarning, match="3 clouds in subfolders, not read"):
+    with pytest.warns(CoViewWarning, match="clouds in subfolders, such as .*, are not read"):
         expand_cloud_paths([tmp_path])
     (tmp_path / "empty").mkdir()
     with pytest.raises(CloudError, match=r"holds no cloud .*name another folder"):
