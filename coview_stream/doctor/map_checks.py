@@ -170,6 +170,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
     try:
         from coview_stream.localization.localizer import Localizer
         from coview_stream.localization.state import State
+        from coview_stream.report.evaluation import driven as metres_driven
     except ImportError as error:
         remedy = install_command("all")
         return Finding("warn", "place", f"not searched for: {error.name} is missing", remedy)
@@ -177,8 +178,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
     def searched(on: BaseMap) -> tuple[float, State, str]:
         """Return the metres driven, the state, and both metres and reason in words."""
         localizer = Localizer(on, config)
-        reason, driven = "", 0.0
-        before = run.poses[0, :3, 3]
+        reason = ""
         for done, index in enumerate(indices, start=1):
             if progress is not None:
                 progress(done, len(indices))
@@ -186,17 +186,17 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
                 frame = run.read(index)
             except CloudError:
                 continue
-            driven += float(np.linalg.norm(frame.T_odom_body[:3, 3] - before))
-            before = frame.T_odom_body[:3, 3]
             evidence = localizer.step(frame.points, frame.T_odom_body, frame.stamp).evidence
             reason = reason if evidence is None else evidence.reason.removeprefix("found: ")
             if localizer.state is State.TRACKING:
                 break
-        text = f"after {driven:.0f} m: {reason or 'too little has been seen'}"
-        return driven, localizer.state, text
+        after = f"in the first {metres[index]:.0f} of {metres[-1]:.0f} m" if goes_on else f"after {metres[index]:.0f} m"
+        return metres[index], localizer.state, f"{after}: {reason or 'too little has been seen'}"
 
     step = max(1, len(run) // _SEARCHED)
     indices = range(0, len(run), step) if len(run) <= 4 * _SEARCHED else range(0, 4 * _SEARCHED, 4)
+    goes_on = indices[-1] + step < len(run)
+    metres = metres_driven(run.poses)
     driven, state, text = searched(base_map)
     if state is State.TRACKING:
         return Finding("ok", "place", f"found {text}")
@@ -214,7 +214,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
     (left, low, _), (right, high, _) = base_map.bounds
     name = "this map" if base_map.path is None else base_map.path.name
     map_name = f"{name} ({left:.0f}, {low:.0f} to {right:.0f}, {high:.0f} m)"
-    remedy = (
+    remedy = "`locate` looks at all of the run; " * goes_on + (
         "clouds and odometry fit each other, so: is the robot on this map, is the map of this site and in metres"
         f"{untried}, and has the site not changed? `coview-stream help reasons`"
     )
@@ -243,7 +243,7 @@ def sensor_findings(
     most of the frames that speak for one, and the calibration at the end, both as while tracking.
     """
     try:
-        judge, calibration = _judge(base_map, config)
+        judge, outcome = _judge(base_map, config)
     except ImportError:
         return  # the motion is not compared either, which has been said
     stride = max(1, int(_BETWEEN / max(float(np.median(np.diff(run.stamps))), 1e-6)))
@@ -259,8 +259,6 @@ def sensor_findings(
             continue
         if fault is not None:
             told.append(fault)
-    seconds = float(run.stamps[indices[-1]] - run.stamps[0])
-    of = "clouds and odometry" if base_map is None else "clouds, odometry and map"
     surest = max((probability for _, _, probability in told), default=0.0)
     if surest > 0.5:
         cause = Counter(cause for cause, _, _ in told).most_common(1)[0][0]
@@ -268,14 +266,16 @@ def sensor_findings(
         found = f"{reason}; so in {len(told)} of {len(indices)} frames (wrong {one_in(1.0 - surest)})"
         yield Finding("FAIL", "sensors", found, f"cause {cause}: `coview-stream help reasons` says what to do")
     else:
+        of, calibration = outcome()
+        seconds = run.stamps[indices[-1]] - run.stamps[0]
         yield Finding("ok", "sensors", f"{of} tell the same motion over {seconds:.0f} s")
-        for clause in calibration().describe(run.mount):
+        for clause in calibration.describe(run.mount):
             found, _, remedy = clause.partition("; ")
             yield Finding("ok", "calibration", found, remedy)
 
 
-def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Callable[[], Calibration]]:
-    """Return a function that returns cause, reason and probability of a frame's fault, and one for the calibration."""
+def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Callable[[], tuple[str, Calibration]]]:
+    """Return functions: cause, reason and probability of a frame's fault; words for the compared, and calibration."""
     from coview_stream.localization.frame import FramePreparation
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.tracking.monitor import FAULTS
@@ -293,8 +293,10 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
                 return None
             return said.cause.value, said.reason, localizer.sensor_fault
 
-        def measured() -> Calibration:  # a lean of places that only led a search is no advice
-            return localizer.calibration if localizer.state.has_place else Calibration()
+        def measured() -> tuple[str, Calibration]:  # places that only led a search tell nothing of map or lean
+            if localizer.state.has_place:
+                return "clouds, odometry and map", localizer.calibration
+            return "clouds and odometry", Calibration()
 
         return localized, measured
     frames, drift = FramePreparation(config), Drift.of(TrackingConfig())
@@ -306,4 +308,4 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
         accused = witness.while_searching(drift)
         return None if accused is None else (accused.cause.value, accused.sentence, witness.faults.sensors)
 
-    return watched, lambda: frames.calibration
+    return watched, lambda: ("clouds and odometry", frames.calibration)

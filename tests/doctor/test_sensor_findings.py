@@ -92,11 +92,22 @@ def test_large_map_is_not_built_again_in_metres(in_feet, monkeypatch):
     assert "(feet were not tried: " in finding.remedy
 
 
+def test_beginning_of_a_long_run_on_no_map_is_told_as_such(in_feet):
+    run, base_map = in_feet
+    (sensors, *_) = map_checks.sensor_findings(run, base_map, LocalizerConfig())
+    assert sensors.found.startswith("clouds and odometry tell the same motion")
+    stands = run_of([run.read(0).points] * 250, run.poses[[0] * 249 + [-1]])
+    place = place_finding(stands, base_map, LocalizerConfig())
+    assert re.search(r"in the first 0 of [1-9]\d* m: ", place.found)
+    assert "`locate` looks at all of the run" in place.remedy
+
+
 @pytest.mark.parametrize("probability", [0.02, 0.98])
 def test_fault_that_is_less_probable_than_none_fails_no_run(way, monkeypatch, probability):
     """Poses are withheld at one in a thousand; of many frames one reaches that by chance."""
     told = iter([None] * 5 + [("mixed", "clouds do not fit each other", probability)])
-    monkeypatch.setattr(map_checks, "_judge", lambda *_: ((lambda frame: next(told, None)), Calibration))
+    judges = (lambda frame: next(told, None)), lambda: ("", Calibration())
+    monkeypatch.setattr(map_checks, "_judge", lambda *_: judges)
     run = run_of(way.clouds, way.T_odom_body)
     (found, *_) = map_checks.sensor_findings(run, None, LocalizerConfig())
     assert (found.what, found.verdict) == ("sensors", "FAIL" if probability > 0.5 else "ok")
