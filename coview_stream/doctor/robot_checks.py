@@ -316,8 +316,8 @@ def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
         return Finding("warn", "node", "alive, but says nothing", remedy, robot)
     found = f"{_text(status, 'state')}: {_text(status, 'reason') or 'no reason given'}"
     servers = sorted(capture.servers)
-    found += f", node {servers[0]}" if len(servers) == 1 else ""
-    found += f", version {_text(status, 'version')}, map {_text(status, 'map_sha256')[:12]}"
+    found += f"; node {servers[0]}" if len(servers) == 1 else ""
+    found += f"; version {_text(status, 'version')}, map {_text(status, 'map_sha256')[:12]}"
     if not capture.alive:
         return Finding("warn", "node", f"{found}; no liveliness token", "do access rules let it hold one?", robot)
     if len(servers) > 1:
@@ -333,7 +333,8 @@ def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
     errors = status.get("errors")
     if isinstance(errors, list) and errors:
         return Finding("warn", "node", f"{found}; reports: {str(errors[-1])[:200]}", robot=robot)
-    if status.get("state") != "TRACKING" and _number(status, "uptime_s") > _LONG_SEARCH:
+    state = status.get("state")
+    if state == "LOST" or (state != "TRACKING" and _number(status, "uptime_s") > _LONG_SEARCH):
         reason = _text(status, "reason")
         if "waiting for" in reason or reason.startswith("no clouds"):
             remedy = "its data does not come: see clouds and odometry above"
