@@ -6,6 +6,7 @@ All take plain arrays, in metres and radians, and work without a display.
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +31,7 @@ ACCENT = "#009E73"
 MAX_BASE_POINTS = 1_000_000
 """A base map is thinned to this many points: more do not show in a picture of 800 cells across."""
 
-_UNLIKELY = 0.01  # of the first place's probability: less probable ones are not drawn
+_UNLIKELY = 0.01  # places that are less probable are not drawn
 _GROUND_WINDOW = 25.0  # metres; terrain changes little over it, and few buildings are wider
 
 _STYLE = {
@@ -170,7 +171,7 @@ def _even_marks(legend: Any) -> None:
 
 def plot_trajectory(
     base: Reals, positions: Reals, states: Sequence[str], path: str | os.PathLike[str], truth: Reals | None = None,
-    places: Reals | None = None,
+    places: Reals | None = None, reason: str = "",
 ) -> None:  # fmt: skip
     """Draw a trajectory over the grey base map, coloured by state.
 
@@ -182,6 +183,7 @@ def plot_trajectory(
         path: picture to write.
         truth: (T, 3) true positions, if known.
         places: (P, 6) that may be right, as :class:`~coview_stream.localization.search.acceptance.Considered` has them.
+        reason: why there is no pose; stands under the title.
 
     Raises:
         InputError: as many states as positions are needed; or the picture cannot be written.
@@ -201,7 +203,9 @@ def plot_trajectory(
             _draw_places(axes, np.asarray(places, dtype=np.float64), shift)
         elif not drawn.any():
             draw_notice(axes, "not localized: no frame has a pose")
-        axes.set_title("Trajectory" if drawn.any() else "Not localized")
+        below = textwrap.wrap(reason, 95)
+        axes.text(0.0, 1.01, "\n".join(below), transform=axes.transAxes, fontsize=9)
+        axes.set_title("Trajectory" if drawn.any() else "Not localized", pad=6 + 13 * len(below))
         legend_below(drawing, axes)
 
 
@@ -211,14 +215,13 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
         here = states == name
         if not here.any():
             continue
-        at = positions[here & drawn]
         without = int((here & ~drawn).sum())
         label = f"{name}: {counted(int(here.sum()), 'frame')}" + (f", {without} without a pose" if without else "")
-        colour = STATE_COLOURS.get(str(name), ACCENT)
-        axes.scatter(at[:, 0], at[:, 1], s=12, color=colour, linewidths=0, label=label, zorder=3)
+        style = {"s": 12, "color": STATE_COLOURS.get(str(name), ACCENT), "linewidths": 0, "zorder": 3}
+        axes.scatter(*positions[here & drawn, :2].T, label=label, **style)
     if drawn.any():
-        x, y = positions[int(np.argmax(drawn)), :2]
-        axes.scatter(x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
+        first = positions[np.argmax(drawn), :2]
+        axes.scatter(*first, s=90, facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
 
 
 def _draw_line(axes: Any, positions: Reals, drawn: Bools) -> None:
@@ -232,14 +235,18 @@ def _draw_line(axes: Any, positions: Reals, drawn: Bools) -> None:
 
 
 def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
-    """Draw places (P, 6) as discs, the larger the more probable, with a line ahead, as long as 3 % of the picture."""
-    places = places[places[:, 4] >= _UNLIKELY * places[0, 4]]
-    x, y, yaw, probability = places[:, 0] - shift[0], places[:, 1] - shift[1], places[:, 3], places[:, 4]
+    """Draw probable places (P, 6) on the map: discs, the larger the more probable, with a line ahead."""
+    low, high = axes.dataLim.get_points()
+    at = places[:, :2] - shift[:2]
+    shown = (at >= low).all(axis=1) & (at <= high).all(axis=1) & (places[:, 4] >= _UNLIKELY)
+    if not shown.any():
+        draw_notice(axes, f"no place above {_UNLIKELY * 100:g} %")
+        return
+    (x, y), yaw, probability = at[shown].T, places[shown, 3], places[shown, 4]
     label = "places that may fit, no pose; probability"
     style = {"color": STATE_COLOURS["AMBIGUOUS"], "zorder": 4}
-    for *at, p in zip(x, y, probability, strict=True):
-        text = f"{p:.0%}" if p >= 0.005 else "<1%"
-        axes.annotate(text, at, (6, 4), textcoords="offset points", fontsize=8, zorder=5)
+    for *xy, p in zip(x, y, probability, strict=True):
+        axes.annotate(f"{p:.0%}", xy, (6, 4), textcoords="offset points", fontsize=8, zorder=5)
     axes.scatter(x, y, s=20.0 + 200.0 * probability, edgecolors=TRUTH, linewidths=0.6, label=label, **style)
     axes.quiver(x, y, np.cos(yaw), np.sin(yaw), scale=30, width=0.004, headwidth=3, **style)
 
@@ -264,8 +271,7 @@ def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike
                 draw_notice(axes, "no pose to compare")
                 axes.set_yticks([])
                 continue
-            mean = float(values[~wrong].mean()) if (~wrong).any() else float("nan")
-            named = "right poses" if not (~wrong).any() else f"right poses, mean {mean:.3f}"
+            named = f"right poses, mean {values[~wrong].mean():.3f}" if (~wrong).any() else "right poses"
             axes.scatter(distance[~wrong], values[~wrong], s=7, color=colour, linewidths=0, label=named)
             _draw_false(axes, distance[wrong], values[wrong], limit)
             handles, labels = axes.get_legend_handles_labels()
@@ -304,8 +310,7 @@ def plot_descriptor_pair(
         InputError: the descriptors differ in shape, or the picture cannot be written.
     """
     if query.shape != winner.shape or query.ndim != 2:
-        shapes = f"{query.shape} and {winner.shape}"
-        raise InputError(f"descriptors: shapes {shapes} differ; give two (rings, sectors)")
+        raise InputError(f"descriptors: shapes {query.shape} and {winner.shape} differ; give two (rings, sectors)")
     pair = [np.asarray(query, dtype=np.float64), np.roll(np.asarray(winner, dtype=np.float64), shift, axis=1)]
     finite = np.concatenate([values[np.isfinite(values)] for values in pair])
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
@@ -346,7 +351,7 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
         for fix in result.fixes
     ]
     places = None if result.considered is None else result.considered.places
-    plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth, places)
+    plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth, places, result.reason)
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:
         channel = next(iter(result.query))

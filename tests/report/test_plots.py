@@ -68,6 +68,14 @@ def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, said):
     pixels(tmp_path / "empty.png")
 
 
+def test_only_probable_places_on_the_map_are_drawn(base, tmp_path, said):
+    places = np.array([[5.0, 5, 0, 0, 0.4, 0], [90, 5, 0, 0, 0.3, 0], [5, 9, 0, 0, 0.009, 0]])
+    for name, drawn in (("first", places[:1]), ("all", places), ("none", places[1:])):
+        plots.plot_trajectory(base, np.full((1, 3), np.nan), ["LOST"], tmp_path / f"{name}.png", places=drawn)
+    assert np.array_equal(pixels(tmp_path / "first.png"), pixels(tmp_path / "all.png"))
+    assert said == ["no place above 1 %"]
+
+
 def test_states_and_positions_of_different_length_are_refused(base, tmp_path):
     with pytest.raises(InputError, match="2 states for 3 positions"):
         plots.plot_trajectory(base, np.zeros((3, 3)), ["LOST"] * 2, tmp_path / "t.png")
@@ -76,8 +84,7 @@ def test_states_and_positions_of_different_length_are_refused(base, tmp_path):
 
 @pytest.mark.slow
 def test_false_poses_are_highlighted(tmp_path):
-    distance, e_r = np.arange(50.0), np.full(50, 0.01)
-    e_t = np.full(50, 0.05)
+    distance, e_r, e_t = np.arange(50.0), np.full(50, 0.01), np.full(50, 0.05)
     plots.plot_errors(distance, e_t, e_r, tmp_path / "right.png")
     assert not has_colour(pixels(tmp_path / "right.png"), plots.STATE_COLOURS["LOST"])
     e_t[20:25] = 40.0
@@ -111,8 +118,7 @@ def test_descriptors_of_different_shape_are_refused(tmp_path):
 
 def test_utm_coordinates_get_a_rounded_plot_offset(base):
     assert not plots.base_shift(base).any()
-    shift = plots.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0]))
-    assert shift.tolist() == [412_300.0, 5_318_800.0, 0.0]
+    assert plots.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0])).tolist() == [412_300.0, 5_318_800.0, 0.0]
 
 
 def test_unwritable_plot_names_its_file(tmp_path):
