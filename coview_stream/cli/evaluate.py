@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coview_stream.report.evaluation import ErrorStats, Evaluation
+    from coview_stream.report.evaluation import Evaluation
 from coview_stream.cli.options import add_shared
 from coview_stream.errors import InputError, counted
 
@@ -62,16 +62,10 @@ def table(evaluation: Evaluation) -> str:
     ]
     if evaluation.unmatched:
         rows.append(("not compared", f"{counted(evaluation.unmatched, 'pose')} without a true one at that time"))
-    if evaluation.translation and evaluation.rotation:
-        rows.append(("translation error", _errors_text(evaluation.translation, "m")))
-        rows.append(("rotation error", _errors_text(evaluation.rotation, "deg")))
+    for name, stats, unit in (("translation", evaluation.translation, "m"), ("rotation", evaluation.rotation, "deg")):
+        if stats is not None:
+            numbers = f"mean {stats.mean:.3f}  rmse {stats.rmse:.3f}  median {stats.median:.3f}  max {stats.max:.3f}"
+            rows.append((f"{name} error", f"{numbers} {unit}  (of the right poses)"))
     if evaluation.false_frames:
         rows.append(("worst pose", f"{evaluation.worst_t_m:.2f} m, {evaluation.worst_r_deg:.2f} deg"))
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
-
-
-def _errors_text(stats: ErrorStats, unit: str) -> str:
-    return (
-        f"mean {stats.mean:.3f}  rmse {stats.rmse:.3f}  median {stats.median:.3f}  max {stats.max:.3f} {unit}"
-        "  (of the right poses)"
-    )

@@ -105,41 +105,39 @@ def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
     Raises:
         InputError: the truth holds no pose.
     """
-    stamps, poses = estimate
-    true_stamps, true_poses = truth
-    if not len(true_stamps):
+    if not len(truth[0]):
         raise InputError("truth: holds no pose; give the trajectory that was really driven")
-    index, matched = _nearest(stamps, true_stamps)
-    T_est, T_true = poses[matched], true_poses[index]
+    index, T_est, T_true = _pairs(estimate, truth)
     e_t = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
     turns = T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1)
     e_r = np.asarray(Rotation.from_matrix(turns).magnitude()) if len(turns) else np.zeros(0)  # precise near zero
-    return FrameErrors(index, driven(true_poses)[index], e_r, e_t)
+    return FrameErrors(index, driven(truth[1])[index], e_r, e_t)
 
 
-def _nearest(stamps: Floats, true_stamps: Floats) -> tuple[Indices, Bools]:
-    """Return rows (K,) of the true stamps nearest to those of the mask (N,) of stamps that have one near enough."""
+def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Indices, Floats, Floats]:
+    """Return the estimated poses (K, 4, 4) that have a true one near in time, behind its rows (K,), and the true."""
+    (stamps, poses), (true_stamps, true_poses) = estimate, truth
     after = np.clip(np.searchsorted(true_stamps, stamps), 0, len(true_stamps) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(true_stamps[before] - stamps) < np.abs(true_stamps[after] - stamps)
     index = np.where(closer, before, after)
     matched = np.abs(true_stamps[index] - stamps) < MAX_STAMP_GAP
-    return index[matched], matched
+    return index[matched], poses[matched], true_poses[index[matched]]
 
 
 def constant_offset(estimate: Trajectory, truth: Trajectory) -> str | None:
-    """Say by which constant shift the truth differs from an estimate, on the map or of the body; None if by none."""
-    index, matched = _nearest(estimate[0], truth[0])
-    T_est, T_true = estimate[1][matched], truth[1][index]
-    if not len(index):
-        return None
+    """Say by which shift or transform the truth differs from an estimate that is not empty; None if by none."""
+    _, T_est, T_true = _pairs(estimate, truth)
     apart = T_true[:, :3, 3] - T_est[:, :3, 3]
     of_body = np.einsum("nji,nj->ni", T_est[:, :3, :3], apart)
     for each, name in ((apart, "another origin of the map's frame"), (of_body, "another place on the body")):
         shift = np.median(each, axis=0)
         if (np.linalg.norm(each - shift, axis=1) < MAX_TRANSLATION / 3.0).mean() > MIN_RIGHT_SHARE:
-            x, y, z = shift
-            return f"lies {x:.2f}, {y:.2f}, {z:.2f} m from the estimate all along: is it of {name}?"
+            return f"lies {', '.join(f'{s:.2f}' for s in shift)} m from the estimate all along: is it of {name}?"
+    turn = Rotation.from_matrix(T_true[:, :3, :3] @ T_est[:, :3, :3].transpose(0, 2, 1)).mean()
+    apart = T_true[:, :3, 3] - turn.apply(T_est[:, :3, 3])
+    if (np.linalg.norm(apart - np.median(apart, axis=0), axis=1) < MAX_TRANSLATION).mean() > MIN_RIGHT_SHARE:
+        return "all are off by one transform: is the truth in the map's frame (map <- body), or is it odometry?"
     return None
 
 
