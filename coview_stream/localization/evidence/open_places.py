@@ -132,7 +132,7 @@ class OpenPlaces:
         weights, count = self._drives.weights.astype(np.float32), float(self._count)
         if leader is not None and count:
             weights *= np.linalg.norm(self._drives.poses[:, :2] - leader[:2], axis=1) > SIGHT
-            # drives of earlier keyframes end all over the map as the newest ones do
+            # drives of earlier keyframes end all over the map as the newest do; more may end far from the leader
             count *= float((np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT).mean())
         scored = _odds_against(chance, background)
         anywhere = _odds_against(self._drives.observed.mean(axis=1), background)
@@ -141,7 +141,7 @@ class OpenPlaces:
             named = _probability(scored, named).sum(axis=0) / np.float32(len(chance) + 1)  # one more is not open
             probable = _probability(anywhere, rate)
             counted = np.tensordot(weights, probable, axes=1)
-            rate = ((counted + OPEN * _PRESUMED) / (count + _PRESUMED)).astype(np.float32)
+            rate = ((counted + OPEN * _PRESUMED) / (np.maximum(counted, count) + _PRESUMED)).astype(np.float32)
         self._probable = probable.max(axis=(1, 2)).astype(np.float64)
         return np.maximum(rate, named).astype(np.float64)
 
