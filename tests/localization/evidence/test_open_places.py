@@ -140,3 +140,13 @@ def test_a_place_counts_only_while_all_keyframes_find_it_open():
     once_beyond = over_drive(*(Keyframe(3.0 * k, half) for k in (0, 1, 2)), Keyframe(9.0))[-1]
     assert then_beyond == pytest.approx(0.5 * usual, rel=0.15)
     assert once_beyond == pytest.approx(0.5 * usual, rel=0.15)
+
+
+def test_share_is_a_probability_on_a_map_no_wider_than_the_sight():
+    """All stations are in sight of the leader; the drives from them have left it."""
+    places, near = OpenPlaces(), STATIONS[:10]
+    for k, keyframe in enumerate(keyframes := [Keyframe(0.0), Keyframe(60.0)]):
+        places.look(None, near, keyframes[:k], keyframe, 1.5)
+        found = places.share(ROUGH[:300], KNOWN, np.zeros(4))
+    assert (found > 0.0).all()
+    assert (found <= 1.0).all()
