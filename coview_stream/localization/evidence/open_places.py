@@ -22,7 +22,7 @@ from coview_stream.localization.evidence.likelihood import NUISANCES, clear_and_
 from coview_stream.localization.evidence.observation import ObservedScan, ScanPart, Share
 
 _STATIONS = 4096  # that a keyframe is observed from
-_FOLLOWED = 96  # poses at stations that the next keyframe observes, and of each keyframe that earlier ones observe
+_FOLLOWED = 96  # drives that go on, and new ones that are looked up back in time: their count is known to a tenth
 _PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
 _STEPS = 5  # of expectation and maximization
 _EVERY = 8  # one of so many structure points is looked up
@@ -85,9 +85,9 @@ class OpenPlaces:
         self, field: kernels.FieldMap, stations: Floats32, scans: Sequence[ObservedScan], scan: ObservedScan,
         height: float,
     ) -> None:  # fmt: skip
-        """Observe a map's ``field`` from some ``stations`` (M, 3), the body ``height`` metres above, at any heading.
+        """Observe a map's ``field`` from drives to random ``stations`` (M, 3), ``height`` metres above them.
 
-        Drives that ended at the last of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
+        Drives of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
         """
         part = _ground(scan)
         if len(scans) and len(self._drives.poses):
@@ -116,7 +116,7 @@ class OpenPlaces:
         self._at, self._count = poses[:, :2], self._count + len(poses)
 
     def forget(self, keyframe: int) -> None:
-        """Drop a keyframe's observations."""
+        """Drop the observations of a keyframe, by its number from 0, the oldest."""
         rest = np.arange(self._drives.observed.shape[1]) != keyframe
         self._drives = replace(self._drives, observed=self._drives.observed[:, rest])
 
@@ -162,7 +162,7 @@ class OpenPlaces:
 
 
 def _ground(scan: ObservedScan) -> ScanPart:
-    """Return few points of a scan: structure only moves it, as it moves scans at scored places."""
+    """Return the few points of a scan, with one of eight of structure, which only moves it, as at scored places."""
     points = scan.few.points
     return replace(scan.few, points=replace(points, structure=points.structure[::_EVERY]))
 
