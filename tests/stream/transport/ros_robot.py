@@ -90,20 +90,20 @@ def place_of(message):
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
 
 
-def cloud_message(stamp_ns, points, frame="base_link", dtype="<f4", names="xyz"):
+def cloud_message(stamp_ns, points, frame="base_link", names="xyz"):
     """Return rclpy's own PointCloud2, serialized by rclpy."""
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import PointCloud2, PointField
     from std_msgs.msg import Header
 
-    data = np.ascontiguousarray(points, dtype=dtype)
+    data = np.ascontiguousarray(points, dtype="<f4")
     step = data.shape[1] * data.itemsize
     fields = [PointField(name=n, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, n in enumerate(names)]
     header = Header(frame_id=frame)
     header.stamp.sec, header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
     return serialize_message(
         PointCloud2(
-            header=header, height=1, width=len(data), fields=fields, is_bigendian=dtype.startswith(">"),
+            header=header, height=1, width=len(data), fields=fields, is_bigendian=False,
             point_step=step, row_step=step * len(data), data=data.tobytes(), is_dense=True,
         )
     )  # fmt: skip

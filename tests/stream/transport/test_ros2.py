@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -107,11 +107,21 @@ class RosSite(Site):
 
 
 @pytest.fixture
-def site(robot):
-    site = RosSite()
-    site.meet(robot)
-    yield site
-    site.net.close()
+def make_site(robot):
+    with ExitStack() as stack:
+
+        def make(*args, **more):
+            site = RosSite(*args, **more)
+            stack.callback(site.net.close)
+            site.meet(robot)
+            return site
+
+        yield make
+
+
+@pytest.fixture
+def site(make_site):
+    return make_site()
 
 
 def drive(robot, site, seconds, points=POINTS):
@@ -135,14 +145,13 @@ def drive(robot, site, seconds, points=POINTS):
 
 
 @pytest.mark.slow
-def test_same_frames_have_the_poses_that_they_have_over_zenoh(robot, world_map, world_drive):
+def test_same_frames_have_the_poses_that_they_have_over_zenoh(robot, make_site, world_map, world_drive):
     """Either engine gets a frame once it has worked on the one before: both work on the same ones."""
     engines, endpoint, heard = [(TrackEngine(world_map), SearchEngine(world_map)) for _ in "12"], free_endpoint(), []
-    site, net, far = RosSite(engines=engines[0]), open_transport(listen=[endpoint]), open_transport([endpoint])
-    with closing(site.net), closing(net), closing(far):
+    site = make_site(engines=engines[0])
+    with closing(open_transport(listen=[endpoint])) as net, closing(open_transport([endpoint])) as far:
         other = Site("r1", net=net, engines=engines[1])
         other.node.declare()
-        site.meet(robot)
         keys = other.keys["r1"]
         far.subscribe(keys.pose, lambda sample: heard.append(decode_pose(sample)), "all")
         moves, clouds = far.publisher(keys.odometry, "data"), far.publisher(keys.cloud, "data")
@@ -192,7 +201,7 @@ def test_body_that_odometry_does_not_name_is_that_of_tf_static():
 
 
 @pytest.mark.slow
-def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, transforms):
+def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, make_site, transforms):
     from rclpy.serialization import deserialize_message
 
     latched = robot.latched(1)
@@ -200,79 +209,72 @@ def test_lidars_pose_on_the_body_is_that_of_tf_static(robot, transforms):
     T_body_lidar = pose_from(rot_z(0.3), [0.2, 0.0, 0.5])
     static = ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne")
     publisher.publish(deserialize_message(static, transforms))
-    site = RosSite()
-    try:
-        site.meet(robot)
-        robot.move(ns(0.0), message(0.0).T_odom_body)
+    site = make_site()
+    robot.move(ns(0.0), message(0.0).T_odom_body)
 
-        def seen():
-            robot.clouds.publish(cloud_message(ns(0.0), POINTS, frame="velodyne"))
-            robot.move(ns(0.1), message(0.1).T_odom_body)
-            time.sleep(0.05)
-            return site.sessions["r1"].has_job("track")
+    def seen():
+        robot.clouds.publish(cloud_message(ns(0.0), POINTS, frame="velodyne"))
+        robot.move(ns(0.1), message(0.1).T_odom_body)
+        time.sleep(0.05)
+        return site.sessions["r1"].has_job("track")
 
-        robot.until(seen)
-        np.testing.assert_allclose(
-            site.sessions["r1"].take_job("track").points, transform_points(T_body_lidar, POINTS), atol=1e-4
-        )
-    finally:
-        site.net.close()
+    robot.until(seen)
+    np.testing.assert_allclose(
+        site.sessions["r1"].take_job("track").points, transform_points(T_body_lidar, POINTS), atol=1e-4
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("back", [3.0, 60.0])
-def test_transform_follows_the_pose_freezes_while_lost_and_ends_with_the_senders_clock(robot, transforms, back):
+def test_transform_follows_the_pose_freezes_while_lost_and_ends_with_the_senders_clock(
+    robot, make_site, transforms, back
+):
     heard = []
     robot.node.create_subscription(transforms, "/tf", heard.append, 10)
-    site = RosSite()
-    try:
-        site.meet(robot)
-        for k in range(3):
-            drive(robot, site, 0.1 * k)
-        robot.move(ns(0.25), message(0.25).T_odom_body)
-        robot.until(lambda: heard and transform(heard[-1])[2] == ns(0.25))
-        parent, child, _, live = transform(heard[-1])
-        assert (parent, child) == ("map", "odom")
-        pose = site.sessions["r1"].pose()
-        before = encode_pose(pose, "json")
-        robot.move(ns(0.22), message(0.22).T_odom_body)  # late, and too late for tf2
-        np.testing.assert_allclose(live, pose_to_tum(pose.T_map_body @ inverse(message(0.25).T_odom_body)), atol=1e-9)
-        site.sessions["r1"].restart_search("asked", forget=True)
-        site.told(robot, lambda: "frozen" in robot.values()["map -> odom"])
-        robot.move(ns(0.3), message(0.3).T_odom_body)
-        robot.until(lambda: transform(heard[-1])[2] == ns(0.3))
-        np.testing.assert_array_equal(transform(heard[-1])[3], live)
-        count, moments = len(heard), iter(0.05 * np.arange(1000) - back)
-        stamps = [transform(each)[2] for each in heard]
-        assert stamps == sorted(stamps)
+    site = make_site()
+    for k in range(3):
+        drive(robot, site, 0.1 * k)
+    robot.move(ns(0.25), message(0.25).T_odom_body)
+    robot.until(lambda: heard and transform(heard[-1])[2] == ns(0.25))
+    parent, child, _, live = transform(heard[-1])
+    assert (parent, child) == ("map", "odom")
+    pose = site.sessions["r1"].pose()
+    before = encode_pose(pose, "json")
+    robot.move(ns(0.22), message(0.22).T_odom_body)  # late, and too late for tf2
+    np.testing.assert_allclose(live, pose_to_tum(pose.T_map_body @ inverse(message(0.25).T_odom_body)), atol=1e-9)
+    site.sessions["r1"].restart_search("asked", forget=True)
+    site.told(robot, lambda: "frozen" in robot.values()["map -> odom"])
+    robot.move(ns(0.3), message(0.3).T_odom_body)
+    robot.until(lambda: transform(heard[-1])[2] == ns(0.3))
+    np.testing.assert_array_equal(transform(heard[-1])[3], live)
+    count, moments = len(heard), iter(0.05 * np.arange(1000) - back)
+    stamps = [transform(each)[2] for each in heard]
+    assert stamps == sorted(stamps)
 
-        def restarted():  # the sender began anew: its frame is another
-            at = next(moments)
-            robot.move(ns(at), message(at).T_odom_body)
-            time.sleep(0.05)
-            return site.counters().clock_restarts
-
-        robot.until(restarted)
-        site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
-        site.net.publisher(KEYS.pose, "pose").put(before)
-        for _ in range(5):
-            restarted()
-        assert len(heard) == count
-        drive(robot, site, next(moments))
+    def restarted():  # the sender began anew: its frame is another
         at = next(moments)
         robot.move(ns(at), message(at).T_odom_body)
-        robot.until(lambda: transform(heard[-1])[2] == ns(at))
-        robot.move(ns(next(moments)), message(99.0).T_odom_body)  # its frame alone
-        site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
-    finally:
-        site.net.close()
+        time.sleep(0.05)
+        return site.counters().clock_restarts
+
+    robot.until(restarted)
+    site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
+    site.net.publisher(KEYS.pose, "pose").put(before)
+    for _ in range(5):
+        restarted()
+    assert len(heard) == count
+    drive(robot, site, next(moments))
+    at = next(moments)
+    robot.move(ns(at), message(at).T_odom_body)
+    robot.until(lambda: transform(heard[-1])[2] == ns(at))
+    robot.move(ns(next(moments)), message(99.0).T_odom_body)  # its frame alone
+    site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
 
 
 def transform(message):
     (row,) = message.transforms
-    t, q, stamp = row.transform.translation, row.transform.rotation, row.header.stamp
-    values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
-    return row.header.frame_id, row.child_frame_id, stamp.sec * 1_000_000_000 + stamp.nanosec, values
+    t, q = row.transform.translation, row.transform.rotation
+    return row.header.frame_id, row.child_frame_id, stamp_of(row), np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
 
 
 @pytest.mark.slow
@@ -301,8 +303,8 @@ def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog)
 
 @pytest.mark.slow
 def test_cloud_before_the_first_odometry_is_refused(robot):
-    net, samples = Ros2Transport(start_node(()), [KEYS]), []
-    try:
+    samples = []
+    with closing(Ros2Transport(start_node(()), [KEYS])) as net:
         for key in (KEYS.cloud, KEYS.odometry):
             net.subscribe(key, samples.append, "all")
         robot.until(lambda: robot.clouds.get_subscription_count() and robot.odometry.get_subscription_count())
@@ -317,14 +319,11 @@ def test_cloud_before_the_first_odometry_is_refused(robot):
         robot.until(lambda: heard(move=False))
         assert all("before the first odometry" in reason for reason in heard(move=False))
         robot.until(lambda: not heard(move=True)[-1])
-    finally:
-        net.close()
 
 
 @pytest.mark.slow
 def test_map_is_published_again_until_it_is_the_one_that_is_served(robot, monkeypatch):
     monkeypatch.setattr(ros2_transport, "RETRY", 0.0)
-    net = Ros2Transport(start_node(()), [KEYS])
     views = {name: MapView.of_cloud(POINTS[:n], np.zeros(3)) for n, name in ((2, "old"), (3, "new"))}
     served, shown = [], robot.heard["/map_points"]
 
@@ -338,7 +337,7 @@ def test_map_is_published_again_until_it_is_the_one_that_is_served(robot, monkey
 
     status = {"state": "LOST", "reason": "", "robot": "r1", "map_sha256": "new"}
     status["pose"] = dict.fromkeys(("protection_level", "rate_hz", "age_s", "confidence"))
-    try:
+    with closing(Ros2Transport(start_node(()), [KEYS])) as net:
         net.answer(KEYS.map_view, view)
         for _ in range(3):
             told(lambda: None)
@@ -349,17 +348,6 @@ def test_map_is_published_again_until_it_is_the_one_that_is_served(robot, monkey
         for _ in range(3):
             told(lambda: None)
         assert len(shown) == 2
-    finally:
-        net.close()
-
-
-@pytest.mark.slow
-def test_points_of_the_other_byte_order_are_read(robot, site):
-    robot.move(ns(0.0), message(0.0).T_odom_body)
-    robot.clouds.publish(cloud_message(ns(0.0), POINTS, dtype=">f4"))
-    robot.move(ns(0.1), message(0.1).T_odom_body)
-    robot.until(lambda: site.sessions["r1"].has_job("track") or site.node.publish_poses(time.monotonic()))
-    np.testing.assert_array_equal(site.sessions["r1"].take_job("track").points, POINTS)
 
 
 @pytest.mark.slow
@@ -387,23 +375,19 @@ def test_stamps_of_another_clock_are_told(robot, site):
 
 
 @pytest.mark.slow
-def test_sim_time_comes_from_the_clock_topic(robot):
+def test_sim_time_comes_from_the_clock_topic(robot, make_site):
     from rosgraph_msgs.msg import Clock
 
-    site = RosSite("-p", "use_sim_time:=true")
-    try:
-        site.meet(robot)
-        clocks = robot.node.create_publisher(Clock, "/clock", 10)
-        drive(robot, site, 0.0)
-        site.told(robot, lambda: "nothing comes on /clock" in robot.values().get("clock", ""))
-        now = Clock()
-        now.clock.sec = ns(1.0) // 1_000_000_000
+    site = make_site("-p", "use_sim_time:=true")
+    clocks = robot.node.create_publisher(Clock, "/clock", 10)
+    drive(robot, site, 0.0)
+    site.told(robot, lambda: "nothing comes on /clock" in robot.values().get("clock", ""))
+    now = Clock()
+    now.clock.sec = ns(1.0) // 1_000_000_000
 
-        site.told(
-            robot, lambda: clocks.publish(now) or (robot.level(), stamp_of(robot.diagnostics[-1])) == (b"\0", ns(1.0))
-        )
-    finally:
-        site.net.close()
+    site.told(
+        robot, lambda: clocks.publish(now) or (robot.level(), stamp_of(robot.diagnostics[-1])) == (b"\0", ns(1.0))
+    )
 
 
 def guess_of(x, y, frame="map"):
@@ -455,16 +439,13 @@ def test_publisher_of_another_type_is_named(robot, site, caplog):
 @pytest.mark.slow
 def test_topics_of_two_robots_are_apart(robot):
     keys = [robot_keys("native", "coview", n, f"{n}/points", f"{n}/odom", f"{n}/pose") for n in ("r1", "r2")]
-    net = Ros2Transport(start_node(["-r", "__ns:=/hall"]), keys)
-    try:
+    with closing(Ros2Transport(start_node(["-r", "__ns:=/hall"]), keys)) as net:
         for k in keys:
             for key in (k.cloud, k.odometry, k.initial_pose):
                 net.subscribe(key, print, "all")
         wanted = {"/diagnostics", *(f"/{n}/{t}" for n in ("r1", "r2") for t in ("points", "odom", "pose"))}
         wanted |= {"/hall/r1/initialpose", "/hall/r2/initialpose"}
         robot.until(lambda: wanted <= {name for name, _ in robot.node.get_topic_names_and_types()})
-    finally:
-        net.close()
 
 
 @pytest.mark.slow
@@ -509,31 +490,6 @@ def test_keys_of_rmw_zenoh_are_those_of_another_library():
         assert pamoja.type_hash_digest(type_hash(kind)) is not None
     token = publisher_token(ours.pose, "ab", "coview_stream", 1)
     assert pamoja.percent_mangle("/rover1/coview/pose") in token.split("/")
-
-
-def test_bag_of_rclpys_bytes_is_a_run(ros, tmp_path):
-    from nav_msgs.msg import Odometry
-    from rclpy.serialization import serialize_message
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    from coview_stream.recordings import open_run
-
-    types = get_typestore(Stores.ROS2_JAZZY)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        clouds = writer.add_connection("/points", ros2.CLOUD, typestore=types)
-        moves = writer.add_connection("/odom", ros2.ODOMETRY, typestore=types)
-        for k in range(3):
-            moved = Odometry()
-            moved.header.frame_id, moved.child_frame_id = "odom", "base_link"
-            moved.header.stamp.sec, moved.pose.pose.orientation.w, moved.pose.pose.position.x = k, 1.0, 2.0 * k
-            writer.write(moves, k * 1_000_000_000, serialize_message(moved))
-            writer.write(clouds, k * 1_000_000_000, cloud_message(k * 1_000_000_000, POINTS + k))
-    frames = list(open_run(tmp_path / "bag"))
-    assert len(frames) == 3
-    for k, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame.points, POINTS + k)
-        assert frame.T_odom_body[0, 3] == 2.0 * k
 
 
 def test_parameters_are_options_by_their_names(ros, tmp_path):
@@ -654,18 +610,9 @@ class Served:
 
     def __init__(self, world_file, folder, *arguments):
         self.log = (folder / "serve.log").open("a+")
-        command = (
-            "coview_stream",
-            "serve",
-            str(world_file),
-            "--robot",
-            "r1",
-            "--ros2",
-            "--state",
-            str(folder),
-            *arguments,
-        )
-        self.process = subprocess.Popen(python_command(*command), env=python_environment(), stderr=self.log)
+        words = ("--robot", "r1", "--ros2", "--state", str(folder), *arguments)
+        command = python_command("coview_stream", "serve", str(world_file), *words)
+        self.process = subprocess.Popen(command, env=python_environment(), stderr=self.log)
 
     def end(self):
         begin = time.monotonic()
