@@ -66,18 +66,23 @@ class Runner:
 
 
 class Site:
-    """A node without threads, its robots, and the network between them."""
+    """A node without threads, its robots, and the network between them.
 
-    def __init__(self, *names, preset="native", engines=None, config=PATIENT, net=None, **more):
+    ``session``: more options of the sessions; ``odometry``: runs the engine of lidar odometry, if there is one.
+    """
+
+    def __init__(
+        self, *names, preset="native", engines=None, config=PATIENT, net=None, session=None, odometry=None, **more
+    ):
         self.net = net or MemoryTransport()
         self.engine = Engine()
         track, search = engines or (self.engine, self.engine)
         self.track, self.search = Runner(track), Runner(search)
         self.keys = {name: robot_keys(preset, "coview", name) for name in names}
-        sessions = [Session(keys, SHA, config) for keys in self.keys.values()]
+        sessions = [Session(keys, SHA, config, **(session or {})) for keys in self.keys.values()]
         self.sessions = dict(zip(names, sessions, strict=True))
-        opened = OpenedMap(SHA, {"track": self.track, "search": self.search}, sessions)
-        self.node = Node(opened, self.net, config, **more)
+        runners = ({"odometry": odometry} if odometry else {}) | {"track": self.track, "search": self.search}
+        self.node = Node(OpenedMap(SHA, runners, sessions), self.net, config, **more)
 
     def moves(self, name, seconds, **place):
         self.net.publish(odometry(seconds, keys=self.keys[name], **place))
@@ -90,7 +95,7 @@ class Site:
     def work(self, name):
         """Let the engines do the work that waits for a robot."""
         session = self.sessions[name]
-        for engine in ("track", "search"):
+        for engine in self.node.feeds[0].engines:
             if (job := session.take_job(engine)) is not None:
                 self.node.feeds[0].work(engine, session, job)
 

@@ -1,10 +1,10 @@
 """Guesses of a robot's place from the network: bounded, checked, handed to the engine once, and told where refused."""
 
-import logging
 import math
 
 import numpy as np
 import pytest
+from fake_node import declared
 from fake_robot import KEYS, Robot, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,11 +16,6 @@ from coview_stream.messages import encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.client import RobotClient
 from coview_stream.stream.node.last_place import decode_guess, guess_of_fields
-from coview_stream.stream.node.robot_endpoints import RobotEndpoints
-from coview_stream.stream.node.status import Reporter
-from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.keys import NodeIdentity
-from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 
 def sample(payload):
@@ -86,10 +81,7 @@ def test_questions_and_messages_reach_the_session(pair):
 
 
 def test_guess_where_the_map_has_no_ground_is_refused_with_a_note(world_map):
-    net, robot = MemoryTransport(), Robot(base_map=world_map)
-    reporter = Reporter([robot.session], net, RateLimitedErrors(logging.getLogger()), NodeIdentity())
-    endpoints = RobotEndpoints(robot.session, net, reporter, lambda session: None)
-    endpoints.begin_serving()
+    net = declared("r1", session={"base_map": world_map}).net
     client = RobotClient("r1", transport=net)
     x, y = world_map.origin[:2]
     for within in (60.0, None):

@@ -1,25 +1,21 @@
 """A node that makes odometry itself, and its engine in a process that dies and comes back."""
 
-import json
 import os
 import signal
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_node import Runner
-from fake_robot import KEYS, SHA, cloud, message, ns, odometry, tracking
+from fake_node import PATIENT, Runner, Site, declared
+from fake_robot import KEYS, cloud, message, ns
 from sockets import until
 
-from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.geometry.transforms import inverse
 from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.node.engine_queue import OdometryJob, OdometryResult
-from coview_stream.stream.node.node import Node, OpenedMap
-from coview_stream.stream.node.session import Session
-from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
 CLOUD = np.random.default_rng(0).uniform(-30, 30, (500, 3)).astype(np.float32)
@@ -55,59 +51,36 @@ def stand_in(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def playing(answer):
-    return Runner(SimpleNamespace(run=answer), "odometry")
-
-
 def placing(job):
     assert isinstance(job, OdometryJob)
     return OdometryResult(message((job.stamp_ns - ns(0)) * 1e-9).T_odom_body, None, False, 0.01)
 
 
 @pytest.fixture
-def quiet():
-    net = MemoryTransport()
-    session = Session(
-        KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0), lidar=LidarOdometryConfig()
-    )
-    track, engine = playing(tracking), playing(placing)
-    made = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, session.config)
-    made.declare()
-    return made, net, engine
+def engine():
+    return Runner(SimpleNamespace(run=placing), "odometry")
 
 
-def worked(node, *engines):
-    for name in engines:
-        if (turn := node.feeds[0].next_job(name)) is not None:
-            node.feeds[0].work(name, *turn)
+@pytest.fixture
+def site(engine):
+    return declared("r1", session={"lidar": LidarOdometryConfig()}, odometry=engine)
 
 
-def status(node, net):
-    node.reporter.publish(0.0)
-    return json.loads(net.samples(KEYS.status)[-1].payload)
+def test_lidar_node_subscribes_to_no_odometry(site):
+    assert site.net.subscribed == {KEYS.cloud: "newest", "coview/r1/in/initial_pose": "all"}
+    site.moves("r1", 0.0)
+    assert site.status("r1")["odometry"] == "kiss-icp"
+    assert site.status("r1")["counters"]["odometry_received"] == 0
+    site.frame("r1", 0.0)
+    assert site.status("r1")["state"] == "TRACKING"
+    assert len(site.poses("r1")) == 1
 
 
-def test_lidar_node_subscribes_to_no_odometry(quiet):
-    node, net, _ = quiet
-    assert net.subscribed == {KEYS.cloud: "newest", "coview/r1/in/initial_pose": "all"}
-    net.publish(odometry(0.0))
-    assert status(node, net)["odometry"] == "kiss-icp"
-    assert status(node, net)["counters"]["odometry_received"] == 0
-    net.publish(cloud(0.0))
-    worked(node, "odometry", "track")
-    assert status(node, net)["state"] == "TRACKING"
-    node.publish_poses(0.0)
-    assert len(net.samples(KEYS.pose)) == 1
-
-
-def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
-    node, net, engine = quiet
-    net.publish(cloud(0.0))
-    worked(node, "odometry", "track")
+def test_odometry_engine_death_loses_the_place_but_not_the_node(site, engine):
+    site.frame("r1", 0.0)
     engine.dead = True
-    net.publish(cloud(0.1))
-    worked(node, "odometry", "track")
-    said = status(node, net)
+    site.frame("r1", 0.1)
+    said = site.status("r1")
     why = "lidar odometry was started again: the odometry engine died"
     assert (said["state"], said["reason"]) == ("LOST", why)
     assert said["counters"]["engine_restarts"] == 1
@@ -115,23 +88,21 @@ def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
         "the odometry engine is started again: the odometry engine died",
         "r1: frames that lidar odometry failed at; the first: the odometry engine died",
     ]
-    net.publish(cloud(0.2))
-    worked(node, "odometry", "track")
-    assert status(node, net)["state"] == "TRACKING"
+    site.frame("r1", 0.2)
+    assert site.status("r1")["state"] == "TRACKING"
 
 
 @pytest.mark.slow
 def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
-    net = MemoryTransport()
-    config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
-    session = Session(KEYS, SHA, config, lidar=LEVEL)
-    track, engine = playing(tracking), EngineProcess("odometry", "unused", "")
-    node = Node(OpenedMap(SHA, {"track": track, "search": track, "odometry": engine}, [session]), net, config)
-    node.start()
+    config = replace(PATIENT, max_outage=30.0, pose_rate=50.0)
+    engine = EngineProcess("odometry", "unused", "")
+    site = Site("r1", config=config, session={"lidar": LEVEL}, odometry=engine)
+    session = site.sessions["r1"]
+    site.node.start()
     stamps = iter(0.1 * k for k in range(100_000))
 
     def tracked(points=CLOUD):
-        net.publish(cloud(next(stamps), points))
+        site.net.publish(cloud(next(stamps), points))
         return session.state()[0].value == "TRACKING"
 
     try:
@@ -144,10 +115,9 @@ def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
         until(lambda: session.counters.engine_restarts >= 2, 20.0)
         until(tracked, 20.0)
     finally:
-        node.close()
-    said = [json.loads(s.payload)["reason"] for s in net.samples(KEYS.status)]
-    assert "lidar odometry was started again: the odometry engine died" in said
-    assert net.raised == []
+        site.node.close()
+    assert "lidar odometry was started again: the odometry engine died" in [s["reason"] for s in site.statuses("r1")]
+    assert site.net.raised == []
     assert not [t for t in threading.enumerate() if t.name == "coview-odometry"]
 
 
