@@ -1,7 +1,5 @@
 """RobotClient in threads and in event loops, on the fake network and over real sockets; and its queue."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import struct
@@ -90,7 +88,6 @@ def test_point_times_are_sent(client, net):
     ("call", "text"),
     [
         (lambda c: c.send_cloud(np.zeros((4, 2)), 1.0), "shape"),
-        (lambda c: c.send_cloud(np.zeros(3), 1.0), "shape"),
         (lambda c: c.send_cloud(None, 1.0), "shape"),
         (lambda c: c.send_cloud([["a", "b", "c"]], 1.0), "cloud is not an array of numbers"),
         (lambda c: c.send_cloud([[1, 2, 3], [4]], 1.0), "cloud is not an array of numbers"),
@@ -273,11 +270,6 @@ def test_bad_client_options_are_refused(net, options):
         RobotClient(**({"robot": "r1", "transport": net} | options))
 
 
-def test_malformed_endpoint_is_refused():
-    with pytest.raises(TransportError, match="nonsense"):
-        RobotClient("r1", "nonsense")
-
-
 @pytest.mark.slow
 def test_client_over_real_sockets():
     endpoint = free_endpoint()
@@ -404,7 +396,7 @@ def test_closing_ends_async_iteration_and_what_was_unread_is_given(net):
 
 
 def test_queue_outlives_the_loop_of_a_reader():
-    queue = LatestQueue[int](3)
+    queue = LatestQueue(3)
 
     async def give_up():
         return await queue.next(timeout=0.01)
@@ -434,7 +426,7 @@ def test_client_says_what_it_is_in_one_line(net):
 
 
 def test_latest_queue_keeps_order_and_drops_oldest():
-    queue = LatestQueue[int](3)
+    queue = LatestQueue(3)
     for k in range(5):
         queue.put(k)
     assert [queue.get(0), queue.get(0), queue.get(0), queue.get(0)] == [2, 3, 4, None]
@@ -442,8 +434,8 @@ def test_latest_queue_keeps_order_and_drops_oldest():
 
 
 def test_put_and_close_wake_a_reader_and_close_keeps_items():
-    queue = LatestQueue[int](3)
-    items: list[int | None] = []
+    queue = LatestQueue(3)
+    items = []
     reader = threading.Thread(target=lambda: [items.append(queue.get()) for _ in range(2)])
     reader.start()
     queue.put(4)
@@ -452,13 +444,8 @@ def test_put_and_close_wake_a_reader_and_close_keeps_items():
     reader.join(5)
     assert items == [4, None]
 
-    full = LatestQueue[int](3)
+    full = LatestQueue(3)
     full.put(1)
     full.close()
     full.put(2)
     assert [full.get(), full.get()] == [1, None]
-
-
-def test_latest_queue_size_is_validated():
-    with pytest.raises(ConfigError, match="queue size"):
-        LatestQueue[int](0)

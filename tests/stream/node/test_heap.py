@@ -1,7 +1,5 @@
 """Heaps of the C library, in processes of their own."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

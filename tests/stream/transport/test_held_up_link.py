@@ -1,7 +1,5 @@
 """Links that are held up or thin: callers do not wait for them, and odometry goes before clouds."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -49,7 +47,7 @@ def test_odometry_goes_before_clouds_on_a_thin_link():
     with Router() as router, BadLink(router.endpoint) as link:
         robot = RobotClient("r1", link.endpoint)
         node = open_transport(connect=[router.endpoint])
-        came: list[float] = []
+        came = []
         node.subscribe(robot.keys.odometry, lambda sample: came.append(time.monotonic()), "all")
         node.subscribe(robot.keys.cloud, lambda sample: None, "newest")
         assert robot.wait_for_node(20.0)
@@ -71,7 +69,7 @@ def test_odometry_that_waits_is_sent_before_a_client_closes():
     with Router() as router:
         robot = RobotClient("r1", router.endpoint)
         node = open_transport(connect=[router.endpoint])
-        came: list[bytes] = []
+        came = []
         node.subscribe(robot.keys.odometry, lambda sample: came.append(sample.payload), "all")
         node.subscribe(robot.keys.cloud, lambda sample: None, "newest")
         assert robot.wait_for_node(20.0)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -11,7 +9,7 @@ from coview_stream.stream.transport.keys import PRESETS, check_disjoint, check_e
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
 
 
-def test_native_keys_are_as_documented() -> None:
+def test_native_keys_are_as_documented():
     keys = robot_keys("native", "coview", "rover1")
     assert keys.cloud == "coview/rover1/in/cloud"
     assert keys.odometry == "coview/rover1/in/odom"
@@ -22,7 +20,7 @@ def test_native_keys_are_as_documented() -> None:
     assert (keys.hint, keys.pose_format, keys.rmw) == (None, "json", False)
 
 
-def test_ros2dds_uses_topic_names_and_native_service_keys() -> None:
+def test_ros2dds_uses_topic_names_and_native_service_keys():
     keys = robot_keys("ros2dds", "site/hall3", "bot1")
     assert (keys.cloud, keys.odometry, keys.pose) == ("bot1/points", "bot1/odom", "bot1/coview/pose")
     assert keys.status == "site/hall3/bot1/out/status"
@@ -30,7 +28,7 @@ def test_ros2dds_uses_topic_names_and_native_service_keys() -> None:
     assert not keys.rmw
 
 
-def test_rmw_zenoh_reads_any_release_and_writes_the_published_hash() -> None:
+def test_rmw_zenoh_reads_any_release_and_writes_the_published_hash():
     keys = robot_keys("rmw_zenoh", "coview", "bot1", domain=7)
     golden = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
     for ending in (golden, "TypeHashNotSupported"):
@@ -44,7 +42,7 @@ def test_rmw_zenoh_reads_any_release_and_writes_the_published_hash() -> None:
     assert humble.pose == f"{typed}/TypeHashNotSupported"
 
 
-def test_keelson_never_reads_its_own_pose_as_odometry() -> None:
+def test_keelson_never_reads_its_own_pose_as_odometry():
     keys = robot_keys("keelson", "rise", "masslab")
     assert matches(keys.cloud, "rise/@v0/masslab/pubsub/point_cloud/lidar/bow")
     assert matches(keys.odometry, "rise/@v0/masslab/pubsub/frame_transform/odometry")
@@ -53,13 +51,13 @@ def test_keelson_never_reads_its_own_pose_as_odometry() -> None:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_makes_keys_that_zenoh_accepts(preset: str) -> None:
+def test_every_preset_makes_keys_that_zenoh_accepts(preset):
     keys = robot_keys(preset, "a/b", "rover 1")
     for key in (keys.cloud, keys.odometry, keys.pose, keys.status, keys.alive, keys.relocalize, keys.reset):
         assert str(zenoh.KeyExpr(key)) == key
 
 
-def test_overrides_fill_placeholders_once() -> None:
+def test_overrides_fill_placeholders_once():
     keys = robot_keys(
         "native", "fleet", "r1", cloud="{domain}/{robot}/**", odometry="/x"[1:], pose="{base}/p", domain=3
     )
@@ -67,7 +65,7 @@ def test_overrides_fill_placeholders_once() -> None:
     assert robot_keys("native", "fleet", "{domain}").cloud == "fleet/{domain}/in/cloud"
 
 
-def test_a_ros_pose_key_keeps_the_convention() -> None:
+def test_a_ros_pose_key_keeps_the_convention():
     keys = robot_keys(
         "rmw_zenoh", "coview", "r1", pose="{domain}/{robot}/located/my_msgs::msg::dds_::Pose_/{pose_hash}"
     )
@@ -78,13 +76,13 @@ def test_a_ros_pose_key_keeps_the_convention() -> None:
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "a*", "a$", "a?", "#1", "@home", "tab\t"])
-def test_bad_robot_name_names_the_option(robot: str) -> None:
+def test_bad_robot_name_names_the_option(robot):
     with pytest.raises(ConfigError, match="--robot"):
         robot_keys("native", "coview", robot)
 
 
 @pytest.mark.parametrize("base", ["", "/a", "a/", "a//b", "a/*", "@v0/x", "a/$*"])
-def test_bad_base_names_the_option(base: str) -> None:
+def test_bad_base_names_the_option(base):
     with pytest.raises(ConfigError, match="--base"):
         robot_keys("native", base, "rover1")
 
@@ -98,12 +96,12 @@ def test_bad_base_names_the_option(base: str) -> None:
         ({"domain": 233}, "--domain"),
     ],
 )
-def test_bad_key_override_names_the_option(options: dict[str, str], message: str) -> None:
+def test_bad_key_override_names_the_option(options, message):
     with pytest.raises(ConfigError, match=message):
         robot_keys("native", "coview", "rover1", **options)
 
 
-def test_unknown_preset_lists_the_known_ones() -> None:
+def test_unknown_preset_lists_the_known_ones():
     with pytest.raises(ConfigError, match="native, ros2dds, rmw_zenoh, keelson"):
         robot_keys("ros1", "coview", "rover1")
 
@@ -116,7 +114,7 @@ WRONG = ["", "/a", "a/", "a//b", "a*", "*a", "a/***", "a/$*", "a/$b", "a$*$*", "
 
 
 @pytest.mark.parametrize("text", EXPRESSIONS + WRONG)
-def test_key_expression_validity_agrees_with_zenoh(text: str) -> None:
+def test_key_expression_validity_agrees_with_zenoh(text):
     try:
         zenoh.KeyExpr(text)
         valid = True

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import zenoh
 from zenoh.ext import Int64, z_deserialize, z_serialize
@@ -22,13 +20,13 @@ ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 GID = bytes(range(16))
 
 
-def test_rmw_attachment_golden_bytes() -> None:
+def test_rmw_attachment_golden_bytes():
     data = attachment(5, 1_700_000_000_123_456_789, GID)
     assert data.hex() == "0500000000000000" + "15cd853dfe9c9717" + "10" + GID.hex()
     assert read_attachment(data) == (1_700_000_000_123_456_789, 5)
 
 
-def test_rmw_attachment_equals_zenoh_serialization() -> None:
+def test_rmw_attachment_equals_zenoh_serialization():
     theirs = z_serialize((Int64(-3), Int64(2**62), GID))
     assert attachment(-3, 2**62, GID) == theirs.to_bytes()
     decoded = z_deserialize(tuple[Int64, Int64, bytes], zenoh.ZBytes(attachment(7, 8, GID)))
@@ -36,11 +34,11 @@ def test_rmw_attachment_equals_zenoh_serialization() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", bytes(33), attachment(1, 2, GID)[:-1], attachment(1, 2, GID) + b"x"])
-def test_other_attachments_are_not_rmw_attachments(data: bytes) -> None:
+def test_other_attachments_are_not_rmw_attachments(data):
     assert read_attachment(data) == (None, None)
 
 
-def test_dds_type_names_and_type_hashes() -> None:
+def test_dds_type_names_and_type_hashes():
     assert dds_type("sensor_msgs/msg/PointCloud2") == "sensor_msgs::msg::dds_::PointCloud2_"
     for name, digest in {
         "sensor_msgs/msg/PointCloud2": "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
@@ -53,7 +51,7 @@ def test_dds_type_names_and_type_hashes() -> None:
         assert type_hash(name, humble=True) == "TypeHashNotSupported"
 
 
-def test_liveliness_tokens_match_rmw_zenoh() -> None:
+def test_liveliness_tokens_match_rmw_zenoh():
     # the example of rmw_zenoh's own design notes
     assert node_token(0, ZID, "listener") == f"@ros2_lv/0/{ZID}/0/0/NN/%/%/listener"
     key = robot_keys("rmw_zenoh", "coview", "bot1", domain=7).pose
@@ -64,7 +62,7 @@ def test_liveliness_tokens_match_rmw_zenoh() -> None:
     )
 
 
-def test_rmw_publisher_adds_sequence_and_gid_without_encoding() -> None:
+def test_rmw_publisher_adds_sequence_and_gid_without_encoding():
     net = MemoryTransport()
     keys = [robot_keys("rmw_zenoh", "coview", name, domain=7).pose for name in ("a", "b")]
     tokens = [publisher_token(key, ZID, "coview", number) for number, key in enumerate(keys, 1)]

@@ -1,10 +1,7 @@
 """Each configuration in examples/zenoh works as its comments say, on loopback and another port."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -13,14 +10,14 @@ import zenoh
 from sockets import free_endpoint, until
 from zenoh_routers import Router
 
-from coview_stream.messages.types import Encoded, Sample
+from coview_stream.messages.types import Encoded
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
+from coview_stream.stream.transport.zenoh_transport import open_transport
 
 EXAMPLES = Path(__file__).parents[3] / "examples" / "zenoh"
 
 
-def moved(source: Path, folder: Path, endpoint: str) -> Path:
+def moved(source, folder, endpoint):
     """Copy an example into ``folder``, with the port of ``endpoint`` in place of zenoh's own."""
     text = source.read_text()
     assert ":7447" in text
@@ -29,18 +26,17 @@ def moved(source: Path, folder: Path, endpoint: str) -> Path:
     return target
 
 
-def check_round_trip(node: ZenohTransport, robot: ZenohTransport, name: str = "r1") -> None:
+def check_round_trip(node, robot, name="r1"):
     """A cloud in, a pose out, a question answered, the node seen alive."""
     keys = robot_keys("native", "coview", name)
-    clouds: list[Sample] = []
-    poses: list[Sample] = []
+    clouds, poses = [], []
     node.subscribe(keys.cloud, clouds.append, "newest")
     node.answer(keys.reset, lambda _: {"ok": True})
     node.announce(keys.alive)
     robot.subscribe(keys.pose, poses.append, "all")
     cloud, pose = robot.publisher(keys.cloud, "bulk"), node.publisher(keys.pose, "realtime")
 
-    def both() -> bool:
+    def both():
         cloud.put(Encoded(bytes(100_000)))
         pose.put(Encoded(b"pose"))
         return bool(clouds and poses)
@@ -51,7 +47,7 @@ def check_round_trip(node: ZenohTransport, robot: ZenohTransport, name: str = "r
     until(lambda: any(reply.ok for reply in session.liveliness().get(keys.alive, timeout=2.0)))
 
 
-def test_peer_example_on_one_machine(tmp_path: Path) -> None:
+def test_peer_example_on_one_machine(tmp_path):
     endpoint = free_endpoint()
     config = moved(EXAMPLES / "peer.json5", tmp_path, endpoint)
     with closing(open_transport(config=config)) as node, closing(open_transport([endpoint])) as robot:
@@ -59,7 +55,7 @@ def test_peer_example_on_one_machine(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_router_example_connects_clients(tmp_path: Path) -> None:
+def test_router_example_connects_clients(tmp_path):
     with Router() as router:
         config = moved(EXAMPLES / "client.json5", tmp_path, router.endpoint)
         with closing(open_transport(config=config)) as node, closing(open_transport(config=config)) as robot:
@@ -68,7 +64,7 @@ def test_router_example_connects_clients(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def certificates(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mtls")
     program = EXAMPLES / "mtls" / "make_certificates.py"
     command = [sys.executable, str(program), "certificates", "--router", "127.0.0.1", "localhost"]
@@ -77,7 +73,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def secured(folder: Path) -> Iterator[str]:
+def secured(folder):
     """Run the mTLS router; yields its endpoint. The copies of the other two examples point to it."""
     endpoint = free_endpoint()
     for name in ("router", "node", "robot"):
@@ -92,9 +88,7 @@ def secured(folder: Path) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_access_control_example_limits_robots_to_their_keys(
-    certificates: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_access_control_example_limits_robots_to_their_keys(certificates, monkeypatch):
     monkeypatch.chdir(certificates)
     with (
         secured(certificates),
@@ -104,8 +98,7 @@ def test_access_control_example_limits_robots_to_their_keys(
     ):
         check_round_trip(node, first, "r1")
         check_round_trip(node, second, "r2")
-        heard: list[Sample] = []
-        spied: list[Sample] = []
+        heard, spied = [], []
         node.subscribe("coview/**", heard.append, "all")
         second.subscribe("coview/r1/**", spied.append, "all")
         until(lambda: put(first, "coview/r1/in/odom", b"before") or heard)
@@ -121,7 +114,7 @@ def test_access_control_example_limits_robots_to_their_keys(
         assert not [reply for reply in second._session.get("coview/r1/rpc/reset", timeout=1.0) if reply.ok]
 
 
-def put(transport: ZenohTransport, key: str, payload: bytes) -> None:
+def put(transport, key, payload):
     """Publish in order with all else of this transport, through a declared publisher and without one."""
     publisher = transport.publisher(key, "data")
     publisher.put(Encoded(payload))
@@ -130,7 +123,7 @@ def put(transport: ZenohTransport, key: str, payload: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_tls_example_refuses_clients_without_certificate(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tls_example_refuses_clients_without_certificate(certificates, monkeypatch):
     monkeypatch.chdir(certificates)
     with secured(certificates) as endpoint:
         anonymous = zenoh.Config()
@@ -146,13 +139,13 @@ def test_tls_example_refuses_clients_without_certificate(certificates: Path, mon
 
 
 @pytest.mark.slow
-def test_tls_example_key_files_are_private(certificates: Path) -> None:
+def test_tls_example_key_files_are_private(certificates):
     for key in (certificates / "certificates").glob("*.key"):
         assert key.stat().st_mode & 0o077 == 0
 
 
 @pytest.mark.slow
-def test_tls_example_names_missing_certificate_files() -> None:
+def test_tls_example_names_missing_certificate_files():
     program = EXAMPLES / "mtls" / "make_certificates.py"
     code = f"import runpy, sys; sys.modules['cryptography'] = None; runpy.run_path({str(program)!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
@@ -161,6 +154,6 @@ def test_tls_example_names_missing_certificate_files() -> None:
     assert done.stderr.endswith("pip install cryptography\n")
 
 
-def test_every_zenoh_example_is_tested() -> None:
+def test_every_zenoh_example_is_tested():
     names = {path.relative_to(EXAMPLES).as_posix() for path in EXAMPLES.rglob("*.json5")}
     assert names == {"peer.json5", "client.json5", *(f"mtls/{name}.json5" for name in ("router", "robot", "node"))}

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import logging
 import socket
@@ -7,11 +5,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from sockets import free_endpoint, until
@@ -20,26 +16,26 @@ from zenoh_routers import Router, RouterProcess
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.transport import Connection, Transport
+from coview_stream.stream.transport.transport import Connection
 from coview_stream.stream.transport.zenoh_config import compose, reason
 from coview_stream.stream.transport.zenoh_io import MAX_INBOX, THREADS, Inboxes
-from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
+from coview_stream.stream.transport.zenoh_transport import open_transport
 
 ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
+def pair():
     """Two transports that talk: a listening peer and its client."""
     endpoint = free_endpoint()
     with closing(open_transport(listen=[endpoint])) as node, closing(open_transport([endpoint])) as robot:
         yield node, robot
 
 
-def test_closed_inbox_handles_nothing() -> None:
+def test_closed_inbox_handles_nothing():
     inboxes = Inboxes(RateLimitedErrors(logging.getLogger("test")))
     worker = threading.Thread(target=inboxes.run)
-    handled: list[Any] = []
+    handled = []
     closed = inboxes.open("a", handled.append, 10)
     closed.close()
     first, second = SimpleNamespace(payload=b"1", attachment=None), SimpleNamespace(payload=b"2", attachment=None)
@@ -52,9 +48,9 @@ def test_closed_inbox_handles_nothing() -> None:
     assert handled == [second]
 
 
-def test_large_samples_that_wait_are_bounded_and_the_newest_is_kept() -> None:
+def test_large_samples_that_wait_are_bounded_and_the_newest_is_kept():
     inboxes = Inboxes(RateLimitedErrors(logging.getLogger("test")))
-    handled: list[Any] = []
+    handled = []
     inbox = inboxes.open("a", handled.append, 1000)
     samples = [SimpleNamespace(payload=range(MAX_INBOX // 4), attachment=None) for _ in range(50)]
     samples += [
@@ -73,7 +69,7 @@ def test_large_samples_that_wait_are_bounded_and_the_newest_is_kept() -> None:
 
 
 @pytest.mark.parametrize("selector", ["**", "coview/**", "coview/*/rpc/*", "coview/@node/**", "*/r1/rpc/reset"])
-def test_question_with_a_wildcard_calls_no_handler(pair: tuple[ZenohTransport, ZenohTransport], selector: str) -> None:
+def test_question_with_a_wildcard_calls_no_handler(pair, selector):
     node, robot = pair
     called = []
     for key in ("coview/r1/rpc/reset", "coview/@node/r1/rpc/reload"):
@@ -88,17 +84,17 @@ def test_question_with_a_wildcard_calls_no_handler(pair: tuple[ZenohTransport, Z
     assert robot.query("coview/r1/rpc/reset")["ok"]  # its own key still does
 
 
-def ask(transport: ZenohTransport, selector: str) -> list[Any]:
+def ask(transport, selector):
     return list(transport._session.get(selector, timeout=5.0))
 
 
-def alive(transport: ZenohTransport, key: str) -> bool:
+def alive(transport, key):
     return any(reply.ok for reply in transport._session.liveliness().get(key, timeout=1.0))
 
 
-def test_samples_arrive_unchanged(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_samples_arrive_unchanged(pair):
     node, robot = pair
-    got: list[Sample] = []
+    got = []
     node.subscribe("r1/in/*", got.append, "all")
     odometry = robot.publisher("r1/in/odom", "data")
     cloud = robot.publisher("r1/in/cloud", "bulk")
@@ -114,9 +110,9 @@ def test_samples_arrive_unchanged(pair: tuple[ZenohTransport, ZenohTransport]) -
     ]
 
 
-def test_deletes_are_not_delivered(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_deletes_are_not_delivered(pair):
     node, robot = pair
-    got: list[Sample] = []
+    got = []
     node.subscribe("r1/in/odom", got.append, "all")
     publisher = robot.publisher("r1/in/odom", "data")
     robot._session.delete("r1/in/odom")
@@ -125,13 +121,12 @@ def test_deletes_are_not_delivered(pair: tuple[ZenohTransport, ZenohTransport]) 
     assert [sample.payload for sample in got] == [b"after"]
 
 
-def test_newest_subscription_skips_and_all_subscription_does_not(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_newest_subscription_skips_and_all_subscription_does_not(pair):
     node, robot = pair
     go = threading.Event()
-    newest: list[bytes] = []
-    every: list[bytes] = []
+    newest, every = [], []
 
-    def slow(sample: Sample) -> None:
+    def slow(sample):
         newest.append(sample.payload)
         assert go.wait(10)
 
@@ -150,10 +145,10 @@ def test_newest_subscription_skips_and_all_subscription_does_not(pair: tuple[Zen
     assert every == [b"first", *(str(number).encode() for number in range(200))]
 
 
-def test_slow_handlers_hold_up_no_others_while_a_thread_is_free(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_slow_handlers_hold_up_no_others_while_a_thread_is_free(pair):
     node, robot = pair
     go = threading.Event()
-    got: list[bytes] = []
+    got = []
     for number in range(THREADS - 1):
         node.subscribe(f"slow/{number}", lambda _: go.wait(10.0), "all")
     node.subscribe("quick", lambda sample: got.append(sample.payload), "all")
@@ -166,13 +161,11 @@ def test_slow_handlers_hold_up_no_others_while_a_thread_is_free(pair: tuple[Zeno
     go.set()
 
 
-def test_raising_handler_is_kept_and_logged_once(
-    pair: tuple[ZenohTransport, ZenohTransport], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_raising_handler_is_kept_and_logged_once(pair, caplog):
     node, robot = pair
-    got: list[bytes] = []
+    got = []
 
-    def handler(sample: Sample) -> None:
+    def handler(sample):
         got.append(sample.payload)
         raise ValueError("cannot decode this")
 
@@ -185,10 +178,10 @@ def test_raising_handler_is_kept_and_logged_once(
     assert lines == ["r1/x: ValueError: cannot decode this"]
 
 
-def test_queries_reply_json_and_errors(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_queries_reply_json_and_errors(pair):
     node, robot = pair
 
-    def refuse(_: dict[str, str]) -> dict[str, Any]:
+    def refuse(_):
         raise ValueError("not now")
 
     end = node.answer("r1/rpc/reset", lambda parameters: {"got": parameters})
@@ -206,12 +199,11 @@ def test_queries_reply_json_and_errors(pair: tuple[ZenohTransport, ZenohTranspor
 
 
 @pytest.mark.slow
-def test_transport_recovers_after_router_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+def test_transport_recovers_after_router_is_killed(caplog):
     endpoint = free_endpoint()
     node = open_transport(connect=[endpoint])  # both before their router
     robot = open_transport(connect=[endpoint])
-    clouds: list[Sample] = []
-    poses: list[Sample] = []
+    clouds, poses = [], []
     node.subscribe("r1/in/**", clouds.append, "newest")
     node.answer("r1/rpc/reset", lambda _: {"ok": True})
     node.announce("r1/alive")
@@ -219,7 +211,7 @@ def test_transport_recovers_after_router_is_killed(caplog: pytest.LogCaptureFixt
     robot.subscribe("r1/out/pose", poses.append, "all")
     cloud = robot.publisher("r1/in/cloud", "bulk")
 
-    def works() -> bool:
+    def works():
         cloud.put(Encoded(b"cloud"))
         pose.put(Encoded(b"pose"))
         return bool(clouds and poses and ask(robot, "r1/rpc/reset") and alive(robot, "r1/alive"))
@@ -242,7 +234,7 @@ def test_transport_recovers_after_router_is_killed(caplog: pytest.LogCaptureFixt
 
 
 @pytest.mark.slow
-def test_silent_host_does_not_block_opening() -> None:
+def test_silent_host_does_not_block_opening():
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
@@ -257,7 +249,7 @@ def test_silent_host_does_not_block_opening() -> None:
 
 
 @pytest.mark.slow
-def test_process_without_close_exits_cleanly() -> None:
+def test_process_without_close_exits_cleanly():
     program = (
         "import socket\n"
         "from coview_stream.stream.transport.zenoh_transport import open_transport\n"
@@ -274,9 +266,9 @@ def test_process_without_close_exits_cleanly() -> None:
 
 
 @pytest.mark.slow
-def test_close_ends_all_threads_and_is_idempotent() -> None:
+def test_close_ends_all_threads_and_is_idempotent():
     with Router() as router:
-        transport: Transport = open_transport(connect=[router.endpoint])
+        transport = open_transport(connect=[router.endpoint])
         transport.subscribe("a", print, "all")
         transport.subscribe("b", print, "newest")
         transport.answer("c", lambda _: {})
@@ -314,7 +306,7 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
         ),
     ],
 )
-def test_invalid_configuration_is_refused_at_once(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_invalid_configuration_is_refused_at_once(options, message, tmp_path):
     if "config" in options:
         path = tmp_path / "zenoh.json5"
         path.write_text(options["config"])
@@ -326,7 +318,7 @@ def test_invalid_configuration_is_refused_at_once(options: dict[str, Any], messa
     assert ".rs:" not in str(caught.value)
 
 
-def test_missing_config_file_and_busy_port_are_named(tmp_path: Path) -> None:
+def test_missing_config_file_and_busy_port_are_named(tmp_path):
     with pytest.raises(TransportError, match=r"gone\.json5: No such file"):
         open_transport(config=tmp_path / "gone.json5")
     endpoint = free_endpoint()
@@ -338,28 +330,28 @@ def test_missing_config_file_and_busy_port_are_named(tmp_path: Path) -> None:
     assert endpoint in str(caught.value)
 
 
-def test_invalid_key_is_refused_without_router() -> None:
+def test_invalid_key_is_refused_without_router():
     transport = open_transport(connect=[free_endpoint()])
     with pytest.raises(TransportError, match="a//b"):
         transport.subscribe("a//b", print, "all")
     transport.close()
 
 
-def settings(config: Any, *keys: str) -> list[Any]:
+def settings(config, *keys):
     return [json.loads(config.get_json(key)) for key in keys]
 
 
 ENDPOINTS = ("mode", "connect/endpoints", "listen/endpoints")
 
 
-def test_mode_follows_from_the_endpoints() -> None:
+def test_mode_follows_from_the_endpoints():
     assert settings(compose(["tcp/h:1"]), *ENDPOINTS) == ["client", ["tcp/h:1"], []]
     assert settings(compose((), ["tcp/h:2"]), *ENDPOINTS) == ["peer", [], ["tcp/h:2"]]
     assert settings(compose(["tcp/h:1"], ["tcp/h:2"]), *ENDPOINTS) == ["peer", ["tcp/h:1"], ["tcp/h:2"]]
     assert settings(compose(), *ENDPOINTS) == ["peer", [], []]
 
 
-def test_config_file_overrides_defaults_and_options_override_its_endpoints(tmp_path: Path) -> None:
+def test_config_file_overrides_defaults_and_options_override_its_endpoints(tmp_path):
     keys = (
         *ENDPOINTS,
         "scouting/multicast/enabled",
@@ -383,15 +375,14 @@ def test_config_file_overrides_defaults_and_options_override_its_endpoints(tmp_p
     assert listen["router"] == ["tcp/[::]:7447"]
 
 
-def test_subscription_that_is_ended_hears_nothing(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_subscription_that_is_ended_hears_nothing(pair):
     node, robot = pair
-    heard: list[bytes] = []
-    others: list[bytes] = []
+    heard, others = [], []
     end = node.subscribe("coview/r1/in/cloud", lambda sample: heard.append(bytes(sample.payload)), "newest")
     node.subscribe("coview/r1/in/odom", lambda sample: others.append(bytes(sample.payload)), "all")
     cloud, odom = (robot.publisher(f"coview/r1/in/{name}", "report") for name in ("cloud", "odom"))
 
-    def sent() -> bool:
+    def sent():
         cloud.put(Encoded(b"1", ""))
         odom.put(Encoded(b"2", ""))
         return bool(heard and others)
@@ -407,7 +398,7 @@ def test_subscription_that_is_ended_hears_nothing(pair: tuple[ZenohTransport, Ze
     again()
 
 
-def test_lease_is_what_is_asked_for_unless_the_file_says() -> None:
+def test_lease_is_what_is_asked_for_unless_the_file_says():
     assert "2000" in str(compose(lease_ms=2000).get_json("transport/link/tx/lease"))
     assert "10000" in str(compose().get_json("transport/link/tx/lease"))
 
@@ -424,7 +415,7 @@ def test_lease_is_what_is_asked_for_unless_the_file_says() -> None:
         ("a.json5", "{mode:", "line 1, column 7: expected"),
     ],
 )
-def test_configuration_errors_are_one_short_line(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_configuration_errors_are_one_short_line(tmp_path, name, text, said):
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(TransportError) as caught:
@@ -435,6 +426,6 @@ def test_configuration_errors_are_one_short_line(tmp_path: Path, name: str, text
     assert "\n" not in message
 
 
-def test_other_errors_are_unchanged() -> None:
+def test_other_errors_are_unchanged():
     assert reason(ValueError("it broke\n at io/x.rs:12.")) == "it broke"
     assert reason(ValueError("")) == "ValueError"
