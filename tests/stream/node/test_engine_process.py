@@ -136,26 +136,6 @@ def test_killed_engine_process_is_restarted(engine, world_file, world_drive):
 
 
 @pytest.mark.slow
-def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(engine, world_file):
-    process = engine("search", world_file)
-    process.start()
-    process.wait_prepared()
-    process.watch()
-    first = process.pid
-    os.kill(first, signal.SIGKILL)
-    with pytest.raises(DiedError, match=r"search engine died \(by signal 9\)"):
-        until(process.watch, 10.0)
-    assert not alive(first)  # nor a zombie
-    assert process.pid is None
-    process.watch()
-    assert process.pid not in (None, first)
-    until(lambda: process.watch() or process.ready, 60.0)  # ready before a job asks
-    process.close()
-    with pytest.raises(DiedError, match="closed"):
-        process.watch()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("adopted", [False, True])
 def test_child_without_a_map_ends_when_it_is_closed(engine, adopted):
     child = EngineChild("search")

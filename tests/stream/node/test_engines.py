@@ -179,24 +179,15 @@ def test_two_robots_give_same_results_as_each_alone(engines, reference, world_dr
             np.testing.assert_allclose(there.T_map_body, undisturbed.T_map_body, atol=0.02)
 
 
-def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_drive):
-    follower = Follower(*engines, "careless")
-    bad = (
-        (np.full((50, 3), np.nan, np.float32), world_drive.T_odom_body[0], CloudError),
-        (world_drive.clouds[0][:3], world_drive.T_odom_body[0], CloudError),
-        (world_drive.clouds[0], np.diag([1.0, 1.0, 2.0, 1.0]), RunError),
-    )
-    for k in range(FRAMES):
-        for points, T, error in bad:
-            with pytest.raises(error):
-                engines[0].run(FrameJob("careless", 1, round(5e8 * k), points, T, search_result=follower.search_result))
-        follower.follow(world_drive, [k], reference.verdicts)
-    for fix, undisturbed in zip(follower.fixes, reference.fixes, strict=True):
-        same(fix, undisturbed)
-
-
-def test_what_comes_with_a_rejected_frame_is_applied_once(engines, reference, world_drive):
+def test_frames_that_are_rejected_change_nothing_and_what_comes_with_them_is_applied_once(
+    engines, reference, world_drive
+):
     """Search results, hints and demands to verify the place: handed over again with the next frame."""
+    bad = (
+        ({"points": np.full((50, 3), np.nan, np.float32)}, CloudError),
+        ({"points": world_drive.clouds[0][:3]}, CloudError),
+        ({"T_odom_body": np.diag([1.0, 1.0, 2.0, 1.0])}, RunError),
+    )
     plain, careless = Follower(engines[0], None, "plain"), Follower(engines[0], None, "twice")
     events = {plain.robot: [], careless.robot: []}
     for k in range(FRAMES):
@@ -204,9 +195,9 @@ def test_what_comes_with_a_rejected_frame_is_applied_once(engines, reference, wo
             result = reference.verdicts[k - 1] if 0 < k <= len(reference.verdicts) else None
             job = replace(robot.job(world_drive, k), search_result=result, hint=world_drive.T_map_body[k])
             job = replace(job, require_verification=k == FRAMES - 1)
-            if robot is careless:
-                with pytest.raises(CloudError):
-                    engines[0].run(replace(job, points=job.points[:3]))
+            for wrong, error in bad if robot is careless else ():
+                with pytest.raises(error):
+                    engines[0].run(replace(job, **wrong))
             answer = engines[0].run(job)
             robot.fixes.append(answer.fix)
             events[robot.robot].append(answer.events)

@@ -260,24 +260,6 @@ def test_failing_status_is_not_retried_in_a_loop():
     assert asked[2] - asked[0] > 0.5
 
 
-def test_unexpected_engine_error_does_not_stop_the_node():
-    site = Site("r1")
-    run = site.track.run
-    errors = [RuntimeError("unforeseen")]
-    site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
-    site.node.start()
-    try:
-        clock = iter(range(100_000))
-
-        def localized():
-            site.sees("r1", 0.02 * next(clock))
-            return site.net.samples("coview/r1/out/pose")
-
-        until(localized, 3.0)
-    finally:
-        site.node.close()
-
-
 def test_unencodable_pose_of_one_robot_does_not_affect_others():
     site = declared("r1", "r2")
     site.engine.answer = lambda job: tracking(job, sigma=float("nan") if job.robot == "r1" else 0.1)

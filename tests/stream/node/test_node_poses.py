@@ -51,7 +51,7 @@ def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
 
 
 def test_poses_follow_rmw_zenoh_conventions():
-    site = declared("r1", preset="rmw_zenoh")
+    site = declared("r1", "r2", preset="rmw_zenoh")
     keys = site.keys["r1"]
     for seconds in (0.0, STEP):
         moved = encode_odometry(message(seconds), "cdr")
@@ -65,21 +65,14 @@ def test_poses_follow_rmw_zenoh_conventions():
     assert [s.encoding for s in sent] == ["", ""]
     assert [read_attachment(s.attachment)[1] for s in sent] == [1, 2]
     nodes = [t for t in site.net.announced if "/NN/" in t]
-    publishers = [t for t in site.net.announced if "/MP/" in t]
-    assert (len(nodes), len(publishers)) == (1, 1)
+    publishers = sorted(t for t in site.net.announced if "/MP/" in t)
+    assert (len(nodes), len(publishers)) == (1, 2)
+    assert len({t.split("/")[4] for t in publishers}) == 2  # entity ids
     assert "%r1%coview%pose" in publishers[0]
     assert sent[0].attachment[-16:] == gid_of(publishers[0])
     np.testing.assert_allclose(
         decode_pose(sent[1]).T_map_body, T_MAP_ODOM @ pose_from(np.eye(3), [2 * STEP, 0, 0]), atol=1e-6
     )
-
-
-def test_each_robot_has_its_own_rmw_publisher():
-    site = declared("r1", "r2", preset="rmw_zenoh")
-    publishers = sorted(t for t in site.net.announced if "/MP/" in t)
-    assert len(publishers) == 2
-    assert len({t.split("/")[4] for t in publishers}) == 2  # entity ids
-    assert len([t for t in site.net.announced if "/NN/" in t]) == 1
 
 
 def test_pose_encoding_option():

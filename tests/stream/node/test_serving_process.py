@@ -79,3 +79,5 @@ def test_engines_that_are_killed_or_stopped_at_any_time_come_back(service, numbe
     assert max(service.errors()) < FALSE
     restarts = {name: engine["restarts"] for name, engine in service.health()["engines"].items()}
     assert restarts == {"track": 1, "search": 1}
+    # it was idle, and was started again without a job
+    assert any("the search engine died (by signal 9)" in record["message"] for record in service.said())

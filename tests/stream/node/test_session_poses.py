@@ -82,22 +82,6 @@ def test_heading_error_propagates_to_position(robot):
     np.testing.assert_allclose(later.covariance, later.covariance.T)
 
 
-def test_correction_does_not_change_published_stamps(robot):
-    robot.localized(0.0)
-    stamps = []
-    for k in range(1, 40):
-        robot.moved(0.05 * k)
-        if k % 2 == 0:
-            job = robot.job_for(0.05 * k - 0.02)
-            robot.session.handle_result(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
-        sent = robot.session.pose()
-        stamps.append(sent.stamp_ns)
-        newest = k if k % 2 == 0 else k - 1
-        np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(0.01 * newest) @ pose(0.1 * k), atol=1e-9)
-    assert stamps == sorted(stamps)
-    assert stamps[-1] == ns(1.95)
-
-
 def test_odometry_timeout_ends_the_pose_until_a_frame_is_verified(robot):
     robot.localized(0.0)
     robot.session.tick(robot.now + 0.49)
