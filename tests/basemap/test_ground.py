@@ -1,13 +1,10 @@
 """Ground, its raster and its levels on scenes whose truth is known."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from coview_stream.basemap.ground import GroundRaster, cloth_available, ground_filter, ground_mask
@@ -15,7 +12,6 @@ from coview_stream.basemap.stations import find_stations
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rasters import filled
 
-Scene = tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]
 METHODS = [
     pytest.param("cloth", marks=pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")),
     "morphological",
@@ -23,18 +19,18 @@ METHODS = [
 DATA = Path(os.environ.get("COVIEW_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 
 
-def _slab(x: tuple[float, float], y: tuple[float, float], z: float, seed: int) -> npt.NDArray[np.float64]:
+def _slab(x, y, z, seed):
     rng = np.random.default_rng(seed)
     count = int((x[1] - x[0]) * (y[1] - y[0]) * 16)
     return np.column_stack([rng.uniform(*x, count), rng.uniform(*y, count), rng.normal(z, 0.02, count)])
 
 
-def _hills(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _hills(xy):
     return 3.0 * np.sin(xy[:, 0] / 20.0) + 0.05 * xy[:, 1]
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     """Rolling ground without returns below two houses; trees over ground; a few echoes from below."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(-50, 50, (60_000, 2))
@@ -53,7 +49,7 @@ def scene() -> Scene:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_ground_mask_of_hills_houses_and_trees(scene: Scene, method: str) -> None:
+def test_ground_mask_of_hills_houses_and_trees(scene, method):
     points, truth = scene
     mask = ground_mask(points, method)
     assert mask.shape == (len(points),)
@@ -62,9 +58,7 @@ def test_ground_mask_of_hills_houses_and_trees(scene: Scene, method: str) -> Non
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_ground_filter_prints_nothing_and_leaves_no_files(
-    scene: Scene, method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_ground_filter_prints_nothing_and_leaves_no_files(scene, method, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     sys.stdout.write("before\n")
     ground_mask(scene[0], method)
@@ -73,9 +67,7 @@ def test_ground_filter_prints_nothing_and_leaves_no_files(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_cloth_wheel_the_morphological_filter_takes_over(scene, monkeypatch):
     points = scene[0]
     expected = ground_mask(points, "morphological")
     monkeypatch.setitem(sys.modules, "CSF", None)
@@ -86,7 +78,7 @@ def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
 
 
 @pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")
-def test_cloth_filter_is_the_default_where_available(scene: Scene) -> None:
+def test_cloth_filter_is_the_default_where_available(scene):
     points = scene[0]
     assert ground_filter(points) == "cloth"
     assert ground_filter(points[points[:, 0] ** 2 < 4.0]) == "morphological"
@@ -94,33 +86,33 @@ def test_cloth_filter_is_the_default_where_available(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_cloth_tiles_have_no_seams() -> None:
+def test_cloth_tiles_have_no_seams():
     xy = np.random.default_rng(6).uniform(0, 300, (120_000, 2))
     points = np.column_stack([xy, 0.1 * xy[:, 0]]).astype(np.float32)
     assert ground_mask(points).mean() > 0.999
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 49])
-def test_few_points_are_all_ground(count: int) -> None:
+def test_few_points_are_all_ground(count):
     points = np.random.default_rng(7).uniform(0, 1, (count, 3)).astype(np.float32) * np.float32([20, 20, 0.05])
     assert ground_mask(points).shape == (count,)
     assert ground_mask(points).all()
 
 
-def test_too_large_extent_is_refused() -> None:
+def test_too_large_extent_is_refused():
     points = np.array([[0, 0, 0], [9e7, 9e7, 0]], np.float32)
     with pytest.raises(ConfigError, match="stray points"):
         ground_mask(points)
 
 
-def test_ground_height_is_bilinear_and_ignores_unknown_neighbours() -> None:
+def test_ground_height_is_bilinear_and_ignores_unknown_neighbours():
     raster = GroundRaster(np.array([[0, 1], [np.nan, 3]], np.float32), x0=10.0, y0=20.0, cell=2.0)
     at = np.array([[11.0, 21.0], [12.0, 21.0], [13.0, 22.0], [11.0, 23.0], [11.9, 21.9]])
     expected = [0.0, 0.5, 2.0, np.nan, (0.45 * 0.55 * 1 + 0.45 * 0.45 * 3) / (1 - 0.45 * 0.55)]
     np.testing.assert_allclose(raster.height_at(at), expected, rtol=1e-5)
 
 
-def test_push_pull_filling_keeps_known_cells_and_stays_within_their_range() -> None:
+def test_push_pull_filling_keeps_known_cells_and_stays_within_their_range():
     z = np.full((37, 53), np.nan, np.float32)
     z[3, 4], z[30, 50] = 1.0, 5.0
     out = filled(z)
@@ -130,7 +122,7 @@ def test_push_pull_filling_keeps_known_cells_and_stays_within_their_range() -> N
 
 
 @pytest.fixture(scope="module")
-def storeys() -> npt.NDArray[np.float32]:
+def storeys():
     """A two-storey house on a field, with a canopy, a bridge in the open and a table on the upper floor."""
     rng = np.random.default_rng(9)
     canopy = np.column_stack([rng.uniform(14, 26, 20_000), rng.uniform(-20, 20, 20_000), rng.uniform(2.5, 9, 20_000)])
@@ -145,7 +137,7 @@ def storeys() -> npt.NDArray[np.float32]:
     return np.concatenate(parts).astype(np.float32)
 
 
-def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
+def test_floors_of_a_house(storeys):
     levels = find_stations(storeys, 2.0)
     ground, upper = levels[levels[:, 2] < 1], levels[levels[:, 2] >= 1]
     # the whole field, below the house, the bridge and the canopy too, once per square
@@ -159,7 +151,7 @@ def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
 
 
 @pytest.mark.parametrize(("half", "ceiling", "count"), [(10.0, 2.5, 100), (2.0, 2.5, 0), (10.0, 1.5, 0)])
-def test_floors_need_extent_and_headroom(half: float, ceiling: float, count: int) -> None:
+def test_floors_need_extent_and_headroom(half, ceiling, count):
     side = (-half, half)
     slabs = [_slab((-30, 30), (-30, 30), 0.0, 1), _slab(side, side, 3.0, 2), _slab(side, side, 3.0 + ceiling, 3)]
     stations = find_stations(np.concatenate(slabs).astype(np.float32), 2.0)
@@ -169,7 +161,7 @@ def test_floors_need_extent_and_headroom(half: float, ceiling: float, count: int
 @pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("method", METHODS)
-def test_ground_error_on_delft_data(method: str) -> None:
+def test_ground_error_on_delft_data(method):
     path = DATA / "airborne" / "delft_ahn3_2.laz"
     if not path.exists():
         pytest.skip("airborne/delft_ahn3_2.laz is not there; set COVIEW_DATA to the folder of real scans")

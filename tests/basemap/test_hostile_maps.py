@@ -1,11 +1,6 @@
 """Map files made to fail later: one MapError when they are loaded, which names the field."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +11,7 @@ from coview_stream.errors import MapError
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[file_format.Arrays, dict[str, Any]]:
+def small(tmp_path_factory):
     """Arrays and parameters of a map of a plane with two boxes."""
     rng = np.random.default_rng(3)
     ground = np.c_[rng.uniform(-9, 9, (9000, 2)), rng.normal(0, 0.01, 9000)]
@@ -29,10 +24,10 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[file_format.Arrays,
 
 
 @pytest.fixture
-def load(small: Any, tmp_path: Path) -> Callable[..., BaseMap]:
+def load(small, tmp_path):
     """Loads a map of other arrays, and of other parameters, from a file."""
 
-    def loaded(arrays: file_format.Arrays, parameters: Any = small[1]) -> BaseMap:
+    def loaded(arrays, parameters=small[1]):
         file_format.save(tmp_path / "a.coview", arrays, parameters)
         return BaseMap.load(tmp_path / "a.coview")
 
@@ -40,12 +35,12 @@ def load(small: Any, tmp_path: Path) -> Callable[..., BaseMap]:
 
 
 @pytest.fixture
-def undescribed(small: Any) -> file_format.Arrays:
+def undescribed(small):
     """The arrays of a map whose stations are not described."""
     return {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
 
 
-def test_whole_map_is_loaded(small: Any, load: Any) -> None:
+def test_whole_map_is_loaded(small, load):
     assert len(load(*small)) == len(small[0]["stations"])
 
 
@@ -56,7 +51,7 @@ NAMES = ["origin", "stations", "points", "normals", "tile_index", "surveyed", "s
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("change", ["shorter", "flat", "type", "deeper", "wider"])
-def test_array_of_another_shape_or_type_is_refused_when_loading(small: Any, load: Any, name: str, change: str) -> None:
+def test_array_of_another_shape_or_type_is_refused_when_loading(small, load, name, change):
     array = small[0][name]
     if change == "shorter" and name in ("surveyed", "tile_index"):
         pytest.skip("any size will do")
@@ -76,7 +71,7 @@ def test_array_of_another_shape_or_type_is_refused_when_loading(small: Any, load
     ("name", "value"), [("origin", np.nan), ("stations", np.inf), ("surveyed_corner", np.nan), ("tile_index", 1 << 40),
                         ("tile_index", -1)]
 )  # fmt: skip
-def test_values_that_would_be_used_as_places_are_checked(small: Any, load: Any, name: str, value: float) -> None:
+def test_values_that_would_be_used_as_places_are_checked(small, load, name, value):
     changed = small[0][name].copy()
     changed[..., -1] = value
     with pytest.raises(MapError, match=f"the map's {name}"):
@@ -86,9 +81,7 @@ def test_values_that_would_be_used_as_places_are_checked(small: Any, load: Any, 
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e30, 3e6, -5e3])
 @pytest.mark.parametrize("name", ["points", "stations"])
 @pytest.mark.parametrize("column", [0, 1, 2])
-def test_points_and_stations_are_finite_and_on_the_surveyed_cells(
-    small: Any, load: Any, value: float, name: str, column: int
-) -> None:
+def test_points_and_stations_are_finite_and_on_the_surveyed_cells(small, load, value, name, column):
     changed = small[0][name].copy()
     changed[-1, column] = value
     if column == 2 and abs(value) < 1e7:
@@ -98,7 +91,7 @@ def test_points_and_stations_are_finite_and_on_the_surveyed_cells(
         load(small[0] | {name: changed})
 
 
-def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused(small: Any, load: Any) -> None:
+def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused(small, load):
     tiles = small[0]["field.tiles"].copy()
     tiles[0, 1] += 1400
     with pytest.raises(MapError, match=r"field\.tiles lies beside"):
@@ -109,32 +102,32 @@ def test_tile_of_the_field_far_away_and_a_raster_larger_than_any_map_are_refused
 
 
 @pytest.mark.parametrize("rows", [[[0, 5], [0, 5]], [[0, 5], [4, 9]], [[5, 9], [0, 6]], [[0, 12], [3, 4], [4, 5]]])
-def test_points_are_named_once(small: Any, load: Any, rows: list[list[int]]) -> None:
+def test_points_are_named_once(small, load, rows):
     index = np.array([[0, k, *row] for k, row in enumerate(rows)])
     with pytest.raises(MapError, match="tile_index names points twice"):
         load(small[0] | {"tile_index": index})
 
 
-def test_empty_stretches_are_none_twice(small: Any, load: Any) -> None:
+def test_empty_stretches_are_none_twice(small, load):
     index = np.array([[0, 0, 3, 3], [0, 1, 0, 3], [0, 2, 3, 9], [0, 3, 0, 0], [0, 4, 3, 3]])
     assert len(load(small[0] | {"tile_index": index}).points) == len(small[0]["points"])
 
 
-def test_stations_of_storeys_without_points_are_described_as_empty(undescribed: Any, load: Any) -> None:
+def test_stations_of_storeys_without_points_are_described_as_empty(undescribed, load):
     undescribed["stations"] = undescribed["stations"].copy()
     undescribed["stations"][1:, :2], undescribed["stations"][:, 2] = undescribed["stations"][:1, :2], 900.0
     undescribed["stations"][0, 2] = -900.0
     assert np.isfinite(load(undescribed).descriptors("coview")).all()
 
 
-def test_stations_on_a_thousand_storeys_are_refused(undescribed: Any, load: Any) -> None:
+def test_stations_on_a_thousand_storeys_are_refused(undescribed, load):
     places = np.repeat(undescribed["stations"][:20], 100, axis=0)
     places[:, 2] = 3.0 * np.arange(len(places))
     with pytest.raises(MapError, match="storeys, 1024 at most"):
         load(undescribed | {"stations": places}).descriptors("coview")
 
 
-def test_many_stations_above_one_another_are_refused(undescribed: Any, load: Any) -> None:
+def test_many_stations_above_one_another_are_refused(undescribed, load):
     undescribed["stations"] = np.repeat(undescribed["stations"][:1], 200, axis=0)
     with pytest.raises(MapError, match="200 stations above one another"):
         _ = load(undescribed).station_grid
@@ -149,7 +142,7 @@ def test_many_stations_above_one_another_are_refused(undescribed: Any, load: Any
         {"config": {"descriptor": {"channels": ["coview"], "colour": 1}}},
     ],
 )  # fmt: skip
-def test_parameters_of_another_kind_are_refused(small: Any, load: Any, parameters: Any) -> None:
+def test_parameters_of_another_kind_are_refused(small, load, parameters):
     whole = small[1] | parameters if isinstance(parameters, dict) and parameters else parameters
     with pytest.raises(MapError, match=r"a\.coview: the map.* (build it|copy or build it) again"):
         load(small[0], whole)
@@ -163,9 +156,7 @@ def test_parameters_of_another_kind_are_refused(small: Any, load: Any, parameter
         ("radius", 1000.0, "radius is 1000"), ("voxel", 1e-300, "voxel is 1e-300"),
     ],
 )  # fmt: skip
-def test_counts_of_the_settings_are_those_of_the_arrays_and_within_bounds(
-    small: Any, load: Any, name: str, value: Any, flaw: str
-) -> None:
+def test_counts_of_the_settings_are_those_of_the_arrays_and_within_bounds(small, load, name, value, flaw):
     parameters = json.loads(json.dumps(small[1]))
     parameters["config"]["descriptor"][name] = value
     arrays = {name: values for name, values in small[0].items() if not name.startswith("descriptor")}
@@ -174,14 +165,14 @@ def test_counts_of_the_settings_are_those_of_the_arrays_and_within_bounds(
 
 
 @pytest.mark.parametrize(("name", "value"), [("learned.tiles", 30_000), ("learned.place_at", np.nan)])
-def test_features_lie_on_the_surveyed_cells(small: Any, name: str, value: float) -> None:
+def test_features_lie_on_the_surveyed_cells(small, name, value):
     kind = file_format._EXPECTED[name][0]
     arrays = small[0] | {name: np.array([[0, 0], [value, 0]]).astype(kind)}
     with pytest.raises(MapError, match=f"{name} lies beside"):
         file_format.check_arrays(arrays, BaseMap(*small).config)
 
 
-def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, load: Any) -> None:
+def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small, load):
     parameters = json.loads(json.dumps(small[1]))
     parameters["config"]["descriptor"]["channels"].append("coview_strict")  # of maps from before November 2026
     with pytest.raises(MapError, match=r"a\.coview: the map's .*'coview_strict'.*; build it again") as error:
@@ -189,13 +180,13 @@ def test_map_with_a_channel_that_is_gone_is_named_with_the_remedy(small: Any, lo
     assert "\n" not in str(error.value)
 
 
-def _with_header(path: Path, text: bytes, body: bytes = bytes(64)) -> Path:
+def _with_header(path, text, body=bytes(64)):
     path.write_bytes(len(text).to_bytes(8, "little") + text + body)
     return path
 
 
 @pytest.mark.parametrize("opening", ["[", '{"a":'])
-def test_header_of_endless_brackets_is_refused(tmp_path: Path, opening: str) -> None:
+def test_header_of_endless_brackets_is_refused(tmp_path, opening):
     path = _with_header(tmp_path / "a.coview", opening.encode() * 1_000_00)
     for use in (file_format.load, file_format.check_target):
         with pytest.raises(MapError):
@@ -210,15 +201,15 @@ def test_header_of_endless_brackets_is_refused(tmp_path: Path, opening: str) -> 
         ([2**62, 4], [0, 0]),
     ],
 )  # fmt: skip
-def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: Any, offsets: list[int]) -> None:
+def test_shapes_that_are_none_are_refused(tmp_path, shape, offsets):
     metadata = {"format": file_format.FORMAT, "version": "1", "parameters": "{}", "sha256": ""}
     header = {"__metadata__": metadata, "a": {"dtype": "U8", "shape": shape, "data_offsets": offsets}}
     with pytest.raises(MapError):
         file_format.load(_with_header(tmp_path / "a.coview", json.dumps(header).encode()), False)
 
 
-def test_null_parameters_and_arrays_that_share_bytes_are_refused(tmp_path: Path) -> None:
-    metadata: dict[str, Any] = {"format": file_format.FORMAT, "version": "1", "parameters": None, "sha256": ""}
+def test_null_parameters_and_arrays_that_share_bytes_are_refused(tmp_path):
+    metadata = {"format": file_format.FORMAT, "version": "1", "parameters": None, "sha256": ""}
     header = {"__metadata__": metadata}
     with pytest.raises(MapError, match="damaged"):
         file_format.load(_with_header(tmp_path / "a.coview", json.dumps(header).encode()))

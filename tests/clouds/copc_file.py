@@ -1,10 +1,7 @@
 """Writer of small COPC files for tests: laspy reads them, and writes none."""
 
-from __future__ import annotations
-
 import io
 import struct
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +15,7 @@ _SCALE = 0.001
 _FORMAT, _RECORD = 6, 30
 
 
-def write_copc(path: Path, points: np.ndarray, classes: np.ndarray | None = None, levels: int = 3) -> int:
+def write_copc(path, points, classes=None, levels=3):
     """Write points (N, 3), metres, as an octree of ``levels`` levels; return the number of its nodes.
 
     Every point stands at one level, drawn by its number. The nodes of the last level are told of in pages of their own.
@@ -36,7 +33,7 @@ def write_copc(path: Path, points: np.ndarray, classes: np.ndarray | None = None
         level = min(levels - 1, number % 4)
         cell = np.floor((point - (center - half)) / (2 * half) * 2**level).astype(int)
         keys.append((level, *cell.tolist()))
-    members: dict[tuple[int, int, int, int], list[int]] = {(0, 0, 0, 0): []}
+    members = {(0, 0, 0, 0): []}
     for number, key in enumerate(keys):
         members.setdefault(key, []).append(number)
         for up in range(1, key[0] + 1):  # nodes on the way are there, if only with no points
@@ -88,7 +85,7 @@ def write_copc(path: Path, points: np.ndarray, classes: np.ndarray | None = None
     return len(filled)
 
 
-def _records(points: np.ndarray, classes: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def _records(points, classes, offset):
     records = np.zeros((len(points), _RECORD), np.uint8)
     records[:, :12] = np.round((points - offset) / _SCALE).astype("<i4").view(np.uint8).reshape(-1, 12)
     records[:, 14] = 0x11  # the first return of one
@@ -96,11 +93,11 @@ def _records(points: np.ndarray, classes: np.ndarray, offset: np.ndarray) -> np.
     return np.ascontiguousarray(records).reshape(-1)
 
 
-def _vlr_head(user: bytes, record: int, size: int, extended: bool = False) -> bytes:
+def _vlr_head(user, record, size, extended=False):
     return struct.pack("<H16sHQ32s" if extended else "<H16sHH32s", 0, user, record, size, b"")
 
 
-def _header(points: np.ndarray, start: int, offset: np.ndarray, extended_at: int) -> bytes:
+def _header(points, start, offset, extended_at):
     low, high = points.min(axis=0), points.max(axis=0)
     sides = [value for pair in zip(high, low, strict=True) for value in pair]
     head = struct.pack(

@@ -1,7 +1,5 @@
 """LAS and LAZ files of a version, a point format and variable records."""
 
-from __future__ import annotations
-
 import laspy
 import numpy as np
 

@@ -1,15 +1,11 @@
 """Windows of COPC files, local and by HTTP ranges from a server on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import urllib.request
-from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,13 +25,13 @@ class Handler(SimpleHTTPRequestHandler):
     """Serves a folder, with ranges if ``ranges`` is set, and records the sizes it sent."""
 
     ranges = True
-    sent: list[int] = []  # noqa: RUF012
+    sent = []  # noqa: RUF012
     busy = 0
 
-    def log_message(self, *_: Any) -> None:
+    def log_message(self, *_):
         """Say nothing."""
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         if type(self).busy:
             type(self).busy -= 1
             self.send_error(503)
@@ -54,21 +50,21 @@ class Handler(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def points() -> np.ndarray:
+def points():
     """Return points (N, 3) of a site in UTM coordinates."""
     rng = np.random.default_rng(4)
     return rng.uniform([500_000.0, 5_600_000.0, 100.0], [500_400.0, 5_600_300.0, 130.0], (20_000, 3))
 
 
 @pytest.fixture(scope="module")
-def site(points: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(points, tmp_path_factory):
     path = tmp_path_factory.mktemp("copc") / "site.copc.laz"
     assert write_copc(path, points) > 10
     return path
 
 
 @contextlib.contextmanager
-def served_folder(folder: Path) -> Iterator[str]:
+def served_folder(folder):
     Handler.ranges, Handler.sent, Handler.busy = True, [], 0
     served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
     threading.Thread(target=served.serve_forever, daemon=True).start()
@@ -80,18 +76,16 @@ def served_folder(folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def server(site: Path) -> Iterator[str]:
+def server(site):
     with served_folder(site.parent) as address:
         yield address
 
 
-def inside(points: np.ndarray) -> np.ndarray:
+def inside(points):
     return points[((points[:, :2] >= WINDOW.low) & (points[:, :2] <= WINDOW.high)).all(axis=1)]
 
 
-def test_window_of_a_file_has_the_points_in_it_and_the_reference_system(
-    site: Path, points: np.ndarray, tmp_path: Path
-) -> None:
+def test_window_of_a_file_has_the_points_in_it_and_the_reference_system(site, points, tmp_path):
     assert is_copc(site)
     path, fetched = fetch_cloud(site, tmp_path, WINDOW)
     cloud = read_cloud(path)
@@ -104,7 +98,7 @@ def test_window_of_a_file_has_the_points_in_it_and_the_reference_system(
     assert len(read_cloud(site)) == len(points)  # the whole of it, as any LAZ file
 
 
-def test_of_a_web_server_only_parts_are_fetched(server: str, site: Path, points: np.ndarray, tmp_path: Path) -> None:
+def test_of_a_web_server_only_parts_are_fetched(server, site, points, tmp_path):
     Handler.busy = 1
     path, fetched = fetch_cloud(f"{server}/site.copc.laz", tmp_path, WINDOW)
     assert len(read_cloud(path)) == fetched.points == len(inside(points))
@@ -112,7 +106,7 @@ def test_of_a_web_server_only_parts_are_fetched(server: str, site: Path, points:
     assert fetched.requests == len(Handler.sent)
 
 
-def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
+def test_small_window_takes_few_bytes(tmp_path):
     """In a file this small most bytes come from rounding requests up to a block; the bound allows for them."""
     rng = np.random.default_rng(5)
     write_copc(tmp_path / "wide.copc.laz", rng.uniform([0.0, 0.0, 0.0], [900.0, 900.0, 40.0], (60_000, 3)), levels=5)
@@ -122,7 +116,7 @@ def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
     assert sum(Handler.sent) - beside < 0.3 * (tmp_path / "wide.copc.laz").stat().st_size
 
 
-def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> None:
+def test_whole_files_are_downloaded(server, site, tmp_path):
     path, _ = fetch_cloud(f"{server}/site.copc.laz", tmp_path)
     assert path.read_bytes() == site.read_bytes()
     assert path.name == "site.copc.laz"
@@ -130,9 +124,7 @@ def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> 
     assert other != path
 
 
-def test_servers_and_files_that_cannot_be_used_are_named(
-    server: str, site: Path, tmp_path: Path, no_pauses: None
-) -> None:
+def test_servers_and_files_that_cannot_be_used_are_named(server, site, tmp_path, no_pauses):
     with pytest.raises(CloudError, match=r"none\.laz: the server answers 404"):
         fetch_cloud(f"{server}/none.laz", tmp_path)
     with pytest.raises(CloudError, match="cannot be reached"):
@@ -167,19 +159,19 @@ def test_servers_and_files_that_cannot_be_used_are_named(
         ("http://169.254.1.1/", "http://8.8.8.8/", True), ("http://0.0.0.0/", "http://169.254.1.1/", True),
     ],
 )  # fmt: skip
-def test_server_leads_to_web_servers_that_are_as_far_and_never_out_of_https(at: str, to: str, followed: bool) -> None:
+def test_server_leads_to_web_servers_that_are_as_far_and_never_out_of_https(at, to, followed):
     request = urllib.request.Request(at)
     with contextlib.nullcontext() if followed else pytest.raises(ValueError, match=r"after http|nearer"):
         assert _Redirects().redirect_request(request, None, 302, "Found", {}, to)
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "5,5,1,1", "0,0,nan,1", "0,0,inf,1", ""])
-def test_windows_without_area_are_refused(text: str) -> None:
+def test_windows_without_area_are_refused(text):
     with pytest.raises(ConfigError, match="window"):
         Window.parse(text)
 
 
-def test_build_takes_addresses_and_windows(server: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_build_takes_addresses_and_windows(server, tmp_path, capsys):
     output = tmp_path / "site.coview"
     args = ["build", f"{server}/site.copc.laz", "--window", str(WINDOW), "-o", str(output), "--no-learned"]
     assert main([*args, "--block-size", "10", "--radius", "20"]) == 0

@@ -1,9 +1,5 @@
 """Every fault of a cloud's file raises one CloudError that names the file."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -18,7 +14,7 @@ HEADER = "VERSION 0.7\nFIELDS {f}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_missing_file_empty_file_directory_and_junk_are_refused(tmp_path: Path, suffix: str) -> None:
+def test_missing_file_empty_file_directory_and_junk_are_refused(tmp_path, suffix):
     for name, content in (("text", b"just some words\n" * 40), ("html", b"<!DOCTYPE html><html>" + b" " * 43)):
         (tmp_path / f"{name}{suffix}").write_bytes(content)
     (tmp_path / f"empty{suffix}").touch()
@@ -32,21 +28,21 @@ def test_missing_file_empty_file_directory_and_junk_are_refused(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_file_without_points_is_refused(tmp_path: Path, suffix: str) -> None:
+def test_file_without_points_is_refused(tmp_path, suffix):
     write_cloud(tmp_path / f"a{suffix}", np.zeros((0, 3), np.float32))
     with pytest.raises(CloudError, match=r"zero points|is empty"):
         read_cloud(tmp_path / f"a{suffix}")
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
-def test_file_with_only_nan_points_is_refused(tmp_path: Path, suffix: str) -> None:
+def test_file_with_only_nan_points_is_refused(tmp_path, suffix):
     write_cloud(tmp_path / f"a{suffix}", np.full((9, 3), np.nan, np.float32))
     with pytest.raises(CloudError, match="none of the 9 points"):
         read_cloud(tmp_path / f"a{suffix}")
 
 
 @pytest.mark.parametrize(("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")])
-def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: str) -> None:
+def test_content_of_another_format_is_refused(tmp_path, real, named):
     write_cloud(tmp_path / f"a{real}", POINTS[:52])
     (tmp_path / f"a{real}").rename(tmp_path / f"a{named}")
     content = "LAS" if real == ".laz" else real[1:].upper()
@@ -70,21 +66,21 @@ def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: 
         ("a.bin", b"\x01\xff" * 15, "no multiple"),
     ],
 )
-def test_damaged_content_is_refused_with_reason(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
+def test_damaged_content_is_refused_with_reason(tmp_path, name, content, reason):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CloudError, match=reason):
         read_cloud(tmp_path / name)
 
 
 @pytest.mark.parametrize("array", [np.zeros(9), np.zeros((4, 2)), np.array([["a"] * 3]), np.array([[None] * 3])])
-def test_npy_of_wrong_shape_or_type_is_refused(tmp_path: Path, array: np.ndarray) -> None:
+def test_npy_of_wrong_shape_or_type_is_refused(tmp_path, array):
     np.save(tmp_path / "a.npy", array, allow_pickle=True)
     with pytest.raises(CloudError, match=r"a\.npy"):
         read_cloud(tmp_path / "a.npy")
 
 
 @pytest.fixture(scope="module")
-def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def originals(tmp_path_factory):
     folder = tmp_path_factory.mktemp("originals")
     for suffix in SUFFIXES:
         write_cloud(folder / f"a{suffix}", POINTS)
@@ -93,9 +89,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(suffix=st.sampled_from(SUFFIXES), share=st.floats(0, 1, exclude_max=True))
-def test_file_truncated_anywhere_is_refused(
-    tmp_path: Path, originals: dict[str, bytes], suffix: str, share: float
-) -> None:
+def test_file_truncated_anywhere_is_refused(tmp_path, originals, suffix, share):
     whole = originals[suffix]
     cut = int(share * len(whole))
     path = tmp_path / f"cut{suffix}"
@@ -114,9 +108,7 @@ def test_file_truncated_anywhere_is_refused(
     where=st.floats(0, 1, exclude_max=True),
     bit=st.integers(0, 7),
 )
-def test_flipped_bits_give_cloud_or_cloud_error(
-    tmp_path: Path, originals: dict[str, bytes], suffix: str, where: float, bit: int
-) -> None:
+def test_flipped_bits_give_cloud_or_cloud_error(tmp_path, originals, suffix, where, bit):
     content = bytearray(originals[suffix])
     # the header decides; flips in coordinates are mere coordinates
     content[int(where * min(400, len(content)))] ^= 1 << bit

@@ -1,7 +1,5 @@
 """The child that decodes: a dead decoder costs one error, and nothing is imported from the current directory."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -23,7 +21,7 @@ POINTS = np.random.default_rng(2).normal(0, 20, (60, 3)).astype(np.float32)
 class Deadly(CloudBuilder):
     """Builder that kills every child of this process, or raises, at the first chunk."""
 
-    def __init__(self, error: Exception | None = None) -> None:
+    def __init__(self, error=None):
         super().__init__()
         self.error = error
 
@@ -36,7 +34,7 @@ class Deadly(CloudBuilder):
                 os.kill(int(child), signal.SIGKILL)
 
 
-def decoded(child: DecodingChild, path: Path) -> int:
+def decoded(child, path):
     builder = CloudBuilder()
     child.ask({"path": str(path)}, builder)
     return len(builder.finish("cloud"))

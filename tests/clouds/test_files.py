@@ -1,9 +1,6 @@
 """Files of every format, in the variants that other programs write; folders and patterns of them."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ TOLERANCE = {".las": 6e-4, ".laz": 6e-4}
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_cloud_file_round_trip(tmp_path: Path, suffix: str) -> None:
+def test_cloud_file_round_trip(tmp_path, suffix):
     path = tmp_path / f"cloud{suffix}"
     write_cloud(path, POINTS)
     cloud = read_cloud(path)
@@ -32,7 +29,7 @@ def test_cloud_file_round_trip(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES[:-1])
-def test_utm_coordinates_keep_millimetres(tmp_path: Path, suffix: str) -> None:
+def test_utm_coordinates_keep_millimetres(tmp_path, suffix):
     path = tmp_path / f"cloud{suffix}"
     write_cloud(path, POINTS, origin=UTM)
     cloud = read_cloud(path)
@@ -41,14 +38,14 @@ def test_utm_coordinates_keep_millimetres(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(cloud.map_points(), POINTS + UTM, rtol=0, atol=1e-3)
 
 
-def test_bin_format_refuses_utm_coordinates(tmp_path: Path) -> None:
+def test_bin_format_refuses_utm_coordinates(tmp_path):
     with pytest.raises(CloudError, match="10 km"):
         write_cloud(tmp_path / "a.bin", POINTS, origin=UTM)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
-def test_non_finite_and_huge_rows_are_dropped_and_counted(tmp_path: Path, suffix: str) -> None:
+def test_non_finite_and_huge_rows_are_dropped_and_counted(tmp_path, suffix):
     points = POINTS.copy()
     points[3, 1], points[5, 0], points[7, 2] = np.nan, np.inf, 1e30
     write_cloud(tmp_path / f"a{suffix}", points)
@@ -58,7 +55,7 @@ def test_non_finite_and_huge_rows_are_dropped_and_counted(tmp_path: Path, suffix
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_pcd_with_fields_of_any_order_and_type(tmp_path: Path, encoding: str) -> None:
+def test_pcd_with_fields_of_any_order_and_type(tmp_path, encoding):
     kind = np.dtype([("i", "u1"), ("z", "<f8"), ("n", "<f4", (3,)), ("x", "<f4"), ("y", "<i2")])
     rows = np.zeros(50, kind)
     rows["x"], rows["y"], rows["z"], rows["n"] = POINTS[:50, 0], np.arange(50), POINTS[:50, 2], 7.0
@@ -79,7 +76,7 @@ def test_pcd_with_fields_of_any_order_and_type(tmp_path: Path, encoding: str) ->
     np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd").points, expected, atol=1e-5)
 
 
-def test_lzf_back_references_repeat_and_overlap() -> None:
+def test_lzf_back_references_repeat_and_overlap():
     # "ab", then 5 from distance 2 (it overlaps its own output), then a long one of 7 + 3 + 2 from distance 7
     packed = bytes([1]) + b"ab" + bytes([3 << 5, 1]) + bytes([7 << 5, 3, 6])
     assert lzf_decompress(packed, 19) == b"ab" + b"ababa" + (b"abababa" * 2)[:12]
@@ -90,7 +87,7 @@ def test_lzf_back_references_repeat_and_overlap() -> None:
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
-def test_ply_vertices_after_another_element(tmp_path: Path, order: str) -> None:
+def test_ply_vertices_after_another_element(tmp_path, order):
     sign = "<" if order == "little" else ">"
     header = (
         f"ply\nformat binary_{order}_endian 1.0\ncomment made by hand\nelement camera 2\nproperty double f\n"
@@ -104,7 +101,7 @@ def test_ply_vertices_after_another_element(tmp_path: Path, order: str) -> None:
     np.testing.assert_allclose(read_cloud(path).points, np.column_stack([rows["x"], rows["y"], rows["z"]]), atol=1e-6)
 
 
-def test_ply_ascii_is_read(tmp_path: Path) -> None:
+def test_ply_ascii_is_read(tmp_path):
     path = tmp_path / "a.ply"
     path.write_text(
         "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nelement vertex 2\n"
@@ -113,7 +110,7 @@ def test_ply_ascii_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path).points, [[1, 2, 3], [4, 5, 6]])
 
 
-def test_merge_rebases_in_float64(tmp_path: Path) -> None:
+def test_merge_rebases_in_float64(tmp_path):
     for name, shift in (("a", 0.0), ("b", 12_345.678)):
         write_cloud(tmp_path / f"{name}.npy", POINTS, origin=UTM + shift)
     clouds = [read_cloud(tmp_path / f"{name}.npy") for name in "ab"]

@@ -1,7 +1,5 @@
 """Filters: outliers, voxels, normals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +12,7 @@ from coview_stream.sim.casting import open3d
 RNG = np.random.default_rng(4)
 
 
-def test_outliers_are_removed_and_plane_is_kept() -> None:
+def test_outliers_are_removed_and_plane_is_kept():
     plane = np.column_stack([RNG.uniform(0, 20, (4000, 2)), RNG.normal(0, 0.02, 4000)])
     stray = RNG.uniform([0, 0, 10], [20, 20, 60], (20, 3))
     points = np.concatenate([plane, stray]).astype(np.float32)
@@ -25,35 +23,35 @@ def test_outliers_are_removed_and_plane_is_kept() -> None:
     assert mask[:4000].mean() > 0.99
 
 
-def test_points_that_are_all_as_far_apart_are_kept() -> None:
+def test_points_that_are_all_as_far_apart_are_kept():
     points = np.zeros((30, 3), dtype=np.float32)
     assert len(remove_outliers(points)[0]) == 30
 
 
 @pytest.mark.parametrize("count", [0, 1, 20])
-def test_too_few_points_for_outliers_are_kept(count: int) -> None:
+def test_too_few_points_for_outliers_are_kept(count):
     kept, mask = remove_outliers(np.zeros((count, 3), np.float32))
     assert len(kept) == count
     assert mask.all()
 
 
 @given(st.integers(0, 2**31), st.floats(0.05, 5.0), st.integers(1, 300))
-def test_voxel_centroids_match_numpy_grouping(seed: int, voxel: float, count: int) -> None:
+def test_voxel_centroids_match_numpy_grouping(seed, voxel, count):
     points = np.random.default_rng(seed).normal(0, 10, (count, 3)).astype(np.float32)
-    groups: dict[tuple[int, ...], list[np.ndarray]] = {}
+    groups = {}
     for point in points.astype(np.float64):
         groups.setdefault(tuple(np.floor(point / voxel).astype(int)), []).append(point)
     expected = [np.mean(groups[key], axis=0) for key in sorted(groups)]
     np.testing.assert_allclose(voxel_grid(points, voxel), expected, atol=1e-5)
 
 
-def test_voxel_grid_of_no_points_and_of_too_many_cells() -> None:
+def test_voxel_grid_of_no_points_and_of_too_many_cells():
     assert voxel_grid(np.zeros((0, 3), np.float32), 0.5).shape == (0, 3)
     with pytest.raises(ConfigError, match="too small"):
         voxel_grid(np.array([[0, 0, 0], [1e7, 1e7, 1e7]], np.float32), 1e-3)
 
 
-def test_normals_of_a_tilted_plane_point_up() -> None:
+def test_normals_of_a_tilted_plane_point_up():
     xy = RNG.uniform(0, 10, (2000, 2))
     points = np.column_stack([xy, 0.5 * xy[:, 0]]).astype(np.float32)
     expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
@@ -64,7 +62,7 @@ def test_normals_of_a_tilted_plane_point_up() -> None:
         assert planarity.min() > 0.999
 
 
-def test_planarity_tells_a_surface_from_a_crown() -> None:
+def test_planarity_tells_a_surface_from_a_crown():
     crown = RNG.normal(0, 1, (4000, 3)).astype(np.float32)
     rough = np.column_stack([RNG.uniform(0, 20, (8000, 2)), RNG.normal(0, 0.03, 8000)]).astype(np.float32)
     inside = np.linalg.norm(crown, axis=1) < 1.0
@@ -73,7 +71,7 @@ def test_planarity_tells_a_surface_from_a_crown() -> None:
     assert np.median(flat) > 0.95
 
 
-def test_isolated_points_have_a_vertical_normal() -> None:
+def test_isolated_points_have_a_vertical_normal():
     normals, planarity = estimate_normals(np.array([[0, 0, 0], [50, 0, 0]], np.float32), radius=1.0)
     np.testing.assert_array_equal(normals, [[0, 0, 1], [0, 0, 1]])
     np.testing.assert_array_equal(planarity, [0, 0])
@@ -81,7 +79,7 @@ def test_isolated_points_have_a_vertical_normal() -> None:
     assert (normals.shape, planarity.shape) == ((0, 3), (0,))
 
 
-def test_filters_agree_with_open3d() -> None:
+def test_filters_agree_with_open3d():
     """Normals to 1e-6, planarity to 1e-6, and the same outliers, on surfaces, a crown and stray points."""
     try:
         o3d = open3d()

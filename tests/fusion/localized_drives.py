@@ -1,7 +1,5 @@
 """Drives whose truth is taken for what was localized."""
 
-from __future__ import annotations
-
 import numpy as np
 import small_world
 

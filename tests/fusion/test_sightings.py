@@ -1,7 +1,5 @@
 """Sightings: rays that end at points, and rays that go through them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ T = pose_from(rot_z(0.7), [30.0, -20.0, 2.0])
 EYE = np.array([0.0, 0.0, 0.5])
 
 
-def wall(x: float) -> np.ndarray:
+def wall(x):
     y, z = np.meshgrid(np.arange(-4, 4, 0.03), np.arange(-1.5, 3, 0.03))
     return np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()]).astype(np.float32)
 

@@ -1,7 +1,5 @@
 """CDR and protobuf composed by hand, so that the codecs are not tested against themselves."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -16,48 +14,38 @@ POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, -6.25]], np.float32)
 class Cdr:
     """Primitive values one after another, each aligned to its own size, after the encapsulation header."""
 
-    def __init__(self, order: str = "<"):
+    def __init__(self, order="<"):
         self.order = order
         self.body = bytearray()
 
-    def put(self, kind: str, *values: float) -> Cdr:
+    def put(self, kind, *values):
         for value in values:
             self.body += bytes(-len(self.body) % struct.calcsize(kind))
             self.body += struct.pack(self.order + kind, value)
         return self
 
-    def text(self, value: str) -> Cdr:
+    def text(self, value):
         raw = value.encode() + b"\0"
         self.put("I", len(raw))
         self.body += raw
         return self
 
-    def data(self, raw: bytes) -> Cdr:
+    def data(self, raw):
         self.put("I", len(raw))
         self.body += raw
         return self
 
-    def done(self) -> bytes:
+    def done(self):
         return (b"\0\1\0\0" if self.order == "<" else b"\0\0\0\0") + bytes(self.body)
 
 
-def header(order: str = "<", frame: str = "base_link", seconds: int = SECONDS, nanos: int = NANOS) -> Cdr:
+def header(order="<", frame="base_link", seconds=SECONDS, nanos=NANOS):
     return Cdr(order).put("i", seconds).put("I", nanos).text(frame)
 
 
 def cdr_cloud(
-    data: bytes,
-    fields: list[tuple[str, int, int]],
-    step: int,
-    width: int,
-    height: int = 1,
-    row_step: int | None = None,
-    order: str = "<",
-    big: bool = False,
-    dense: bool = True,
-    frame: str = "base_link",
-    nanos: int = NANOS,
-) -> bytes:
+    data, fields, step, width, height=1, row_step=None, order="<", big=False, dense=True, frame="base_link", nanos=NANOS
+):
     """PointCloud2 from (name, offset, datatype) and its rows."""
     out = header(order, frame, nanos=nanos).put("I", height, width, len(fields))
     for name, offset, datatype in fields:
@@ -66,12 +54,12 @@ def cdr_cloud(
     return out.data(data).put("B", dense).done()
 
 
-def cdr_pose(order: str = "<", covariance: object = (0.0,) * 36, quaternion: object = TURN) -> Cdr:
+def cdr_pose(order="<", covariance=(0.0,) * 36, quaternion=TURN):
     out = header(order, "map").put("d", 1, 2, 3)
     return out.put("d", *quaternion).put("d", *covariance)
 
 
-def cdr_odometry(order: str = "<", quaternion: object = TURN, position: object = (1, 2, 3)) -> bytes:
+def cdr_odometry(order="<", quaternion=TURN, position=(1, 2, 3)):
     out = header(order, "odom").text("base_link").put("d", *position)
     return out.put("d", *quaternion).put("d", *(0.0,) * 36).put("d", *(0.0,) * 42).done()
 
@@ -79,7 +67,7 @@ def cdr_odometry(order: str = "<", quaternion: object = TURN, position: object =
 XYZ = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
 
 
-def varint(value: int) -> bytes:
+def varint(value):
     out = b""
     while value >= 128:
         out += bytes([value % 128 + 128])
@@ -87,34 +75,32 @@ def varint(value: int) -> bytes:
     return out + bytes([value])
 
 
-def sized(number: int, value: bytes) -> bytes:
+def sized(number, value):
     return varint(number * 8 + 2) + varint(len(value)) + value
 
 
-def stamp(seconds: int = SECONDS, nanos: int = NANOS) -> bytes:
+def stamp(seconds=SECONDS, nanos=NANOS):
     return sized(1, b"\x08" + varint(seconds % 2**64) + b"\x10" + varint(nanos % 2**64))
 
 
-def doubles(*values: float) -> bytes:
+def doubles(*values):
     return b"".join(bytes([8 * number + 1]) + struct.pack("<d", v) for number, v in enumerate(values, 1) if v)
 
 
-def pb_pose(position: tuple[float, ...] = (1, 2, 3), quaternion: tuple[float, ...] = TURN) -> bytes:
+def pb_pose(position=(1, 2, 3), quaternion=TURN):
     return sized(1, doubles(*position)) + sized(2, doubles(*quaternion))
 
 
-def pb_in_frame(frame: str = "odom", **pose: tuple[float, ...]) -> bytes:
+def pb_in_frame(frame="odom", **pose):
     return stamp() + sized(2, frame.encode()) + sized(3, pb_pose(**pose))
 
 
-def pb_transform(parent: str = "odom", child: str = "base_link") -> bytes:
+def pb_transform(parent="odom", child="base_link"):
     rotation = sized(5, doubles(*TURN))
     return stamp() + sized(2, parent.encode()) + sized(3, child.encode()) + sized(4, doubles(1, 2, 3)) + rotation
 
 
-def pb_cloud(
-    data: bytes, fields: list[tuple[str, int, int]], step: int, pose: bytes | None = None, head: bytes | None = None
-) -> bytes:
+def pb_cloud(data, fields, step, pose=None, head=None):
     """foxglove.PointCloud from (name, offset, type) and its rows."""
     out = stamp() if head is None else head
     out += sized(2, b"base_link")
@@ -127,5 +113,5 @@ def pb_cloud(
     return out + sized(6, data)
 
 
-def envelope(payload: bytes) -> bytes:
+def envelope(payload):
     return stamp() + sized(2, payload)

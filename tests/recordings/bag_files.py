@@ -1,9 +1,5 @@
 """Small recordings, written by rosbags' own writers."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -27,16 +23,16 @@ KINDS = {"f4": 7, "u4": 6, "f8": 8}
 LATE = 777_000_000_000  # ns: the recorder's clock is another one
 
 
-def message(name: str, /, **values: object) -> object:
+def message(name, /, **values):
     return STORE.types[name](**values)
 
 
-def header(stamp_ns: int, frame: str) -> object:
+def header(stamp_ns, frame):
     stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-def cloud(stamp_ns: int, points: np.ndarray, times: np.ndarray | None = None, order: str = "<", frame: str = "body"):
+def cloud(stamp_ns, points, times=None, order="<", frame="body"):
     columns = [(name, "f4", points[:, k]) for k, name in enumerate("xyz")]
     if times is not None:
         columns.append(("time", "f4", times))
@@ -62,7 +58,7 @@ def cloud(stamp_ns: int, points: np.ndarray, times: np.ndarray | None = None, or
     )
 
 
-def odometry(stamp_ns: int, T: np.ndarray, child: str = "body"):
+def odometry(stamp_ns, T, child="body"):
     x, y, z = T[:3, 3]
     qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
     pose = message(
@@ -84,7 +80,7 @@ def odometry(stamp_ns: int, T: np.ndarray, child: str = "body"):
     )
 
 
-def transforms(stamp_ns: int, *edges: tuple[str, str, np.ndarray]):
+def transforms(stamp_ns, *edges):
     """TFMessage of (parent, child, T_parent_child)."""
     messages = []
     for parent, child, T in edges:
@@ -100,7 +96,7 @@ def transforms(stamp_ns: int, *edges: tuple[str, str, np.ndarray]):
     return message(TRANSFORMS, transforms=messages)
 
 
-def livox(stamp_ns: int, points: np.ndarray, times: np.ndarray, frame: str = "livox_frame"):
+def livox(stamp_ns, points, times, frame="livox_frame"):
     rows = [
         message(LIVOX.replace("Msg", "Point"), offset_time=int(t), x=x, y=y, z=z, reflectivity=9, tag=0, line=k % 4)
         for k, ((x, y, z), t) in enumerate(zip(points, times, strict=True))
@@ -109,7 +105,7 @@ def livox(stamp_ns: int, points: np.ndarray, times: np.ndarray, frame: str = "li
     return message(LIVOX, **head, rsvd=np.zeros(3, np.uint8), points=rows)
 
 
-def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compression: str = "") -> Path:
+def write_bag(path, topics, storage="mcap", compression=""):
     """Write messages, or raw CDR bytes (as clouds), by topic; all topics arrive side by side."""
     if path.suffix == ".bag":
         return _write_ros1(path, topics, compression)
@@ -125,7 +121,7 @@ def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compre
     return path
 
 
-def _write_ros1(path: Path, topics: dict[str, list], compression: str = "") -> Path:
+def _write_ros1(path, topics, compression=""):
     writer = Ros1Writer(path)
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
@@ -137,11 +133,11 @@ def _write_ros1(path: Path, topics: dict[str, list], compression: str = "") -> P
     return path
 
 
-def _type(messages: list) -> str:
+def _type(messages):
     return getattr(messages[0], "__msgtype__", CLOUD) if messages else CLOUD
 
 
-def _in_turn(topics: dict[str, list]):
+def _in_turn(topics):
     longest = max(map(len, topics.values()), default=0)
     for topic, messages in topics.items():
         for k, item in enumerate(messages):

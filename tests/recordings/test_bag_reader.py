@@ -1,10 +1,6 @@
 """Recordings unpack to a limited size, whatever they claim."""
 
-from __future__ import annotations
-
 import bz2
-from collections.abc import Callable
-from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -16,11 +12,9 @@ from coview_stream.recordings import bag_reader
 from coview_stream.recordings.bag_reader import BagReader, bounded
 from coview_stream.recordings.open_run import open_run
 
-Limit = Callable[[int], None]
-
 
 @pytest.fixture
-def limit(monkeypatch: pytest.MonkeyPatch) -> Limit:
+def limit(monkeypatch):
     return lambda size: monkeypatch.setattr(bag_reader, "LIMIT", size)
 
 
@@ -30,7 +24,7 @@ WORDS = [b"", b"a", b"abc" * 1000]
 @pytest.mark.parametrize(
     ("pack", "make"), [(bz2.compress, bz2.BZ2Decompressor), (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor)]
 )
-def test_frames_come_back_whole_and_no_longer_than_allowed(limit: Limit, pack: object, make: object) -> None:
+def test_frames_come_back_whole_and_no_longer_than_allowed(limit, pack, make):
     unpack = bounded(make)
     for word in WORDS:
         assert unpack(pack(word)) == word
@@ -46,9 +40,7 @@ def test_frames_come_back_whole_and_no_longer_than_allowed(limit: Limit, pack: o
 
 
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", "MESSAGE"), ("mcap", "STORAGE"), ("sqlite3", "MESSAGE")])
-def test_a_recording_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, limit: Limit, storage: str, compression: str
-) -> None:
+def test_a_recording_that_unpacks_to_too_much_is_refused(tmp_path, limit, storage, compression):
     points = np.zeros((5000, 3), np.float32)
     topics = {"/points": [cloud(k * 10**8, points) for k in range(3)],
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(3)]}  # fmt: skip
@@ -59,7 +51,7 @@ def test_a_recording_that_unpacks_to_too_much_is_refused(
         open_run(bag)
 
 
-def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, limit: Limit) -> None:
+def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path, limit):
     points = np.zeros((50_000, 3), np.float32)
     topics = {"/points": [cloud(k * 10**8, points) for k in range(5)],
               "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(5)]}  # fmt: skip
@@ -73,7 +65,7 @@ def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, l
         open_run(bag)
 
 
-def test_readers_are_bounded_once_opened(tmp_path: Path) -> None:
+def test_readers_are_bounded_once_opened(tmp_path):
     from rosbags.rosbag1 import reader
     from rosbags.rosbag2 import storage_mcap
 

@@ -1,12 +1,9 @@
 """Recordings as runs: every storage, stamps of headers, deskewing, topics, mounts, and unreadable files."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sqlite3
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,7 +44,7 @@ def clouds(stamps=CLOUD_NS):
     return [cloud(ns, POINTS + np.float32(k)) for k, ns in enumerate(stamps)]
 
 
-def only_file(folder: Path) -> Path:
+def only_file(folder):
     return next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
 
 

@@ -1,9 +1,5 @@
 """Runs and trajectories: layouts, lazy reading, and everything that does not fit together."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -20,7 +16,7 @@ LINES = [f"{i}.5 {i} 0 0 0 0 0 1" for i in range(COUNT)]
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     (tmp_path / "frames").mkdir()
     for i in range(COUNT):
         write_cloud(tmp_path / "frames" / f"{i:06d}.pcd", POINTS + i)
@@ -28,7 +24,7 @@ def run(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def _kitti(root: Path, poses: np.ndarray) -> Path:
+def _kitti(root, poses):
     (root / "velodyne").mkdir()
     for i in range(len(poses)):
         write_cloud(root / "velodyne" / f"{i:06d}.bin", POINTS + i)
@@ -37,7 +33,7 @@ def _kitti(root: Path, poses: np.ndarray) -> Path:
     return root
 
 
-def test_run_yields_frames_in_order(run: Path) -> None:
+def test_run_yields_frames_in_order(run):
     opened = open_run(run)
     frames = list(opened)
     assert len(opened) == len(frames) == COUNT
@@ -49,13 +45,13 @@ def test_run_yields_frames_in_order(run: Path) -> None:
         assert not frame.origin.any()
 
 
-def test_frames_are_sorted_by_number(run: Path) -> None:
+def test_frames_are_sorted_by_number(run):
     for i in range(COUNT):
         (run / "frames" / f"{i:06d}.pcd").rename(run / "frames" / f"{i + 8}.pcd")
     assert [path.name for path in open_run(run).frames_paths] == ["8.pcd", "9.pcd", "10.pcd", "11.pcd"]
 
 
-def test_damaged_frame_fails_alone(run: Path) -> None:
+def test_damaged_frame_fails_alone(run):
     (run / "frames" / "000002.pcd").write_bytes(b"")
     opened = open_run(run)
     assert len(opened.read(3).points) == 30
@@ -65,13 +61,13 @@ def test_damaged_frame_fails_alone(run: Path) -> None:
         opened.read(COUNT)
 
 
-def test_frames_of_a_run_must_be_in_the_body_frame(run: Path) -> None:
+def test_frames_of_a_run_must_be_in_the_body_frame(run):
     write_cloud(run / "frames" / "000001.pcd", POINTS, origin=(500_000.0, 4e6, 0.0))
     with pytest.raises(CloudError, match="body frame"):
         open_run(run).read(1)
 
 
-def test_single_cloud_run_keeps_its_origin(tmp_path: Path) -> None:
+def test_single_cloud_run_keeps_its_origin(tmp_path):
     origin = np.array([500_000.25, 4_000_000.5, 30.0])
     write_cloud(tmp_path / "scan.laz", POINTS, origin=origin)
     opened = open_run(tmp_path / "scan.laz")
@@ -82,7 +78,7 @@ def test_single_cloud_run_keeps_its_origin(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.points + frame.origin, POINTS + origin, atol=1e-3)
 
 
-def test_one_frame_needs_no_odometry(run: Path) -> None:
+def test_one_frame_needs_no_odometry(run):
     (run / "odometry.tum").unlink()
     with pytest.raises(RunError, match="4 frames but no odometry"):
         open_run(run)
@@ -91,21 +87,21 @@ def test_one_frame_needs_no_odometry(run: Path) -> None:
     assert len(open_run(run)) == 1
 
 
-def test_odometry_from_another_file(run: Path) -> None:
+def test_odometry_from_another_file(run):
     write_tum(run / "other.tum", STAMPS + 5, POSES)
     assert open_run(run, run / "other.tum").stamps[0] == pytest.approx(STAMPS[0] + 5)
     with pytest.raises(RunError, match=r"missing\.tum: no such file"):
         open_run(run, run / "missing.tum")
 
 
-def test_kitti_layout_is_read(tmp_path: Path) -> None:
+def test_kitti_layout_is_read(tmp_path):
     opened = open_run(_kitti(tmp_path, POSES))
     np.testing.assert_allclose(opened.poses, POSES, atol=1e-9)
     np.testing.assert_allclose(opened.stamps, np.arange(COUNT) * 0.1)
     np.testing.assert_array_equal(opened.read(1).points, POINTS + np.float32(1))
 
 
-def test_kitti_camera_poses_need_their_calibration(tmp_path: Path) -> None:
+def test_kitti_camera_poses_need_their_calibration(tmp_path):
     T_camera_body = pose_from([[0, -1, 0], [0, 0, -1], [1, 0, 0]], (0.1, -0.2, -0.3))
     body = np.stack([pose_from(np.eye(3), (4.0 * i, 0.0, 0.0)) for i in range(COUNT)])
     _kitti(tmp_path, T_camera_body @ body @ inverse(T_camera_body))
@@ -119,7 +115,7 @@ def test_kitti_camera_poses_need_their_calibration(tmp_path: Path) -> None:
         open_run(tmp_path)
 
 
-def test_kitti_times_must_fit(tmp_path: Path) -> None:
+def test_kitti_times_must_fit(tmp_path):
     _kitti(tmp_path, POSES)
     (tmp_path / "times.txt").write_text("0\n1\n2\n")
     with pytest.raises(RunError, match=r"times\.txt: too short, 3 stamps for 4 frames"):
@@ -146,14 +142,14 @@ def test_kitti_times_must_fit(tmp_path: Path) -> None:
         (["1 0 0 0 1 0 0 0 1 0 0 0"] * 4, "times"),
     ],
 )
-def test_odometry_not_matching_the_frames_is_refused(run: Path, lines: list[str], reason: str) -> None:
+def test_odometry_not_matching_the_frames_is_refused(run, lines, reason):
     (run / "odometry.tum").write_text("\n".join(lines))
     with pytest.raises(RunError, match=reason) as caught:
         open_run(run)
     assert "\n" not in str(caught.value)
 
 
-def test_binary_odometry_file_is_refused(run: Path) -> None:
+def test_binary_odometry_file_is_refused(run):
     (run / "odometry.tum").write_bytes(bytes(range(256)))
     with pytest.raises(RunError, match="is no text"):
         open_run(run)
@@ -171,18 +167,18 @@ def test_binary_odometry_file_is_refused(run: Path) -> None:
         (lambda d: (d / "a.wrl").touch() or d / "a.wrl", "neither a run nor a cloud"),
     ],
 )
-def test_path_without_a_run_is_refused(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
+def test_path_without_a_run_is_refused(tmp_path, make, reason):
     with pytest.raises(RunError, match=reason):
         open_run(make(tmp_path))
 
 
-def test_run_that_does_not_exist_is_answered_by_its_neighbour(run: Path) -> None:
+def test_run_that_does_not_exist_is_answered_by_its_neighbour(run):
     with pytest.raises(RunError, match=f"no such file or directory; did you mean {run}") as caught:
         open_run(run.with_name(f"{run.name}s"))
     assert "odom_poses.txt" not in str(caught.value)
 
 
-def test_duplicate_frames_and_broken_links_are_refused(run: Path) -> None:
+def test_duplicate_frames_and_broken_links_are_refused(run):
     write_cloud(run / "frames" / "000001.ply", POINTS)
     with pytest.raises(RunError, match="same frame"):
         open_run(run)
@@ -192,7 +188,7 @@ def test_duplicate_frames_and_broken_links_are_refused(run: Path) -> None:
         open_run(run)
 
 
-def test_tum_trajectory_round_trip_normalizes_quaternions(tmp_path: Path) -> None:
+def test_tum_trajectory_round_trip_normalizes_quaternions(tmp_path):
     write_tum(tmp_path / "a.tum", STAMPS, POSES)
     stamps, poses = read_tum(tmp_path / "a.tum")
     np.testing.assert_allclose(stamps, STAMPS, atol=1e-6)
@@ -201,7 +197,7 @@ def test_tum_trajectory_round_trip_normalizes_quaternions(tmp_path: Path) -> Non
     np.testing.assert_allclose(read_tum(tmp_path / "b.tum")[1][0, :3, :3], rot_z(np.pi / 2), atol=1e-12)
 
 
-def test_empty_trajectory_round_trip(tmp_path: Path) -> None:
+def test_empty_trajectory_round_trip(tmp_path):
     write_tum(tmp_path / "a.tum", [], [])
     stamps, poses = read_tum(tmp_path / "a.tum")
     assert stamps.shape == (0,)
@@ -209,7 +205,7 @@ def test_empty_trajectory_round_trip(tmp_path: Path) -> None:
     assert (tmp_path / "a.tum").read_bytes() == b""
 
 
-def test_unwritable_or_mismatched_trajectory_is_refused(tmp_path: Path) -> None:
+def test_unwritable_or_mismatched_trajectory_is_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         write_tum(tmp_path / "nowhere" / "a.tum", STAMPS, POSES)
     with pytest.raises(InputError, match="3 stamps for 4 poses"):
@@ -217,7 +213,7 @@ def test_unwritable_or_mismatched_trajectory_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_run_can_be_indexed(run: Path) -> None:
+def test_run_can_be_indexed(run):
     opened = open_run(run)
     frames = list(opened)
     assert opened[1].path == frames[1].path
@@ -226,10 +222,10 @@ def test_run_can_be_indexed(run: Path) -> None:
         with pytest.raises(IndexError, match="no frame"):
             opened[beyond]
     with pytest.raises(TypeError):
-        opened["first"]  # type: ignore[call-overload]
+        opened["first"]
 
 
-def test_slice_of_a_run_is_a_run(run: Path) -> None:
+def test_slice_of_a_run_is_a_run(run):
     opened = open_run(run)
     part = opened[1:]
     assert [frame.stamp for frame in part] == opened.stamps[1:].tolist()
@@ -243,7 +239,7 @@ def test_slice_of_a_run_is_a_run(run: Path) -> None:
 
 
 @pytest.mark.parametrize("delay", [0.05, -0.15])
-def test_clouds_that_are_late_have_earlier_odometry(run: Path, delay: float) -> None:
+def test_clouds_that_are_late_have_earlier_odometry(run, delay):
     opened = open_run(run)
     assert opened.with_late_clouds(0.0) is opened
     with pytest.raises(RunError, match="longer than the run"):
@@ -255,7 +251,7 @@ def test_clouds_that_are_late_have_earlier_odometry(run: Path, delay: float) -> 
     np.testing.assert_array_equal(moved[0].points, opened[kept[0]].points)
 
 
-def test_runs_and_frames_say_what_they_are_in_one_line(run: Path) -> None:
+def test_runs_and_frames_say_what_they_are_in_one_line(run):
     opened = open_run(run)
     assert repr(opened).startswith(f"Run({str(run)!r}: {len(opened)} frames, ")
     assert repr(opened).endswith(" m driven)")

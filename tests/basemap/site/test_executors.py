@@ -1,7 +1,5 @@
 """Executors of a build's steps: the same results wherever they run, and what fails or dies is named."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import time
@@ -14,13 +12,13 @@ from coview_stream.basemap.site.executors import DaskExecutor, Executor, Process
 from coview_stream.errors import ConfigError, MapError
 
 
-def step(number: int) -> int:
+def step(number):
     if number == 3:
         raise MapError("three is damaged")
     return number * number
 
 
-def deadly(number: int) -> int:
+def deadly(number):
     if number == 2:
         os._exit(9)
     return number
