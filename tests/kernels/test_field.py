@@ -151,14 +151,6 @@ def test_wrong_shapes_and_poses_are_refused(scene: Scene):
         kernels.field_scores(field, FieldScan(scan.structure[:, :2], scan.low, scan.free), [pose])
 
 
-def test_stored_layers_are_looked_up_instead(scene: Scene):
-    field, scan, _, others = scene
-    stored = replace(field, stored=FieldLayers(*(np.array(each) for each in field.layers)))
-    assert stored.layers is stored.stored
-    for one, other in zip(*(kernels.field_scores(each, scan, others) for each in (field, stored)), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_layers_made_in_small_batches_are_the_same(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     field, whole = scene[0], scene[0].layers
     monkeypatch.setattr("coview_kernels.field._BATCH", 3)
@@ -191,6 +183,7 @@ def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
     stored = replace(field, stored=field.layers._replace(bits=bits))
     windows(1 << 14, 2 * bits[0].nbytes)
     assert len(list(Windows(bits))) == 5
+    assert stored.layers is stored.stored
     starts = np.vstack([others, pose, np.add(pose, [500.0, -300.0, 0.0, 0.0])])  # some beside the map
     for poses in (starts, pose[None]):
         for one, other in zip(*(kernels.field_scores(each, scan, poses) for each in (field, stored)), strict=True):

@@ -196,15 +196,7 @@ def test_interpreter_exits_while_another_thread_computes():
 
 
 def test_import_of_a_kernel_module_off_the_owner_thread_raises():
-    code = "import coview_kernels._ti_voxel_filter"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={"PYTHONPATH": str(ROOT / "kernels")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert "runtime.kernels" in done.stderr
+    assert "runtime.kernels" in run_python("import coview_kernels._ti_voxel_filter").stderr
 
 
 def test_warm_up_of_an_unknown_kernel_raises():

@@ -71,11 +71,6 @@ def test_unit_columns_of_tiny_values():
     np.testing.assert_allclose(unit_columns(np.full((4, 1), 1e-30)), 0.5)
 
 
-def test_empty_query_has_distance_one_everywhere():
-    spectra = column_spectra(np.ones((3, 4, 6), dtype=np.float32))
-    np.testing.assert_array_equal(all_shift_distance(np.zeros((4, 6)), spectra, 6), np.ones((3, 6)))
-
-
 @pytest.mark.parametrize("rings", [3, 5000])
 def test_all_shift_distance_of_many_candidates(rings):
     rng = np.random.default_rng(8)
