@@ -10,7 +10,6 @@ from bench.accuracy import ablation, accuracy, conditions
 from bench.accuracy.choices import KeyframeView, right
 from bench.accuracy.conditions import Variant, rings, spoilt
 from bench.harness.worlds import TUNED_SEEDS
-from bench.results import TABLES
 from bench.tracking.drives import scenarios
 from coview_stream.clouds import read_cloud, write_cloud, write_tum
 from coview_stream.errors import InputError
@@ -115,12 +114,6 @@ def test_totals_count_a_lost_run_as_endless_and_without_poses():
     row = accuracy.total("snow", [made_up(), lost, lost])
     assert row.ours == 30.0
     assert (row.details["found"], row.details["first_fix_m"], row.details["rmse_t"]) == ("1 of 3", np.inf, 0.03)
-
-
-def test_every_group_of_the_ablation_has_sites_and_a_table_of_results():
-    assert set(ablation.SITES) == set(ablation.GROUPS)
-    assert {site for names in ablation.SITES.values() for site in names} == {*ablation.WORLDS, *ablation.REAL}
-    assert {f"ablation, {group}" for group in ablation.GROUPS} == {n for n in TABLES if n.startswith("ablation")}
 
 
 def test_rows_of_the_ablation_add_sites_up():

@@ -1,13 +1,10 @@
 """Scores of a tracked drive: errors, events, coverage of the covariance, protection levels."""
 
-from argparse import Namespace
-
 import numpy as np
 import pytest
 from drives_with_truth import track, way
 
 from bench.accuracy.scores import errors, exposed, losses, rate, recovery, score
-from bench.harness.rows import Row
 from bench.tracking import protection, smoothing, tracking
 from bench.tracking.covariance import BAND, figures, judge
 from bench.tracking.protection import PARTS, PRODUCT, Sample, beyond_alert_limit, blocks, conformal, misleading
@@ -217,13 +214,6 @@ def test_smoothed_poses_of_every_kind_have_a_verdict(key):
     missed = [row for row in smoothing.verdicts([smoothed_run(), smoothed_run(**{key: 4})]) if not row.holds]
     assert len(missed) == 1
     assert ("without a live one" in missed[0].name) == key.startswith("only")
-
-
-def test_no_two_columns_about_smoothing_have_one_heading():
-    run = Row("smooth/town", details=smoothed_run())
-    for table in smoothing.tables([run], Namespace()).values():
-        headings = [cell.strip() for cell in table.splitlines()[0].strip("|").split("|")]
-        assert len(set(headings)) == len(headings)
 
 
 @pytest.mark.parametrize(("scale", "holds"), [(0.5, False), (1.0, True), (2.0, False)])
