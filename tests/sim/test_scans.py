@@ -96,13 +96,6 @@ def test_foliage_transmits_configured_share_of_rays():
     np.testing.assert_allclose(solid.incidence, 1.0, atol=1e-4)
 
 
-def test_rays_into_the_sky_return_nothing():
-    hits = Caster(SceneState(box(2, 2, 1), EMPTY)).trace(
-        np.array([[0, 0, 5]], np.float32), np.array([[0, 0, 1]], np.float32), RNG, 0.0
-    )
-    assert np.isinf(hits.distance).all()
-
-
 def test_far_wall_at_grazing_angle_returns_fewer_points():
     corners = np.array([[10.0, -500, -50], [10, 500, -50], [10, 500, 50], [10, -500, 50]])
     wall = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))

@@ -83,11 +83,6 @@ def test_scene_change_keeps_the_map_and_replaces_configured_share():
     assert before.now is before.mapped
 
 
-def test_seed_and_kind_change_the_scene():
-    a, b = build_scene("town", 1, 100.0), build_scene("town", 2, 100.0)
-    assert [f.x for f in a.footprints] != [f.x for f in b.footprints]
-
-
 def test_an_unknown_kind_names_the_known_ones():
     with pytest.raises(ConfigError, match=r"'moon'.*town"):
         build_scene("moon", 1)

@@ -197,6 +197,7 @@ def test_files_of_other_kinds_are_refused(tmp_path) -> None:
         {"sensors": ()},
         {"slope": (0.0, float("nan"))},
         {"submaps": 0},
+        {"dirt": ("mud",)},
     ],
 )
 def test_invalid_recipes_are_refused(wrong: dict) -> None:

@@ -2,21 +2,14 @@
 
 import numpy as np
 import pytest
-from yard import fan, standing, vlp16, yard
+from yard import fan, scanned, yard
 
 from coview_stream.sim.dirt import Dirt
 from coview_stream.sim.dirt.optics import Beams, Dust, Glass, Rain, Reflectors, windows
-from coview_stream.sim.dirt.scan import Scanner, Surfaces
+from coview_stream.sim.dirt.scan import Surfaces
 from coview_stream.sim.mesh import box, placed
 
 RNG = np.random.default_rng
-
-
-def scanned(scene, dirt, frames=1):
-    """Points of a standing robot, its body frame."""
-    scanner = Scanner(scene, vlp16(), dirt, 1.5, lambda purpose: RNG(int(purpose)))
-    truth = standing(frames)
-    return np.concatenate(list(scanner.frames(0.1 * np.arange(frames), truth, truth)))
 
 
 def edge():

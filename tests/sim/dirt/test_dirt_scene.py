@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from yard import standing, vlp16, yard
+from yard import scanned, standing, yard
 
 from coview_stream.sim.airborne import POROSITY, airborne_scan
 from coview_stream.sim.dirt import Dirt
-from coview_stream.sim.dirt.scan import Scanner, Surfaces, seasonal_caster
+from coview_stream.sim.dirt.scan import Surfaces, seasonal_caster
 from coview_stream.sim.dirt.scene import Cover, Grass, Movers, Seasons, Snow, Traffic, Years, aged, drawn_parts, person
 from coview_stream.sim.dirt.survey import Density, Strips, Thinning, disagreement, spoilt_strips
 from coview_stream.sim.scenes import build_scene
@@ -44,10 +44,7 @@ def test_people_and_vehicles_move_from_frame_to_frame():
 
 def test_traffic_is_seen_and_is_as_tall_as_people_are():
     assert person().vertices[:, 2].max() == pytest.approx(1.75)
-    scene, truth = yard(), standing(2)
-    dirt = Dirt(traffic=Traffic(0.0, 0.0, companions=2))
-    scanner = Scanner(scene, vlp16(), dirt, 1.5, lambda purpose: RNG(int(purpose)))
-    points = np.concatenate(list(scanner.frames(np.array([0.0, 0.1]), truth, truth)))
+    points = scanned(yard(), Dirt(traffic=Traffic(0.0, 0.0, companions=2)), 2)
     bodies = points[(points[:, 2] > -1.3) & (np.linalg.norm(points, axis=1) < 6.0)]
     assert len(bodies) > 200
     assert bodies[:, 2].max() < 0.35  # 1.75 m above the ground, the sensor at 1.5 m

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from coview_stream.sim.dirt.scan import Scanner
 from coview_stream.sim.layout import Layout, Site
 from coview_stream.sim.scenes import Footprint, Parts, Scene
 from coview_stream.sim.sensors import SENSORS
@@ -37,3 +38,10 @@ def fan(degrees=60.0, count=4001, up=0.0):
 
 def vlp16():
     return SENSORS["vlp16"]()
+
+
+def scanned(scene, dirt, frames=1):
+    """Points of a standing robot, its body frame."""
+    scanner = Scanner(scene, vlp16(), dirt, 1.5, lambda purpose: np.random.default_rng(int(purpose)))
+    truth = standing(frames)
+    return np.concatenate(list(scanner.frames(0.1 * np.arange(frames), truth, truth)))
