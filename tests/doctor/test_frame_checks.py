@@ -1,9 +1,8 @@
 """Clouds against odometry: the usual faults of a set-up on a simulated drive and, where they are, on real runs."""
 
-import os
 import re
 from dataclasses import replace
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,9 +26,8 @@ from coview_stream.geometry.transforms import (
 )
 from coview_stream.localization.witness.conventions import RIVALS
 from coview_stream.recordings.open_run import open_run
+from tests.test_realdata import SETS, data
 
-ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
 R_camera_body = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -168,25 +166,15 @@ def test_run_of_which_no_frame_can_be_read_is_not_ok(world_drive, tmp_path):
         seen_frames(run)
 
 
-@pytest.fixture(scope="module")
-def real():
-    kept = {}
-
-    def frames(name):
-        path = DATA / name / "run"
-        if not path.exists():
-            pytest.skip(f"real scans {path} are not here; name their folder in COVIEW_DATA")
-        if name not in kept:
-            kept[name] = seen_frames(open_run(path))
-        return kept[name]
-
-    return frames
+@cache
+def real(name):
+    return seen_frames(open_run(data(name, "run")))
 
 
 @pytest.mark.slow
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", ["riverside_a", "kitti04", "handheld_livox"])
-def test_unspoilt_run_is_ok(real, name):
+@pytest.mark.parametrize("name", SETS)
+def test_unspoilt_run_is_ok(name):
     assert [f.verdict for f in frame_findings(real(name))] == ["ok", "ok"]
 
 
@@ -194,7 +182,7 @@ def test_unspoilt_run_is_ok(real, name):
 @pytest.mark.realdata
 @pytest.mark.parametrize("fault", FAULTS)
 @nightly
-def test_fault_is_found_on_a_real_run(real, fault):
+def test_fault_is_found_on_a_real_run(fault):
     spoil, words = FAULTS[fault]
     findings = list(frame_findings([spoil(f) for f in real("riverside_a")]))
     assert any(words in f.found and f.verdict != "ok" and f.remedy for f in findings), findings
