@@ -94,16 +94,6 @@ def test_feature_windows_leave_no_seams(points, encoder):
         assert differing(one, many, name) < 1e-3, name
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("encoder", ["far-sighted"], indirect=True)
-@pytest.mark.parametrize(("margin", "name"), [(24, "learned.local"), (48, "learned.place")])
-def test_window_margin_is_needed(points, encoder, monkeypatch, margin, name):
-    """Or the test above could not fail."""
-    whole = by_place(feature_arrays(points)[0])
-    monkeypatch.setattr(feature_map, "_NET_MARGIN", margin)
-    assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
-
-
 def test_feature_tiles_lie_on_fixed_grid_where_map_has_points(points, built):
     tiles = {tuple(t) for t in built[0]["learned.tiles"].tolist()}
     own = {tuple(t) for t in np.floor(points[:, :2] / TILE).astype(int).tolist()}
