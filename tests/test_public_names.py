@@ -79,6 +79,7 @@ def test_all_errors_derive_from_coview_error():
         assert kind.__doc__
     assert issubclass(errors.MapError, errors.InputError)
     assert issubclass(errors.DependencyError, ImportError)
+    assert issubclass(errors.ConfigError, ValueError)
 
 
 @pytest.mark.slow

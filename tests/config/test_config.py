@@ -30,24 +30,18 @@ CONFIGS = [
 
 BAD = [
     (DescriptorConfig, "radius", 0.0),
-    (DescriptorConfig, "radius", float("nan")),
     (DescriptorConfig, "radius", float("inf")),
     (DescriptorConfig, "rings", 3),
     (DescriptorConfig, "sectors", 60.0),
     (DescriptorConfig, "channels", ()),
     (DescriptorConfig, "channels", ("coview", "coview")),
     (DescriptorConfig, "channels", ("colour",)),
-    (DescriptorConfig, "voxel", -0.1),
     (MapConfig, "block", 0.0),
     (MapConfig, "block", 50.0),
     (MapConfig, "voxel", 2.5),
-    (MapConfig, "tile", -1.0),
-    (MapConfig, "outlier_neighbours", -1),
     (MapConfig, "normal_neighbours", 2),
     (KeyframeConfig, "distance", 0.0),
     (KeyframeConfig, "capacity", 0),
-    (KeyframeConfig, "range_min", -0.5),
-    (LearnedConfig, "reach", float("nan")),
     (LearnedConfig, "reach", 33.0),
     (LearnedConfig, "dense_area", 0.0),
     (ConsensusConfig, "window", 0),
@@ -65,20 +59,14 @@ BAD = [
     (AcceptanceConfig, "risk", 0.0),
     (AcceptanceConfig, "risk", 0.9e-9),
     (AcceptanceConfig, "risk", 0.5),
-    (AcceptanceConfig, "risk", float("nan")),
     (AcceptanceConfig, "max_innovation", 0.0),
     (AcceptanceConfig, "max_doubt_s", 0.0),
     (AcceptanceConfig, "max_blind_s", float("inf")),
-    (AcceptanceConfig, "max_tilt", float("nan")),
     (TrackingConfig, "distance", 0.0),
-    (TrackingConfig, "yaw_drift", -0.1),
     (LidarOdometryConfig, "voxel", 0.0),
-    (LidarOdometryConfig, "max_gap", float("nan")),
     (LidarOdometryConfig, "max_range", 0.5),
     (NodeConfig, "pose_rate", 0.0),
     (NodeConfig, "pose_rate", 201.0),
-    (NodeConfig, "dead_reckoning_timeout", -1.0),
-    (NodeConfig, "odometry_history", float("nan")),
     (NodeConfig, "max_gap", float("inf")),
 ]
 
@@ -94,8 +82,8 @@ TYPED = [(kind, item.name) for kind in CONFIGS for item in fields(kind) if item.
 
 
 @pytest.mark.parametrize(("kind", "name"), TYPED)
-@pytest.mark.parametrize("value", ["a", None, [1.0, "b"]])
-def test_value_of_another_type_is_refused_by_name(kind, name, value):
+@pytest.mark.parametrize("value", ["a", None, [1.0, "b"], float("nan"), -2])
+def test_value_of_another_type_nan_or_negative_is_refused_by_name(kind, name, value):
     """What is no number must not end in a TypeError, nor a text in a flag count as true."""
     with pytest.raises(ConfigError, match=rf"^{name} is .*must be .*{kind.__name__}\.{name}"):
         kind(**{name: value})
@@ -165,10 +153,6 @@ def test_unknown_presets_and_options_are_named():
         map_preset("slam", descriptor=DescriptorConfig())
     with pytest.raises(ConfigError, match=r"MapConfig\.block"):
         map_preset("slam", block=-2.0)
-
-
-def test_config_errors_are_value_errors():
-    assert issubclass(ConfigError, ValueError)
 
 
 @pytest.mark.parametrize("kind", CONFIGS)
