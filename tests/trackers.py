@@ -27,6 +27,14 @@ def follow(localizer, drive, frames=None, start=0.0):
     return [localizer.step(drive.clouds[k], drive.T_odom_body[k], start + 0.5 * k) for k in numbers]
 
 
+def assert_usual(fixes, usual, metres):
+    """Fail unless fixes have the states and, but for so many metres, the poses of the usual ones, frame by frame."""
+    for fix, known in zip(fixes, usual, strict=False):
+        assert fix.state is known.state
+        if known.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, known.T_map_body, atol=metres)
+
+
 def registration(T_map_odom):
     return Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import inspect
 import pickle
 import re
-import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_world
 from small_world import assert_pose, pose_error
-from trackers import follow, garbage
+from trackers import assert_usual, follow, garbage
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig
@@ -99,19 +97,14 @@ def test_utm_map_and_utm_odometry_keep_millimetres(world_map, world_drive, world
 def test_invalid_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     cloud, T = world_drive.clouds[0], world_drive.T_odom_body[0]
-    scaled = T.copy()
-    scaled[:3, :3] *= 1.1
-    mirrored = T @ np.diag([1.0, -1.0, 1.0, 1.0])
-    nan_pose = T.copy()
-    nan_pose[0, 3] = np.nan
     bad = [
         (cloud[:, :2], T, 0.0, CloudError),
         (cloud[:9], T, 0.0, CloudError),
         (np.full((50, 3), np.nan, np.float32), T, 0.0, CloudError),
         (np.empty((0, 3), np.float32), T, 0.0, CloudError),
-        (cloud, scaled, 0.0, RunError),
-        (cloud, mirrored, 0.0, RunError),
-        (cloud, nan_pose, 0.0, RunError),
+        (cloud, T @ np.diag([1.1, 1.1, 1.1, 1.0]), 0.0, RunError),
+        (cloud, T @ np.diag([1.0, -1.0, 1.0, 1.0]), 0.0, RunError),
+        (cloud, pose_from(T[:3, :3], [np.nan, 0.0, 0.0]), 0.0, RunError),
         (cloud, T[:3], 0.0, RunError),
         (cloud, T, float("nan"), RunError),
     ]
@@ -121,10 +114,7 @@ def test_invalid_frames_raise_and_change_nothing(world_map, world_drive, world_f
             with pytest.raises(error):
                 localizer.step(points, pose, stamp)
         fixes.append(localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k))
-    for fix, undisturbed in zip(fixes, world_fixes, strict=False):
-        assert fix.state is undisturbed.state
-        if fix.T_map_body is not None:
-            np.testing.assert_allclose(fix.T_map_body, undisturbed.T_map_body, atol=1e-9)
+    assert_usual(fixes, world_fixes, 1e-9)
 
 
 def test_nan_rows_are_dropped(world_map, world_drive):
@@ -337,17 +327,10 @@ STEPS = {
 }
 
 
-def lines_without_docstring(function):
-    source = textwrap.dedent(inspect.getsource(function))
-    (tree,) = ast.parse(source).body
-    docstring = tree.body[0]
-    assert ast.get_docstring(tree)
-    return len(source.splitlines()) - (docstring.end_lineno - docstring.lineno + 1)
-
-
 @pytest.mark.parametrize("function", STEPS, ids=lambda function: function.__qualname__)
 def test_algorithm_fits_on_one_screen(function):
-    assert lines_without_docstring(function) <= MAX_LINES
+    lines, docstring = (text.count("\n") for text in (inspect.getsource(function), function.__doc__))
+    assert lines - docstring <= MAX_LINES
 
 
 def test_headings_of_the_method_page_are_in_the_order_of_the_steps():

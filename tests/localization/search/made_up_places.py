@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import small_world
+from small_world import Box
 
 from coview_kernels import Registration
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import Evidence
@@ -52,6 +55,17 @@ def moved(forward=0.0, degrees=0.0):
     """``HERE`` with the robot (not the odometry's origin) moved and turned."""
     body = HERE @ REQUEST.T_odom_body @ pose_from(rot_z(np.radians(degrees)), [forward, 0.0, 0.0])
     return body @ inverse(REQUEST.T_odom_body)
+
+
+def map_of(boxes):
+    """The map of a site of boxes."""
+    return BaseMap.build(small_world.sample_map(boxes).astype(np.float32), radius=30.0)
+
+
+def rows_of_boxes():
+    """Equal boxes on a square grid, to the map's edge."""
+    middles = np.arange(-28.0, 29.0, 8.0)
+    return [Box(np.array([x, y]), np.array([3.0, 3.0, 3.0]), 0.0) for x in middles for y in middles]
 
 
 def place(probability, T_map_odom=HERE, score=0.7, hinted=False, **hypothesis):

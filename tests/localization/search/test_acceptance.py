@@ -10,7 +10,6 @@ from made_up_places import REQUEST, RULE, candidate, judged, moved, place
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import Circle, pose_from, rot_z
-from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, MAX_PLACES, Considered, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
@@ -150,16 +149,3 @@ def test_the_most_probable_come_first_in_the_frame_of_the_sources():
 
 def test_no_place_is_nothing():
     assert Considered.of(Scored(Rivals(), []), search_request(), np.zeros(3)) is None
-
-
-@pytest.mark.slow
-def test_a_search_brings_the_right_place_along(world_map, world_drive):
-    localizer = Localizer(world_map)
-    results = []
-    for k, (cloud, T) in enumerate(zip(world_drive.clouds[:3], world_drive.T_odom_body[:3], strict=True)):
-        request = localizer.add_frame(cloud, T, 0.5 * k)
-        if request is not None:
-            results.append((k, localizer.search.update(request)))
-    number, result = results[0]
-    distance = np.linalg.norm(result.considered.places[:, :2] - world_drive.T_map_body[number][:2, 3], axis=1)
-    assert distance.min() < 1.0

@@ -6,11 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import small_world
+from made_up_places import map_of, rows_of_boxes
 from small_world import Box
 
-from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.registration.clouds import LocalMaps
@@ -23,14 +21,10 @@ from coview_stream.localization.state import State
 
 
 @pytest.fixture(scope="module")
-def search(tmp_path_factory):
+def search():
     """On equal boxes, the same turned by half a turn about zero, but for a tower in the east."""
-    middles = np.arange(-28.0, 29.0, 8.0)
-    boxes = [Box(np.array([x, y]), np.array([3.0, 3.0, 3.0]), 0.0) for x in middles for y in middles]
-    boxes.append(Box(np.array([24.0, 0.0]), np.array([5.0, 5.0, 9.0]), 0.0))
-    path = tmp_path_factory.mktemp("tower") / "site.ply"
-    write_cloud(path, small_world.sample_map(boxes).astype(np.float32))
-    base_map, config = BaseMap.build(path, radius=30.0), LocalizerConfig()
+    tower = Box(np.array([24.0, 0.0]), np.array([5.0, 5.0, 9.0]), 0.0)
+    base_map, config = map_of([*rows_of_boxes(), tower]), LocalizerConfig()
     return AdvisedSearch(base_map, config, LocalMaps(base_map, config.registration.source_range))
 
 

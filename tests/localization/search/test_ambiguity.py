@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import small_world
 from any_risk import NEVER
+from made_up_places import map_of, rows_of_boxes
 from nightly import nightly
 from small_world import Box
 
-from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import EYE
 from coview_stream.localization.search.ambiguity import FARTHEST, ambiguity, sample, virtual_scan
@@ -17,13 +16,9 @@ PLACES = 8
 
 
 @pytest.fixture(scope="module")
-def rows_map(tmp_path_factory):
+def rows_map():
     """Equal boxes on a square grid, to the map's edge."""
-    middles = np.arange(-28.0, 29.0, 8.0)
-    rows = [Box(np.array([x, y]), np.array([3.0, 3.0, 3.0]), 0.0) for x in middles for y in middles]
-    path = tmp_path_factory.mktemp("rows") / "site.ply"
-    write_cloud(path, small_world.sample_map(rows).astype(np.float32))
-    return BaseMap.build(path, radius=30.0)
+    return map_of(rows_of_boxes())
 
 
 @pytest.mark.slow
@@ -79,13 +74,11 @@ def seen(base_map, eye, changed=0.0):
 
 
 @pytest.mark.slow
-def test_walls_hide_what_is_behind_them(tmp_path_factory):
+def test_walls_hide_what_is_behind_them():
     wall = Box(np.array([8.0, 0.0]), np.array([1.0, 20.0, 6.0]), 0.0)
     behind = Box(np.array([16.0, 0.0]), np.array([3.0, 3.0, 4.0]), 0.0)
     beside = Box(np.array([-16.0, 0.0]), np.array([3.0, 3.0, 4.0]), 0.0)
-    path = tmp_path_factory.mktemp("wall") / "site.ply"
-    write_cloud(path, small_world.sample_map([wall, behind, beside]).astype(np.float32))
-    cloud = seen(BaseMap.build(path, radius=30.0), [0.0, 0.0, EYE]).cloud
+    cloud = seen(map_of([wall, behind, beside]), [0.0, 0.0, EYE]).cloud
     high = cloud.points[cloud.height > 1.0]
     assert (np.abs(high[:, 0] - 7.5) < 0.5).sum() > 50
     assert (high[:, 0] < -14.0).sum() > 5

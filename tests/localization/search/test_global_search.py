@@ -9,7 +9,6 @@ from made_up_places import name_instead
 from se3 import exp_se3
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.files import write_cloud
 from coview_stream.config import AcceptanceConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, tilt_of
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
@@ -107,25 +106,17 @@ def lean_of(result):
     return np.degrees(tilt_of(result.T_map_cloud))
 
 
-def test_sensor_that_leans_is_found_at_its_first_keyframe_by_its_prior(never_sure, world_drive):
-    request = next(run_of(leaning(world_drive), 1))
+@pytest.mark.parametrize("keyframes", [1, 2], ids=["at its first keyframe", "at a later keyframe"])
+def test_sensor_that_leans_is_found_by_its_prior(never_sure, world_drive, keyframes):
     drawn = Calibration(sigma_tilt=np.radians(0.2))  # such a lean is improbable then
-    known = replace(request, calibration=drawn, epoch=Epoch(1))
-    leans, improbable = never_sure.update(request), never_sure.update(known)
+    *before, newest = run_of(leaning(world_drive), keyframes)
+    results = []
+    for epoch, prior in zip((FIRST_EPOCH, Epoch(1)), (newest.calibration, drawn), strict=True):
+        for request in before:
+            never_sure.update(replace(request, calibration=drawn, epoch=epoch))
+        results.append(never_sure.update(replace(newest, calibration=prior, epoch=epoch)))
+    leans, improbable = results
     assert lean_of(leans) == pytest.approx(4.0, abs=0.5)
-    assert off(leans.leader) < 0.3
-    assert leans.evidence.evidence.ground > 0.8
-    assert leans.considered.none < 0.1 * improbable.considered.none
-
-
-def test_sensor_that_leans_is_found_at_a_later_keyframe_by_its_prior(never_sure, world_drive):
-    drawn = Calibration(sigma_tilt=np.radians(0.2))
-    requests = list(run_of(leaning(world_drive), 2))
-    first, known = (replace(request, calibration=drawn) for request in requests)
-    never_sure.update(first)
-    leans = never_sure.update(requests[1])
-    never_sure.update(replace(first, epoch=Epoch(1)))
-    improbable = never_sure.update(replace(known, epoch=Epoch(1)))
     assert off(leans.leader) < 0.3
     assert leans.evidence.evidence.ground > 0.8
     assert leans.considered.none < 0.1 * improbable.considered.none
@@ -138,12 +129,10 @@ def test_lean_is_measured_by_the_newest_frame_alone(never_sure, world_drive):
 
 
 @pytest.fixture(scope="module")
-def twin_map(map_points, tmp_path_factory):
+def twin_map(map_points):
     """Two places that the likelihood field cannot tell apart."""
-    path = tmp_path_factory.mktemp("twins") / "twins.ply"
     both = np.concatenate([map_points, map_points + np.array([TWIN, 0, 0])])
-    write_cloud(path, both.astype(np.float32))
-    return BaseMap.build(path, radius=30.0)
+    return BaseMap.build(both.astype(np.float32), radius=30.0)
 
 
 @pytest.mark.slow

@@ -12,7 +12,6 @@ from small_world import Box
 from trackers import observed
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.files import write_cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 from coview_stream.localization.registration.clouds import LocalMaps
@@ -34,10 +33,8 @@ def points():
 
 
 @pytest.fixture(scope="module")
-def row_map(points, tmp_path_factory):
-    path = tmp_path_factory.mktemp("row") / "site.ply"
-    write_cloud(path, points.astype(np.float32))
-    return BaseMap.build(path, radius=30.0)
+def row_map(points):
+    return BaseMap.build(points.astype(np.float32), radius=30.0)
 
 
 def look(row_map, points, x, reach, start):

@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
-from trackers import follow
+from trackers import assert_usual, follow
 
 from bench.accuracy.choices import TableVote
 from coview_stream.basemap.station_index import StationIndex
@@ -180,33 +180,27 @@ def test_circle_has_the_scores_of_the_map(world_map, request, many):
         np.testing.assert_allclose(single, index.at(whole, compared.numbers, np.zeros(len(every))), atol=1e-4)
 
 
-def driven(localizer, world_drive, guess=None):
-    if guess is not None:
-        localizer.guess_place(guess)
-    return follow(localizer, world_drive, 6)
-
-
 @pytest.mark.slow
 def test_robot_is_found_by_squares_as_by_all_stations(few_are_many, world_map, world_drive, world_fixes):
-    for fix, plain in zip(driven(Localizer(world_map), world_drive), world_fixes, strict=False):
-        assert fix.state is plain.state
-        if plain.T_map_body is not None:
-            np.testing.assert_allclose(fix.T_map_body[:3, 3], plain.T_map_body[:3, 3], atol=0.1)
+    assert_usual(follow(Localizer(world_map), world_drive, 6), world_fixes, 0.1)
 
 
 @pytest.mark.slow
 def test_robot_is_found_within_a_circle_and_not_beside_it(world_map, world_drive, world_fixes):
-    true = next(fix for fix in world_fixes if fix.T_map_body is not None).T_map_body
-    x, y = true[:2, 3].tolist()
-    here = driven(Localizer(world_map), world_drive, PlaceGuess(x + 15.0, y - 12.0, within=50.0))
+    def guided(x, y):
+        localizer = Localizer(world_map)
+        localizer.guess_place(PlaceGuess(x, y, within=50.0))
+        return follow(localizer, world_drive, 6)
+
+    x, y = next(fix for fix in world_fixes if fix.T_map_body is not None).T_map_body[:2, 3].tolist()
+    here = guided(x + 15.0, y - 12.0)
     assert any(fix.T_map_body is not None for fix in here)
     for fix, plain in zip(here, world_fixes, strict=False):
         if fix.T_map_body is not None and plain.T_map_body is not None:
             np.testing.assert_allclose(fix.T_map_body[:3, 3], plain.T_map_body[:3, 3], atol=0.1)
     away = world_map.stations[np.linalg.norm(world_map.stations[:, :2] - (x, y), axis=1).argmax()] + world_map.origin
     away[:2] += 45.0 * (away[:2] - (x, y)) / np.linalg.norm(away[:2] - (x, y))
-    there = driven(Localizer(world_map), world_drive, PlaceGuess(*away[:2].tolist(), within=50.0))
-    assert all(fix.T_map_body is None for fix in there)
+    assert all(fix.T_map_body is None for fix in guided(*away[:2].tolist()))
 
 
 def test_localizer_that_does_not_search_chooses_no_stations(world_map, world_drive):
@@ -241,13 +235,12 @@ def test_circle_grows_with_what_the_robot_drives():
 
 
 def test_circle_without_ground_is_searched_by_nothing(world_map, world_drive):
-    guess = PlaceGuess(9000.0, 9000.0, within=60.0)
-    localizer = Localizer(world_map)
-    with pytest.raises(InputError, match="no ground within 60 m"):
-        localizer.guess_place(guess)
-    engine = TrackEngine(world_map)
+    localizer, guess = Localizer(world_map), PlaceGuess(9000.0, 9000.0, within=60.0)
+    for beside, metres in ((guess, 60), (PlaceGuess(9000.0, 9000.0), 5)):
+        with pytest.raises(InputError, match=f"no ground within {metres} m"):
+            localizer.guess_place(beside)
     job = FrameJob("r1", 0, 0, world_drive.clouds[0], world_drive.T_odom_body[0], guess=guess)
-    result = engine.run(job)
+    result = TrackEngine(world_map).run(job)
     assert result.request is None
     assert "no ground in the circle" in result.fix.evidence.reason
     assert result.fix.state is State.SEARCHING
