@@ -105,6 +105,10 @@ class Ride:
         """Metres and degrees that the belief is off at a pose."""
         return small_world.pose_error(self.tracker.T_map_odom @ self.odometry(truth), truth)
 
+    def assert_right(self, truth, metres):
+        """Fail unless the belief is within so many metres, and a fifth of a degree, of a pose."""
+        small_world.assert_pose(self.tracker.T_map_odom @ self.odometry(truth), truth, metres, 0.2)
+
     def slips(self, by, truth):
         """From here on odometry is off by a motion (4, 4) of the body at ``truth`` that was none."""
         self.T_odom_map = self.odometry(truth) @ by @ inverse(truth)

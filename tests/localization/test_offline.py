@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,12 +85,20 @@ def test_summary_has_state_place_and_time(located):
     assert "000001.ply: empty" in summary(nothing)
 
 
+def fix(stamp, posed, cause=None, reason=None):
+    """A fix at the origin, or of a robot that has lost its place, with a reason of its cause."""
+    pose = (np.eye(4), np.eye(4), np.eye(6)) if posed else (None, None, None)
+    state = State.TRACKING if posed else State.LOST
+    reason = f"{cause} at {stamp:g}" if reason is None else reason
+    return Fix(stamp, state, *pose, evidence=KeyframeEvidence(stamp, state, reason, cause=cause))
+
+
 def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(world_map):
     leaning = Calibration(pitch=np.radians(2.9))
-    fix = Fix(1.0, State.TRACKING, np.eye(4), np.eye(4), np.eye(6), calibration=leaning)
-    upside_down = RunResult(2, [fix], mount=Mount(roll=np.pi))
+    upside_down = RunResult(2, [replace(fix(1.0, True), calibration=leaning)], mount=Mount(roll=np.pi))
     found = json.loads(json.dumps(upside_down.to_json(world_map)))["calibration"]
     assert found["pitch_deg"] == 2.9
+    assert found["says"][0].startswith("sensor leans 2.9 deg in pitch beyond its mount: corrected; ")
     assert "set --mount=180,2.9,0,0,0,0 to silence" in found["says"][0]
     assert found["says"][0] in summary(upside_down)
     searching = RunResult(1, [Fix(1.0, State.SEARCHING, calibration=leaning)])  # it may be why
@@ -103,9 +112,7 @@ def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(worl
 def test_calibration_is_silent_beside_a_fault_that_may_have_spoilt_it(world_map):
     late = Calibration(delay=0.3, sigma_delay=0.01)
     for cause, count in ((RejectionReason.MIXED, 0), (RejectionReason.FITNESS, 1)):
-        evidence = KeyframeEvidence(1.0, State.DOUBTED, "the sentence of the cause", cause=cause)
-        posed = Fix(0.0, State.TRACKING, np.eye(4), np.eye(4), np.eye(6))
-        found = RunResult(2, [posed, Fix(1.0, State.DOUBTED, evidence=evidence, calibration=late)])
+        found = RunResult(2, [fix(0.0, True), replace(fix(1.0, False, cause), calibration=late)])
         assert len(found.to_json(world_map)["calibration"]["says"]) == count
         assert len(found.fixes[1].to_json()["calibration"]["says"]) == count
         assert summary(found).count("set --cloud-delay=0.30: the first poses are off by it") == count
@@ -156,17 +163,12 @@ def test_unwritable_results_are_an_error(located, world_map, tmp_path):
 
 
 def test_interruptions_are_reported_with_their_reason(world_map):
-    def fix(stamp, posed, reason):
-        state = State.TRACKING if posed else State.LOST
-        pose = (np.eye(4), np.eye(4), np.eye(6)) if posed else (None, None, None)
-        return Fix(stamp, state, *pose, evidence=KeyframeEvidence(stamp, state, reason))
-
     spells = [(4, False, "no place stands out"), (3, True, ""), (2, False, "the scan fits less well"), (1, True, "")]
     spells += [(1 + k % 3, k % 2 == 0, f"reason {k}") for k in range(1, 8)]
     fixes, stamp = [], 10.0
     for frames, posed, reason in spells:
         for _ in range(frames):
-            fixes.append(fix(stamp, posed, reason))
+            fixes.append(fix(stamp, posed, reason=reason))
             stamp += 0.5
     found = RunResult(len(fixes), fixes)
     assert [spell.frames for spell in found.interruptions] == [2, 2, 1, 3, 2]
@@ -180,24 +182,19 @@ def test_interruptions_are_reported_with_their_reason(world_map):
 
 
 def test_faults_of_sensors_are_reported_whether_there_are_poses_or_not(world_map):
-    def fix(stamp, cause, posed=False):
-        pose = (np.eye(4), np.eye(4), np.eye(6)) if posed else (None, None, None)
-        state = State.TRACKING if posed else State.SEARCHING
-        return Fix(stamp, state, *pose, evidence=KeyframeEvidence(stamp, state, f"{cause} at {stamp:g}", cause=cause))
-
     repeated, clock = RejectionReason.REPEATED, RejectionReason.CLOCK
-    found = RunResult(5, [fix(10.0, None, True), fix(10.5, repeated), fix(11.0, None), fix(11.5, repeated),
-                          fix(12.0, clock, True)])  # fmt: skip
+    spells = [(10.0, True, None), (10.5, False, repeated), (11.0, False, None), (11.5, False, repeated)]
+    found = RunResult(5, [fix(*spell) for spell in [*spells, (12.0, True, clock)]])
     assert found.to_json(world_map)["faults"] == [
         {"cause": "repeated", "first_stamp": 10.5, "last_stamp": 11.5, "frames": 2, "reason": f"{repeated} at 11.5"},
         {"cause": "clock", "first_stamp": 12.0, "last_stamp": 12.0, "frames": 1, "reason": f"{clock} at 12"},
     ]
     assert re.search(r"^FAULT repeated +2 frames from 0\.5 s to 1\.5 s: .* at 11\.5$", summary(found), re.MULTILINE)
     distrust = "; poses before it are not to be trusted"
-    axes = fix(13.0, RejectionReason.CONVENTIONS)
+    axes = fix(13.0, False, RejectionReason.CONVENTIONS)
     assert re.search(rf"^FAULT conventions .*{distrust}$", summary(RunResult(6, [*found.fixes, axes])), re.MULTILINE)
     assert distrust not in summary(found)
-    assert distrust not in summary(RunResult(6, [axes, fix(14.0, None, True)]))  # it went by
+    assert distrust not in summary(RunResult(6, [axes, fix(14.0, True)]))  # it went by
     unposed = RunResult(2, found.fixes[1:3])
     assert "FAULT repeated" in summary(unposed)
     assert "FAULT" not in summary(RunResult(1, found.fixes[:1]))

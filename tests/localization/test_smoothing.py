@@ -13,10 +13,8 @@ import small_world
 from small_world import pose_error
 from trackers import garbage
 
-from coview_stream.cli import build_parser
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.errors import ConfigError
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.backward import BelievedRegistration, RecordedFrame, RecordingLocalizer
@@ -272,11 +270,3 @@ def test_files_mark_each_pose_and_keep_the_live_ones(world_map, way, tmp_path):
     write(RunResult(1, [Fix(0.0, State.SEARCHING)]), world_map, tmp_path)
     assert not (tmp_path / "filtered.tum").exists()
     assert json.loads((tmp_path / "result.json").read_text())["smoothed"] is None
-
-
-@pytest.mark.parametrize("words", [("serve", "site.coview"), ("replay", "run", "--robot", "rover")])
-def test_live_commands_have_no_smoothing(words):
-    parser = build_parser()
-    parser.parse_args(words)
-    with pytest.raises(ConfigError, match="--smooth"):
-        parser.parse_args([*words, "--smooth"])

@@ -21,9 +21,6 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tracking.md"
 
 
-# ---- the table
-
-
 def test_every_state_is_reached_from_searching_and_every_event_changes_some_state():
     reached = {State.SEARCHING}
     for _ in State:
@@ -40,12 +37,6 @@ def test_tracking_begins_by_an_accepted_place_or_a_doubted_one_that_is_verified(
     assert [event for event in Event if next_state(State.LOST, event) is not State.LOST] == [Event.PLACE_ACCEPTED]
 
 
-def test_only_a_known_place_is_doubted_or_lost():
-    for (before, _), after in TRANSITIONS.items():
-        assert before.has_place or after not in (State.DOUBTED, State.LOST)
-    assert [state for state in State if state.has_place] == [State.TRACKING, State.DOUBTED]
-
-
 def test_doubted_is_reported_as_ambiguous():
     reported = {state: state.reported for state in State}
     assert reported.pop(State.DOUBTED) == "AMBIGUOUS"
@@ -60,9 +51,6 @@ def test_docs_have_the_transition_table_and_every_state():
     assert printed == "\n".join(rows)
     for state in State:
         assert len(re.findall(rf"^\| {state} \| [^|]+ \| (?:yes|no) \|$", text, re.MULTILINE)) == 1
-
-
-# ---- a localizer
 
 
 @pytest.mark.slow
@@ -137,9 +125,6 @@ def carried(drive, frm, to):
     return drive.seen_from(drive.T_odom_body[frm] @ inverse(drive.T_map_body[to]))
 
 
-# ---- DOUBTED
-
-
 def dusty(drive, k):
     """A frame of which half is dust."""
     some = np.random.default_rng(0).permutation(len(drive.clouds[k]))[: len(drive.clouds[k]) * 6 // 10]
@@ -183,9 +168,6 @@ def test_covered_sensor_is_doubted_and_checked_at_each_frame(tracking, world_dri
     (again,) = follow(tracking, world_drive, [at[-1]], 9.0)
     assert again.state is State.TRACKING
     assert right(again, world_drive.T_map_body[at[-1]])
-
-
-# ---- carried to another place
 
 
 @pytest.mark.slow
@@ -237,9 +219,6 @@ def test_kidnapping_with_frozen_odometry_is_detected(tracking, world_drive):
     assert fixes[11].state is State.LOST  # after five seconds
 
 
-# ---- carried with open eyes
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("begin", [12, 20])
 def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive, begin):
@@ -261,9 +240,6 @@ def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive,
     still = localizer.step(clouds[-1], slow_drive.T_odom_body[begin - 1], 0.1 * len(clouds) + 0.1)
     assert still.state is State.TRACKING
     assert right(still, truth[-1], 0.05)
-
-
-# ---- covered, and beyond the edge
 
 
 @pytest.mark.slow

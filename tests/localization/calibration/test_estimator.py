@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 
-from coview_stream.config.mount import Mount
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.calibration import LEVEL, Calibration
 from coview_stream.localization.calibration.estimator import SIZE, CalibrationBelief, CalibrationEstimator
@@ -25,13 +24,6 @@ def test_scale_and_turn_of_odometry_are_estimated(scale):
         before, raw = T_odom, raw @ pose_from(rot_z(np.radians(0.2)), [2.0 * scale, 0.0, 0.0])
     assert (1.0 + estimator.calibration.scale) * scale == pytest.approx(1.0, abs=0.005)
     assert np.degrees(estimator.calibration.turn) == pytest.approx(-0.1, abs=0.03)
-
-
-def test_lean_is_reported_as_the_mount_that_silences_it():
-    leaning = Calibration(pitch=np.radians(2.9))
-    assert leaning.describe() == ["sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0,0,0,0 to silence this"]
-    assert "--mount=180,2.9,0,0,0,0 " in leaning.describe(Mount(roll=np.pi))[0]
-    assert "is it the vehicle or the sensor?" in leaning.describe(one_scan=True)[0]
 
 
 @pytest.mark.parametrize(

@@ -152,9 +152,6 @@ def test_few_explained_points_of_a_changed_site_are_worth_something():
     assert 0.2 < likeliest_share(row, background)[0] < 0.6
 
 
-# ---- calibration against chance
-
-
 def searches_by_chance(count, places, number, seed):
     """Posterior errors of the best place of searches in which all places are there by chance."""
     rng = np.random.default_rng(seed)
@@ -350,9 +347,6 @@ def test_small_errors_are_exact():
     assert rival.error(mask(2, 0)) == pytest.approx(math.exp(-100.0), rel=1e-6)
     assert 1.0 - rival.place[0] == 0.0
     assert of([300.0, 200.0, 250.0], count=3).error(mask(3, 0)) == pytest.approx(math.exp(-50.0), rel=1e-6)
-
-
-# ---- against chance
 
 
 @pytest.mark.parametrize("count", [1, 10, 250])

@@ -135,17 +135,13 @@ PLACES = np.array([[x, 0.0, 0.0] for x in (-16.0, 0.0, 16.0)])
 
 
 def test_local_map_cache_drops_the_oldest_beyond_its_bytes(world_map):
+    """And keeps one that is larger than the cache until the next."""
     sizes = [LocalMaps(world_map, radius=6.0).around(place).nbytes for place in PLACES]
-    maps = LocalMaps(world_map, radius=6.0, max_bytes=sum(sizes) - 1)
-    refs = [weakref.ref(maps.around(place)) for place in PLACES]
-    assert [ref() is not None for ref in refs] == [False, True, True]
-
-
-def test_local_map_larger_than_the_cache_is_kept_until_the_next(world_map):
-    maps = LocalMaps(world_map, radius=6.0, max_bytes=1)
-    refs = [weakref.ref(maps.around(place)) for place in PLACES]
-    assert [ref() is not None for ref in refs] == [False, False, True]
-    assert maps.around(PLACES[-1]) is refs[-1]()
+    for max_bytes, kept in ((sum(sizes) - 1, [False, True, True]), (1, [False, False, True])):
+        maps = LocalMaps(world_map, radius=6.0, max_bytes=max_bytes)
+        refs = [weakref.ref(maps.around(place)) for place in PLACES]
+        assert [ref() is not None for ref in refs] == kept
+        assert maps.around(PLACES[-1]) is refs[-1]()
 
 
 def test_local_maps_in_use_are_not_cut_again(world_map):
@@ -168,9 +164,6 @@ def test_local_map_without_points_is_none_and_is_cut_once(world_map, monkeypatch
 
 
 FLOOR = SIGMA_FLOOR
-
-
-# ---- orders and motions
 
 
 def test_swap_rotation_translation_reorders_the_same_covariance():
@@ -201,9 +194,6 @@ def test_propagated_heading_error_becomes_position_error():
 
 def test_gravity_informs_of_roll_and_pitch_alone():
     np.testing.assert_allclose(gravity_information(0.01), np.diag([1e4, 1e4, 0.0, 0.0, 0.0, 0.0]))
-
-
-# ---- a registration's
 
 
 def information_of(sigma):
@@ -271,9 +261,6 @@ def test_sigma_grows_continuously_as_information_falls():
 def test_invalid_information_matrix_is_refused(bad):
     with pytest.raises(InputError, match="information"):
         registration_covariance(bad, CONFIG)
-
-
-# ---- the measurement without the prior
 
 
 def test_remove_prior_is_undone_by_fusing_the_prior():

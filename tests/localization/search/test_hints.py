@@ -47,9 +47,6 @@ def misled(localizer, drive, metres=8.0):
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
 
-# ---- right ones
-
-
 def test_correct_hint_is_judged_like_what_votes_find(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
@@ -84,9 +81,6 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive):
     assert metres == pytest.approx(0.1, abs=0.01)
     assert degrees < 0.1
     assert tilt_of(T_map_odom) < 1e-9
-
-
-# ---- wrong ones
 
 
 FARTHEST = pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6])  # that is accepted
@@ -153,9 +147,6 @@ def test_place_that_led_is_one_hint_beside_the_others():
     assert hints.about(np.zeros(3), np.eye(4)) == ()
 
 
-# ---- what a localizer keeps
-
-
 def test_hint_is_kept_until_reset(world_map, world_drive):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0])
@@ -200,9 +191,6 @@ def test_odometry_frame_hint_is_kept_across_anchors():
     moved = pose_from(np.eye(3), first - second) @ T_odom_body  # the same pose about the second anchor
     np.testing.assert_allclose(again @ moved, T_map_odom @ T_odom_body, atol=1e-9)
     np.testing.assert_allclose(kept.about(first, np.eye(4))[0], T_map_odom, atol=1e-9)
-
-
-# ---- what a search tries
 
 
 def test_new_hint_or_one_keyframe_that_does_not_refute_it_starts_the_tries_again():
@@ -257,9 +245,6 @@ def test_followed_hint_is_one_place_and_waits_for_votes(world_map, world_drive, 
     states = {fix.state for fix in follow(localizer, world_drive, 6)}
     assert states == {State.AMBIGUOUS if hinted else State.SEARCHING}
     assert made == [int(hinted)] * 6
-
-
-# ---- acceptance
 
 
 def test_poses_to_try_begin_at_the_guess_and_cover_its_surroundings():

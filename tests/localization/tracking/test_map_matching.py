@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_world import pose_error
+from small_world import assert_pose, pose_error
 from trackers import observed
 
 from coview_kernels import Prior
@@ -29,8 +29,13 @@ TIGHT = np.diag([0.003, 0.003, 0.004, 0.05, 0.05, 0.05]) ** 2
 
 
 @pytest.fixture(scope="module")
-def scan(world_drive):
-    return observed(world_drive.clouds[4], inverse(T_MAP_ODOM) @ world_drive.T_map_body[4])
+def truth(world_drive):
+    return world_drive.T_map_body[4]
+
+
+@pytest.fixture(scope="module")
+def scan(world_drive, truth):
+    return observed(world_drive.clouds[4], inverse(T_MAP_ODOM) @ truth)
 
 
 def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
@@ -44,9 +49,8 @@ def off(match, truth):
     return float(np.linalg.norm(boxminus(match, truth)[3:]))
 
 
-def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
+def test_match_does_not_depend_on_the_prior(world_map, truth, scan):
     """The belief is off by centimetres and claims to be sure; registered with it, the pose is pulled there."""
-    truth = world_drive.T_map_body[4]
     believed = boxplus(truth, np.array([0.001, -0.001, 0.002, 0.05, -0.04, 0.03]))
     sure = np.diag([0.001, 0.001, 0.001, 0.003, 0.003, 0.003]) ** 2
     settings = CONFIG.registration
@@ -62,16 +66,14 @@ def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
     assert off(match.T_map_body, truth) < 0.5 * off(fused, truth)
 
 
-def test_match_covariance_does_not_depend_on_prior_covariance(world_map, world_drive, scan):
-    truth = world_drive.T_map_body[4]
+def test_match_covariance_does_not_depend_on_prior_covariance(world_map, truth, scan):
     loose, tight = (matched(world_map, scan, Estimate(truth, C)).covariance for C in (LOOSE, TIGHT))
     check_covariance(loose, "loose")
     np.testing.assert_allclose(np.sqrt(np.diag(tight)), np.sqrt(np.diag(loose)), rtol=0.2)
 
 
-def test_innovation_is_measured_against_graph_prediction(world_map, world_drive, scan):
+def test_innovation_is_measured_against_graph_prediction(world_map, truth, scan):
     """Which need not be what the match began with."""
-    truth = world_drive.T_map_body[4]
     away = boxplus(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
     near = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(truth, TIGHT))
     far = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(away, TIGHT))
@@ -85,9 +87,8 @@ def test_innovation_is_measured_against_graph_prediction(world_map, world_drive,
     assert far.verdict.cause is RejectionReason.VERIFIED
 
 
-def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_drive, scan):
+def test_without_matching_structure_the_prior_pose_is_kept(world_map, truth, scan):
     """Ten metres above everything."""
-    truth = world_drive.T_map_body[4]
     belief = Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
     match = matched(world_map, scan, belief)
     assert not match.verdict.verified
@@ -99,8 +100,7 @@ def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_driv
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 @pytest.mark.parametrize("part", ["prior", "registration"])
-def test_singular_prior_or_registration_is_rejected(world_map, world_drive, scan, bad, part, monkeypatch):
-    truth = world_drive.T_map_body[4]
+def test_singular_prior_or_registration_is_rejected(world_map, truth, scan, bad, part, monkeypatch):
     if part == "prior":
         match = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
     else:
@@ -122,8 +122,7 @@ def held(world_map, scan, belief):
     return matcher.match_widely(first, scan, wider, target, belief)
 
 
-def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_map, world_drive, scan):
-    truth = world_drive.T_map_body[4]
+def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_map, truth, scan):
     for x, y in ((1.6, 0.0), (-1.0, 2.2)):
         tries = held(world_map, scan, Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, x, y, 0.0])), TIGHT))
         best = max(tries, key=lambda each: each.verdict.ratio)
@@ -135,24 +134,17 @@ def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_ma
         assert tries[0].verdict.observation.rival == pytest.approx(best.verdict.observation.ratio, abs=3.0)
 
 
-def test_right_place_stays_when_it_is_tried_again(world_map, world_drive, scan):
-    truth = world_drive.T_map_body[4]
+def test_right_place_stays_when_it_is_tried_again(world_map, truth, scan):
     tries = held(world_map, scan, Estimate(truth, TIGHT))
     assert tries[0].verdict.verified
     assert all(off(each.T_map_body, truth) < 0.05 for each in tries if each.verdict.verified)
 
 
-@pytest.fixture(scope="module")
-def first_scan(scan, world_drive):
-    return scan, world_drive.T_map_body[4]
-
-
-def rivals(world_map, first_scan, off, count=1):
+def rivals(world_map, truth, scan, off, count=1):
     """Rivals of a pose that is off the truth by a motion of the body, and what is known of the place."""
-    seen, truth = first_scan
     place, target = PlaceEvidence(world_map), LocalMaps(world_map, 50.0).around(truth[:3, 3])
-    T = truth @ off @ inverse(seen.T_odom_body)
-    return find_rivals(place, seen, T, target, CONFIG.registration, count), T, place
+    T = truth @ off @ inverse(scan.T_odom_body)
+    return find_rivals(place, scan, T, target, CONFIG.registration, count), T, place
 
 
 @pytest.mark.parametrize(
@@ -167,32 +159,30 @@ def rivals(world_map, first_scan, off, count=1):
         ([2.2, 2.2, -4.0], 3),
     ],
 )
-def test_right_place_is_the_best_rival_of_one_beside_it(world_map, first_scan, off, count):
+def test_right_place_is_the_best_rival_of_one_beside_it(world_map, truth, scan, off, count):
     """From where the finest scale of a registration does not come there alone."""
     x, y, degrees = off
-    match, T, place = rivals(world_map, first_scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
-    target, settings = LocalMaps(world_map, 50.0).around(first_scan[1][:3, 3]), CONFIG.registration
-    alone = register(first_scan[0].cloud, T, target, settings, settings.track[-1:])
-    assert alone is None or pose_error(alone.T_map_source @ first_scan[0].T_odom_body, first_scan[1])[0] > 0.5
-    metres, turn = pose_error(match[0].T_map_odom @ first_scan[0].T_odom_body, first_scan[1])
-    assert metres < 0.05
-    assert turn < 0.3
-    assert match[0].ratio > place.observe(first_scan[0], T).ratio + 5.0
+    match, T, place = rivals(world_map, truth, scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
+    target, settings = LocalMaps(world_map, 50.0).around(truth[:3, 3]), CONFIG.registration
+    alone = register(scan.cloud, T, target, settings, settings.track[-1:])
+    assert alone is None or pose_error(alone.T_map_source @ scan.T_odom_body, truth)[0] > 0.5
+    assert_pose(match[0].T_map_odom @ scan.T_odom_body, truth, 0.05, 0.3)
+    assert match[0].ratio > place.observe(scan, T).ratio + 5.0
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_right_place_has_no_rival_that_comes_near_it(world_map, first_scan, count):
-    match, T, place = rivals(world_map, first_scan, np.eye(4), count)
+def test_right_place_has_no_rival_that_comes_near_it(world_map, truth, scan, count):
+    match, T, place = rivals(world_map, truth, scan, np.eye(4), count)
     assert len(match) <= count
     for rival in match:
-        assert rival.ratio < place.observe(first_scan[0], T).ratio - 3.0
+        assert rival.ratio < place.observe(scan, T).ratio - 3.0
 
 
-def test_rivals_are_apart_and_the_most_probable_first(world_map, first_scan):
-    match, T, _ = rivals(world_map, first_scan, pose_from(np.eye(3), [1.5, 1.5, 0.0]), 3)
+def test_rivals_are_apart_and_the_most_probable_first(world_map, truth, scan):
+    match, T, _ = rivals(world_map, truth, scan, pose_from(np.eye(3), [1.5, 1.5, 0.0]), 3)
     ratios = [rival.ratio for rival in match]
     assert ratios == sorted(ratios, reverse=True)
-    poses = [each @ first_scan[0].T_odom_body for each in (T, *(rival.T_map_odom for rival in match))]
+    poses = [each @ scan.T_odom_body for each in (T, *(rival.T_map_odom for rival in match))]
     for k, one in enumerate(poses):
         assert all(matters(*off_by(one, other)) for other in poses[:k])
 

@@ -54,13 +54,6 @@ def ratio_of(place, observation):
     return float(np.log(odds.sum()))
 
 
-def test_scan_of_another_world_speaks_against_the_place(place, scans, elsewhere, world_drive):
-    for scan in scans:
-        place.learn(place.observe(scan, T_MAP_ODOM))
-    for cloud in elsewhere.clouds:
-        assert place.observe(scan_of(cloud, world_drive.T_map_body[5]), T_MAP_ODOM).ratio < -5.0
-
-
 def test_scan_that_fits_in_part_speaks_for_a_place_only_where_that_is_usual(world_map, world_drive, scans):
     """A new robot does not know how much of the site has changed; one that drives through it does."""
     fresh, unchanged, changed = (PlaceEvidence(world_map) for _ in range(3))

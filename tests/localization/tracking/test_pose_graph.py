@@ -76,9 +76,6 @@ def relative(A, B):
 STEP = exp_se3(np.array([0.02, -0.01, 0.3, 2.0, 0.3, -0.1]))
 
 
-# ---- one and two keyframes, where the answer is known
-
-
 def test_innovation_is_the_squared_distance_in_sigmas(graph):
     graph.start(START, START_COVARIANCE)
     graph.estimate.T_map_body[:] = 0.0  # a copy
@@ -90,9 +87,6 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
     assert graph.estimate.innovation(boxplus(T, gap), REGISTRATION) == pytest.approx(expected, rel=1e-6)
     assert graph.estimate.innovation(T, REGISTRATION) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(graph.estimate.T_map_body, T)
-
-
-# ---- a gap, a new start, refusals
 
 
 def test_empty_graph_raises(graph):
@@ -154,9 +148,6 @@ def test_map_is_not_locked_out_where_covariances_are_optimistic(way, registratio
     assert least < shift_errors(estimates, way.truth)[20:].max() < most
 
 
-# ---- against a dense solution
-
-
 # covariances of the dense solution differ along each of the map's axes
 LOPSIDED_START = np.diag([0.01, 0.015, 0.03, 0.3, 0.1, 0.2]) ** 2
 LOPSIDED_STEP = np.diag([0.001, 0.002, 0.002, 0.02, 0.04, 0.01]) ** 2
@@ -209,9 +200,6 @@ def test_newest_pose_equals_dense_solution(graph):
     assert gap[:3].max() < 5e-4
     assert gap[3:].max() < 2e-3
     assert relative(solution.covariance, covariance) < 0.02
-
-
-# ---- the window
 
 
 def full_isam2(way):

@@ -32,9 +32,6 @@ RULE = AcceptanceConfig()
 WIDE = LocalizerConfig(tracking=TrackingConfig(window=20.0, min_points=30_000))  # all scans so far are one
 
 
-# ---- one that is believed
-
-
 def test_good_registration_is_accepted(world_map, world_drive):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
     ride = ride_of(world_map, world_drive)
@@ -46,9 +43,7 @@ def test_good_registration_is_accepted(world_map, world_drive):
     assert verdict.reason == "verified"
     assert verdict.score == verdict.evidence.score > 0.8
     assert 0.0 < verdict.innovation < RULE.max_innovation
-    metres, degrees = ride.error(truth)
-    assert metres < 0.05
-    assert degrees < 0.2
+    ride.assert_right(truth, 0.05)
     after = ride.tracker.predicted_covariance()
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
     floor = np.diag(registration_covariance(1e14 * np.eye(6), ride.tracker.config.registration))
@@ -85,9 +80,6 @@ def test_prefetch_map_sorts_a_crop(world_map, world_drive):
     assert "grid" not in vars(around(truth[:3, 3]))
     ride.tracker.prefetch_map(ride.odometry(truth))
     assert "grid" in vars(around(truth[:3, 3]))
-
-
-# ---- those that are not
 
 
 def test_registration_corrects_and_teaches_nothing_unless_it_is_believed(world_map, world_drive):
@@ -184,18 +176,14 @@ def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
 
 
 def test_newest_only_uses_the_newest_frame(world_map, slow_drive):
-    ride = ride_of(world_map, slow_drive, WIDE, 0)
-    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
-    for seed in range(3):
-        ride.see(garbage(seed), truth[1])
-    assert ride.update(clouds[1], truth[1], newest_only=True).score > 0.9
-    again = ride_of(world_map, slow_drive, WIDE, 0)
-    for seed in range(3):
-        again.see(garbage(seed), truth[1])
-    assert again.update(clouds[1], truth[1]).score < 0.8
-
-
-# ---- a new start
+    cloud, truth, scores = slow_drive.clouds[1], slow_drive.T_map_body[1], []
+    for newest_only in (True, False):
+        ride = ride_of(world_map, slow_drive, WIDE, 0)
+        for seed in range(3):
+            ride.see(garbage(seed), truth)
+        scores.append(ride.update(cloud, truth, newest_only=newest_only).score)
+    assert scores[0] > 0.9
+    assert scores[1] < 0.8
 
 
 def test_restart_carries_nothing_over(world_map, slow_drive, world_drive):
@@ -234,9 +222,6 @@ def test_place_that_moves_while_the_calibration_changes_is_the_registered_clouds
 SIDEWAYS = pose_from(np.eye(3), [0.0, 0.6, 0.0])
 
 
-# ---- odometry that slips
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "slip",
@@ -267,9 +252,7 @@ def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     assert ride.tracker.odometry.drift.position < 2.5 * drift.position
     assert ride.update(clouds[k + 1], truth[k + 1]).cause is RejectionReason.VERIFIED
     assert ride.tracker.odometry.drift.position < 2.5 * drift.position  # nor does the step across it tell of any
-    metres, degrees = ride.error(truth[k + 1])
-    assert metres < 0.03
-    assert degrees < 0.2
+    ride.assert_right(truth[k + 1], 0.03)
 
 
 def test_plausible_drift_is_not_a_slip(world_map, slow_drive):
@@ -292,9 +275,7 @@ def test_slip_of_the_heading_alone_is_followed_at_once(world_map, slow_drive):
     verdict = ride.update(slow_drive.clouds[8], slow_drive.T_map_body[8])
     assert verdict.verified
     assert verdict.innovation > RULE.max_innovation
-    metres, degrees = ride.error(slow_drive.T_map_body[8])
-    assert metres < 0.03
-    assert degrees < 0.2
+    ride.assert_right(slow_drive.T_map_body[8], 0.03)
 
 
 def test_step_in_height_is_not_followed(world_map, slow_drive):
@@ -325,9 +306,6 @@ def test_displaced_frame_is_detected_only_after_a_good_one(world_map, slow_drive
     assert ride.tracker.looks_displaced(ride.odometry(truth[9]))
     ride.tracker.forget_scans()
     assert not ride.tracker.looks_displaced(ride.odometry(truth[9]))  # no frame to look at
-
-
-# ---- standing still
 
 
 def stood(world_map, slow_drive, looks, standing_still):

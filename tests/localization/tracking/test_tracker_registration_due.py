@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from trackers import Ride, add_frame, match_and_update, registration, tracker_of
+from trackers import Ride, match_and_update, registration, tracker_of
 
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
@@ -118,13 +118,6 @@ def test_scan_buffer_window_adapts_to_point_count(points, metres, first):
 def test_scan_buffer_drops_old_frames():
     """A robot that never gets its points together, on a robot that runs for weeks."""
     assert len(scan_buffer(10, 300, 0.01, min_points=10**6).window()) <= 400
-
-
-def test_update_before_start_raises(world_map, world_drive):
-    tracker = tracker_of(world_map)
-    add_frame(tracker, world_drive.clouds[0], np.eye(4))
-    with pytest.raises(RuntimeError, match="call start first"):
-        tracker.match_to_map(world_drive.clouds[0], np.eye(4))
 
 
 @pytest.fixture

@@ -51,8 +51,11 @@ class Odometry:
         return np.stack([np.interp(t - LAGS, self.times, column) for column in np.transpose(self.poses)], axis=1)
 
 
-def drive(change, way=pose, begin=10.0, until=20.0, **given):
-    """Drive until a time; from ``begin`` on, ``change(o, t)`` gives odometry's and the clouds' motion of a step."""
+def drive(change, way=pose, begin=10.0, until=20.0, stops=True, **given):
+    """Drive until a time or, unless it goes on, an accusation: the posterior, the newest accusation, the seconds.
+
+    From ``begin`` on, ``change(o, t)`` gives odometry's and the clouds' motion of a step.
+    """
     faults, rng, odometry = FaultPosterior(), np.random.default_rng(3), Odometry(5.0)
     for t in np.arange(5.0, until, DT):
         o = seen = moved(way(t), way(t + DT))
@@ -61,9 +64,20 @@ def drive(change, way=pose, begin=10.0, until=20.0, **given):
         seen, on_map = (Seen(seen + rng.normal(size=3) * np.sqrt(np.diag(NOISE)), NOISE) for _ in range(2))
         faults.add(Step(DT, Seen(o, NOISE), seen, on_map, *odometry.move(o), **given))
         accused = faults.accusation(*LEVEL, RISK)
-        if accused is not None:
+        if accused is not None and stops:
             return faults, accused, t + DT - begin
-    return faults, None, until - begin
+    return faults, accused, until - begin
+
+
+def late(lag):
+    """Clouds that are older than their stamps by ``lag`` seconds from the first step on."""
+    return lambda o, t: (o, moved(pose(t - (lag if t >= 10.4 else 0.0)), pose(t + DT - lag)))
+
+
+def displaced(x, y, degrees):
+    """Clouds of a sensor that has been moved and turned on its mount by the first step."""
+    C = np.array([x, y, np.radians(degrees)])
+    return lambda o, t: (o, compose(o, C) if t < 10.4 else compose(compose(inverted(C), o), C))
 
 
 def test_nothing_is_wrong_where_all_agree():
@@ -89,11 +103,7 @@ def test_robot_that_stands_does_not_repeat_itself():
 
 @pytest.mark.parametrize("lag", [0.4, 1.0, 2.0])
 def test_clouds_that_are_late_are_named_with_their_lag(lag):
-    def late(o, t):
-        before = lag if t >= 10.0 + DT else 0.0
-        return o, moved(pose(t - before), pose(t + DT - lag))
-
-    faults, accused, seconds = drive(late)
+    faults, accused, seconds = drive(late(lag))
     assert accused.cause is RejectionReason.CLOCK
     assert "older than their stamps" in accused.sentence
     assert seconds <= 4.0
@@ -130,46 +140,31 @@ def test_on_a_straight_way_the_stamps_tell_a_clock_that_parts_from_odometry_out_
         assert faults.rescaled(RISK)[0] == pytest.approx(0.7, abs=0.05)
 
 
-@pytest.mark.parametrize("degrees", [-10.0, 5.0, 90.0])
-def test_sensor_that_turned_on_its_mount_is_named_with_its_angle(degrees):
-    C = np.array([0.0, 0.0, np.radians(degrees)])
-
-    def turned(o, t):
-        return o, compose(o, C) if t < 10.0 + DT else compose(compose(inverted(C), o), C)
-
-    _, accused, seconds = drive(turned)
+@pytest.mark.parametrize(
+    ("x", "y", "degrees", "words"),
+    [
+        (0.0, 0.0, -10.0, "turned by 10 degrees"),
+        (0.0, 0.0, 5.0, "turned by 5 degrees"),
+        (0.0, 0.0, 90.0, "turned by 90 degrees"),
+        (0.5, 4.0, 0.0, "clouds jumped by 4.0 m"),
+    ],
+)
+def test_sensor_that_turned_or_jumped_on_its_mount_is_named_with_its_motion(x, y, degrees, words):
+    _, accused, seconds = drive(displaced(x, y, degrees))
     assert accused.cause is RejectionReason.MOUNT
-    assert f"turned by {abs(degrees):.0f} degrees" in accused.sentence
+    assert words in accused.sentence
     assert seconds <= 3.0
 
 
-def test_clouds_that_jump_are_named():
-    C = np.array([0.5, 4.0, 0.0])
-
-    def jumped(o, t):
-        return o, compose(o, C) if t < 10.0 + DT else compose(compose(inverted(C), o), C)
-
-    _, accused, seconds = drive(jumped)
-    assert accused.cause is RejectionReason.MOUNT
-    assert "clouds jumped by 4.0 m" in accused.sentence
-    assert seconds <= 3.0
-
-
-def test_a_mount_that_the_calibration_has_followed_is_no_fault():
-    C = np.array([0.0, 0.0, np.radians(10.0)])
-    faults, accused, _ = drive(lambda o, t: (o, compose(o, C) if t < 10.4 else compose(compose(inverted(C), o), C)))
+@pytest.mark.parametrize(
+    ("change", "turn", "delay"),
+    [(displaced(0.0, 0.0, 10.0), np.radians(10.0), 0.0), (late(1.0), 0.0, 1.0)],
+    ids=["mount", "delay"],
+)
+def test_a_fault_that_the_calibration_has_followed_is_none(change, turn, delay):
+    faults, accused, _ = drive(change)
     assert accused is not None
-    faults.corrected(C, 0.0)
-    assert faults.accusation(*LEVEL, RISK) is None
-
-
-def test_a_delay_that_the_calibration_has_followed_is_no_fault():
-    def late(o, t):
-        return o, moved(pose(t - (1.0 if t >= 10.4 else 0.0)), pose(t + DT - 1.0))
-
-    faults, accused, _ = drive(late)
-    assert accused is not None
-    faults.corrected(np.zeros(3), 1.0)
+    faults.corrected(np.array([0.0, 0.0, turn]), delay)
     assert faults.accusation(*LEVEL, RISK) is None
 
 
@@ -269,23 +264,13 @@ def test_a_fault_that_ends_leaves_nothing_behind():
     C = np.array([0.0, 0.0, np.radians(10.0)])
 
     def turned(o, t):
-        if t < 10.4:
-            return o, compose(o, C)
         if t < 12.9:
-            return o, compose(compose(inverted(C), o), C)
+            return displaced(0.0, 0.0, 10.0)(o, t)
         return o, o if t >= 13.4 else compose(inverted(C), o)
 
-    faults = FaultPosterior()
-    rng, odometry = np.random.default_rng(3), Odometry(5.0)
-    for t in np.arange(5.0, 25.0, DT):
-        o = seen = moved(pose(t), pose(t + DT))
-        if t >= 10.0:
-            o, seen = turned(o, t)
-        seen, on_map = (Seen(seen + rng.normal(size=3) * np.sqrt(np.diag(NOISE)), NOISE) for _ in range(2))
-        faults.add(Step(DT, Seen(o, NOISE), seen, on_map, *odometry.move(o)))
-        if t == 12.0:
-            assert faults.accusation(*LEVEL, RISK) is not None
-    assert faults.accusation(*LEVEL, RISK) is None
+    assert drive(turned, until=12.5, stops=False)[1] is not None
+    faults, accused, _ = drive(turned, until=25.0, stops=False)
+    assert accused is None
     assert faults.good + faults.slip > 0.99
 
 
@@ -298,12 +283,8 @@ def test_odometry_that_jumps_by_a_kilometre_is_a_slip():
 def test_robot_that_tilts_is_off_by_a_short_lag():
     """A lag too short for the way to show: the body's tilting turns the pose."""
     level, tilting = (1.0, np.radians(3.0)), np.radians(30.0)
-
-    def late(o, t):
-        return o, moved(pose(t - (0.15 if t >= 10.4 else 0.0)), pose(t + DT - 0.15))
-
-    even, _, _ = drive(late, until=14.0)
-    shaken, _, _ = drive(late, until=14.0, tilting=tilting)
+    even, _, _ = drive(late(0.15), until=14.0)
+    shaken, _, _ = drive(late(0.15), until=14.0, tilting=tilting)
     assert even.accusation(*level, RISK) is None
     assert shaken.accusation(*level, RISK).cause is RejectionReason.CLOCK
 
