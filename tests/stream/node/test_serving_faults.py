@@ -6,7 +6,7 @@ import time
 
 import pytest
 from nightly import nightly
-from serving import FALSE, Service
+from serving import FALSE
 from sockets import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
@@ -19,19 +19,6 @@ _jump = lambda: _rng.uniform(-1e5, 1e5)
 time.time = lambda: _now() + _jump()
 time.time_ns = lambda: max(0, _ns() + int(1e9 * _jump()))
 """
-
-
-@pytest.fixture
-def serve(world_file, slow_drive, tmp_path):
-    made = []
-
-    def start(**environment):
-        made.append(Service(world_file, slow_drive, tmp_path, **environment))
-        return made[-1]
-
-    yield start
-    for service in made:
-        service.end()
 
 
 @nightly

@@ -10,19 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nightly import nightly
-from serving import FALSE, Service
+from serving import FALSE
 from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
-
-
-@pytest.fixture
-def service(world_file, slow_drive, tmp_path):
-    made = Service(world_file, slow_drive, tmp_path)
-    yield made
-    made.end()
 
 
 def second_map(world_file, path):

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -19,65 +20,56 @@ from coview_stream.stream.transport.zenoh_transport import open_transport
 CLOUD = np.random.default_rng(1).uniform(-30, 30, (20_000, 3)).astype(np.float32)  # 240 kB: 2 s at 1 Mbit/s
 
 
-@pytest.mark.slow
-def test_half_open_link_holds_up_nothing_that_a_client_calls():
-    with Router() as router, BadLink(router.endpoint) as link:
-        robot = RobotClient("r1", link.endpoint)
-        node = open_transport(connect=[router.endpoint])
-        node.subscribe(robot.keys.odometry, lambda sample: None, "all")
+@pytest.fixture
+def linked():
+    """A link that may go bad, the client of a robot behind it, and the odometry that a node on its other side gets."""
+    with Router() as router, BadLink(router.endpoint) as link, closing(open_transport([router.endpoint])) as node:
+        robot, came = RobotClient("r1", link.endpoint), []
+        node.subscribe(robot.keys.odometry, came.append, "all")
         node.subscribe(robot.keys.cloud, lambda sample: None, "newest")
         assert robot.wait_for_node(20.0)
-        link.mode("silent")
-        longest, end, stamp = 0.0, time.monotonic() + 4.0, 0.0
-        while time.monotonic() < end:
-            begin, stamp = time.monotonic(), stamp + 0.005
-            robot.send_odometry(np.eye(4), stamp)
-            robot.send_cloud(CLOUD, stamp)
-            longest = max(longest, time.monotonic() - begin)
-        assert longest < 1.0  # zenoh's own waits are of many seconds; encoding is of milliseconds
-        begin = time.monotonic()
+        yield link, robot, came
         robot.close()
-        assert time.monotonic() - begin < 4.0
-        node.close()
     until(lambda: not any(thread.name in ("coview closing", "coview writer") for thread in threading.enumerate()), 20.0)
 
 
 @pytest.mark.slow
-def test_odometry_goes_before_clouds_on_a_thin_link():
-    with Router() as router, BadLink(router.endpoint) as link:
-        robot = RobotClient("r1", link.endpoint)
-        node = open_transport(connect=[router.endpoint])
-        came = []
-        node.subscribe(robot.keys.odometry, lambda sample: came.append(time.monotonic()), "all")
-        node.subscribe(robot.keys.cloud, lambda sample: None, "newest")
-        assert robot.wait_for_node(20.0)
-        link.mode("thin")
-        sent, end = 0, time.monotonic() + 11.0
-        while time.monotonic() < end:
-            sent += 1
-            robot.send_odometry(np.eye(4), 0.05 * sent)
-            if sent % 2 == 0:
-                robot.send_cloud(CLOUD, 0.05 * sent)
-            time.sleep(0.05)
-        assert len(came) > 0.4 * sent  # in order of putting it is 0.1: each cloud takes 2 s
-        robot.close()
-        node.close()
+def test_half_open_link_holds_up_nothing_that_a_client_calls(linked):
+    link, robot, _ = linked
+    link.mode("silent")
+    longest, end, stamp = 0.0, time.monotonic() + 4.0, 0.0
+    while time.monotonic() < end:
+        begin, stamp = time.monotonic(), stamp + 0.005
+        robot.send_odometry(np.eye(4), stamp)
+        robot.send_cloud(CLOUD, stamp)
+        longest = max(longest, time.monotonic() - begin)
+    assert longest < 1.0  # zenoh's own waits are of many seconds; encoding is of milliseconds
+    begin = time.monotonic()
+    robot.close()
+    assert time.monotonic() - begin < 4.0
 
 
 @pytest.mark.slow
-def test_odometry_that_waits_is_sent_before_a_client_closes():
-    with Router() as router:
-        robot = RobotClient("r1", router.endpoint)
-        node = open_transport(connect=[router.endpoint])
-        came = []
-        node.subscribe(robot.keys.odometry, lambda sample: came.append(sample.payload), "all")
-        node.subscribe(robot.keys.cloud, lambda sample: None, "newest")
-        assert robot.wait_for_node(20.0)
-        for number in range(500):
-            robot.send_odometry(np.eye(4), 0.005 * number)
-        robot.close()
-        until(lambda: len(came) == 500, 10.0)
-        node.close()
+def test_odometry_goes_before_clouds_on_a_thin_link(linked):
+    link, robot, came = linked
+    link.mode("thin")
+    sent, end = 0, time.monotonic() + 11.0
+    while time.monotonic() < end:
+        sent += 1
+        robot.send_odometry(np.eye(4), 0.05 * sent)
+        if sent % 2 == 0:
+            robot.send_cloud(CLOUD, 0.05 * sent)
+        time.sleep(0.05)
+    assert len(came) > 0.4 * sent  # in order of putting it is 0.1: each cloud takes 2 s
+
+
+@pytest.mark.slow
+def test_odometry_that_waits_is_sent_before_a_client_closes(linked):
+    _, robot, came = linked
+    for number in range(500):
+        robot.send_odometry(np.eye(4), 0.005 * number)
+    robot.close()
+    until(lambda: len(came) == 500, 10.0)
 
 
 class Stuck:
