@@ -103,39 +103,6 @@ def alive(pid):
 
 
 @pytest.mark.slow
-def test_killed_engine_process_is_restarted(engine, world_file, world_drive):
-    child = EngineChild("track")
-    process = engine("track", world_file, child=child)
-    good = job(world_drive.clouds[0])
-    process.start()
-    process.wait_ready()
-    first = process.pid
-    assert first == child.process.pid
-    result = process.run(good)
-    assert result.fix.state is State.SEARCHING
-    assert result.request is not None
-    np.testing.assert_array_equal(result.request.cloud, world_drive.clouds[0])
-    with pytest.raises(RejectedError, match="finite points"):
-        process.run(job(np.zeros((3, 3), np.float32)))
-    later = job(world_drive.clouds[0], stamp_ns=1_100_000_000)
-    assert process.run(later).request is None  # the same child, and it remembers: no keyframe without driving on
-    assert process.pid == first
-
-    os.kill(first, signal.SIGKILL)
-    with pytest.raises(DiedError, match="track engine died"):
-        process.run(good)
-    result = process.run(good)
-    assert process.pid != first
-    assert result.request is not None  # and this one remembers nothing
-    second = process.pid
-    process.close()
-    assert process.pid is None
-    until(lambda: not alive(second), 5.0)
-    with pytest.raises(DiedError, match="closed"):
-        process.run(good)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("adopted", [False, True])
 def test_child_without_a_map_ends_when_it_is_closed(engine, adopted):
     child = EngineChild("search")
@@ -255,6 +222,9 @@ def test_close_ends_a_running_job(engine):
     with pytest.raises(DiedError, match="died"):
         process.run(job())
     timer.join()
+    for again in (process.watch, lambda: process.run(job())):
+        with pytest.raises(DiedError, match="closed"):
+            again()
 
 
 # ---- the child

@@ -1,12 +1,11 @@
 """The node's poses: a drive through the small world, formats, silence."""
 
-import json
 import time
 
 import numpy as np
 import pytest
 from fake_node import STEP, declared
-from fake_robot import SHA, T_MAP_ODOM, message, ns, tracking
+from fake_robot import T_MAP_ODOM, message, ns, tracking
 from small_world import pose_error
 
 from coview_stream.geometry.transforms import pose_from
@@ -34,14 +33,7 @@ def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
     assert len(right) >= 3
     assert max(right) < 0.1
     assert site.net.raised == []
-    (raw, *_) = site.net.samples("coview/r1/out/pose")
-    assert raw.encoding == "application/json"
-    fields = json.loads(raw.payload)
-    assert {"stamp_ns", "robot", "state", "position", "orientation", "covariance", "confidence", "map_sha256"} <= set(
-        fields
-    )
-    assert (fields["robot"], fields["state"], fields["map_sha256"]) == ("r1", "TRACKING", SHA)
-    assert len(fields["covariance"]) == 36
+    assert site.net.samples("coview/r1/out/pose")[0].encoding == "application/json"
     status = site.status("r1")
     assert status["state"] == "TRACKING"
     assert status["counters"]["processed"] == 8
