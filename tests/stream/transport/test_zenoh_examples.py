@@ -42,9 +42,8 @@ def check_round_trip(node, robot, name="r1"):
         return bool(clouds and poses)
 
     until(both)
-    session = robot._session
-    until(lambda: any(reply.ok for reply in session.get(keys.reset, timeout=2.0)))
-    until(lambda: any(reply.ok for reply in session.liveliness().get(keys.alive, timeout=2.0)))
+    until(lambda: any(reply.ok for reply in robot.session.get(keys.reset, timeout=2.0)))
+    until(lambda: robot.tokens(keys.alive))
 
 
 def test_peer_example_on_one_machine(tmp_path):
@@ -111,14 +110,14 @@ def test_access_control_example_limits_robots_to_their_keys(certificates, monkey
             ("coview/r1/in/odom", b"after"),
         }
         assert spied == []
-        assert not [reply for reply in second._session.get("coview/r1/rpc/reset", timeout=1.0) if reply.ok]
+        assert not [reply for reply in second.session.get("coview/r1/rpc/reset", timeout=1.0) if reply.ok]
 
 
 def put(transport, key, payload):
     """Publish in order with all else of this transport, through a declared publisher and without one."""
     publisher = transport.publisher(key, "data")
     publisher.put(Encoded(payload))
-    transport._session.put(key, payload)
+    transport.session.put(key, payload)
     publisher.close()
 
 
