@@ -1,4 +1,4 @@
-"""Configurations refuse what makes no sense, by name, and the presets are the paper's."""
+"""Configurations refuse what makes no sense, by name; presets and their options."""
 
 import inspect
 from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass
@@ -98,13 +98,6 @@ def test_part_given_as_a_dictionary_is_refused_by_name():
 
 def test_numbers_of_numpy_are_numbers():
     assert MapConfig(voxel=np.float32(0.5), levels=np.True_).voxel == 0.5
-
-
-def test_defaults_are_those_of_the_paper():
-    usual = MapConfig()
-    assert (usual.block, usual.descriptor.radius) == (2.0, 50.0)
-    assert (usual.descriptor.rings, usual.descriptor.sectors) == (20, 60)
-    assert LocalizerConfig().keyframe.distance == 2.0
 
 
 def test_field_in_the_wrong_place_is_named_with_the_right_one():

@@ -84,6 +84,7 @@ def test_silent_robot_is_told_keys_of_other_robots():
     other = robot_keys("native", "coview", "r2")
     found = findings(MemoryTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
     assert [(f.verdict, f.what) for f in found] == [("FAIL", "clouds"), ("FAIL", "odometry"), ("warn", "node")]
+    assert found[0].found.endswith(other.cloud)
     assert found[0].remedy == "clouds come on coview/r1/in/cloud: try --robot r1"
     assert "does the robot publish" in found[1].remedy
 

@@ -6,13 +6,11 @@ import sys
 import numpy as np
 import pytest
 import small_world
-from fake_lidar_odometry import Told, Truth, frame, swept
+from fake_lidar_odometry import Told, frame, swept
 
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CloudError, DependencyError, RunError
 from coview_stream.geometry.transforms import inverse, is_pose, pose_from, rot_z, tilt_of, transform
-from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.state import State
 from coview_stream.odometry.lidar_odometry import LidarOdometry
 
 LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
@@ -222,17 +220,6 @@ def test_shaken_body_is_guessed_upright(scene):
     odometry = stepped(cloud, told, 1, LidarOdometryConfig(gravity="level"))
     odometry.step(shaken, None, 0.1)
     assert np.degrees(np.arccos(told.guesses[1][2, :3] @ up)) < 0.5
-
-
-@pytest.mark.slow
-def test_localizer_tracks_on_lidar_odometry(world_map, world_drive):
-    odometry = LidarOdometry(registration=Truth(world_drive.T_map_body))
-    localizer = Localizer(world_map)
-    for k, cloud in enumerate(world_drive.clouds):
-        T = odometry.step(cloud, None, 0.5 * k)
-        fix = localizer.step(odometry.points, T, 0.5 * k)
-    assert fix.state is State.TRACKING
-    assert small_world.pose_error(fix.T_map_body, world_drive.T_map_body[-1])[0] < 0.1
 
 
 def test_missing_kiss_icp_is_named_with_remedy(monkeypatch):

@@ -50,14 +50,6 @@ def test_grass_lifts_the_ground_and_nothing_falls_below_it() -> None:
     assert np.percentile(grown, 1) > -0.1
 
 
-def test_beams_blur_what_is_seen() -> None:
-    (clean, *_), (blurred, dirt, world, T) = frame(()), frame(("beams",))
-    assert dirt.beams.divergence > 0.0
-    assert len(blurred) > 0.8 * len(clean)
-    ground = above(blurred, world, T)
-    assert np.median(np.abs(ground)) < 0.1
-
-
 def test_drives_with_dirt_have_their_own_random_numbers() -> None:
     dirty = replace(TINY, dirt=TRAINED_DIRT)
     clean, spoilt = (list(submaps(draw_world(SEED, recipe), SEED, recipe)) for recipe in (TINY, dirty))
