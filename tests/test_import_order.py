@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from import_graph import BELOW_ALL, FOLDERS, PACKAGE, PAGE, circles, folder_graph, imports, picture, upward
+from import_graph import BELOW_ALL, FOLDERS, PACKAGE, PAGE, circles, imports, picture, upward
 
 
 def test_folders_are_those_of_the_order() -> None:
@@ -21,10 +21,6 @@ def test_no_import_runs_upward() -> None:
 def test_no_circles_of_files() -> None:
     apex = ("coview_stream", "coview_stream.__main__")  # the package names all that is public
     assert circles({name: found for name, found in imports().items() if name not in apex}) == []
-
-
-def test_no_circles_of_folders() -> None:
-    assert circles(folder_graph()) == []
 
 
 def test_circles_are_found() -> None:

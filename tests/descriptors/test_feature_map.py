@@ -172,13 +172,6 @@ def test_maps_of_earlier_version_can_be_read(world_map):
     assert old.config.learned is False
 
 
-def test_features_of_other_weights_are_refused(built):
-    arrays, parameters = built
-    FeatureMap(arrays, parameters).check()
-    with pytest.raises(MapError, match=r"other weights .* build it again"):
-        FeatureMap(arrays, {**parameters, "weights": "0" * 64}).check()
-
-
 @pytest.mark.parametrize("name", ["local", "sigma", "tiles", "place", "place_at"])
 def test_incomplete_features_are_refused(world_map, built, name):
     arrays = {n: v for n, v in built[0].items() if n != f"learned.{name}"}
