@@ -335,18 +335,6 @@ def test_poses_come_by_async_for_until_none_come(net):
     assert run(drive()) == [1, 2, 3]
 
 
-def test_other_tasks_go_on_while_poses_are_awaited(net):
-    async def drive():
-        async with RobotClient("r1", transport=net) as robot:
-            waiting = asyncio.ensure_future(anext(robot.poses()))
-            await asyncio.sleep(0)
-            assert not waiting.done()
-            publish(net, 7)
-            return (await waiting).stamp_ns
-
-    assert run(drive()) == 7
-
-
 def test_cancelled_reader_takes_no_pose(net):
     async def drive():
         async with RobotClient("r1", transport=net) as robot:

@@ -56,12 +56,12 @@ def endpoint():
 
 
 @contextmanager
-def followed(mirrors, *more):
+def followed(mirrors, *more, take_over=lambda: None):
     """Open the mirrors and follow their sites; yields the follower, and a list that grows by one for each change."""
     for mirror in mirrors:
         mirror.open()
     changes, stopping = [], threading.Event()
-    follower = MapFollower(mirrors, lambda: changes.append(1), *more, period=0.05)
+    follower = MapFollower(mirrors, lambda: changes.append(1) or take_over(), *more, period=0.05)
     thread = threading.Thread(target=follower.run, args=(stopping,))
     thread.start()
     try:
@@ -107,8 +107,7 @@ def test_site_is_fetched_and_its_server_may_go(server, source, site):
 def test_only_the_manifest_and_named_layers_are_given(server, source, site, endpoint):
     (site / "layers" / "secret").write_bytes(b"not for you")
     (site / "secret").write_bytes(b"not for you")
-    session = zenoh.open(compose([endpoint]))
-    try:
+    with zenoh.open(compose([endpoint])) as session:
         for key in (
             "coview/maps/yard/secret", "coview/maps/yard/layers/secret", "coview/maps/yard/layers/" + "0" * 64,
             "coview/maps/yard/layers/*", "coview/maps/other/manifest",
@@ -116,8 +115,6 @@ def test_only_the_manifest_and_named_layers_are_given(server, source, site, endp
             assert [reply for reply in session.get(key, timeout=2.0) if reply.ok] == [], key
         found = [reply.ok for reply in session.get("coview/maps/*/manifest", timeout=2.0)]
         assert [str(each.key_expr) for each in found] == ["coview/maps/yard/manifest"]
-    finally:
-        session.close()
     with pytest.raises(TransportError, match="no map server answers"):
         source.layer("0" * 64, 10)
 
@@ -179,36 +176,18 @@ def test_outage_of_one_site_hides_no_change_of_another(site, tmp_path):
 
 @pytest.mark.parametrize("error", [ValueError("x"), KeyError("x"), RecursionError(), UnicodeError("a..b")])
 def test_follower_survives_any_error_of_a_source_and_of_the_node(site, error):
-    source, failing = Directory(site), [error]
+    def fail():
+        raise error
 
-    def take_over():
-        taken.append(1)
-        if len(taken) == 1:
-            raise error
-
-    taken, good = [], source.manifest
-    mirror = Mirror(source)
-    mirror.open()
-    follower, stopping = MapFollower([mirror], take_over, lambda: "refused", period=0.05), threading.Event()
-    thread = threading.Thread(target=follower.run, args=(stopping,))
-
-    def manifest():
-        if failing:
-            raise error
-        return good()
-
-    source.manifest = manifest
-    thread.start()
-    try:
+    source = Directory(site)
+    good = source.manifest
+    with followed([Mirror(source)], lambda: "refused", take_over=fail) as (follower, changes):
+        source.manifest = fail
         until(lambda: follower.last["error"])
-        failing.clear()
+        source.manifest = good
         until(lambda: follower.last["result"] == "current")
         change(site)
-        until(lambda: len(taken) > 1)
-        assert thread.is_alive()
-    finally:
-        stopping.set()
-        thread.join()
+        until(lambda: len(changes) > 1)
 
 
 def test_source_that_goes_to_and_fro_is_asked_more_seldom(monkeypatch):
@@ -227,14 +206,11 @@ def test_source_that_goes_to_and_fro_is_asked_more_seldom(monkeypatch):
 
 
 def test_refusal_that_is_no_text_is_one_error(endpoint, source):
-    session = zenoh.open(compose((), [endpoint]))
-    queryable = session.declare_queryable("coview/maps/yard/**", lambda query: query.reply_err(b"\xff\xfe"))
-    try:
+    with zenoh.open(compose((), [endpoint])) as session:
+        queryable = session.declare_queryable("coview/maps/yard/**", lambda query: query.reply_err(b"\xff\xfe"))
         with pytest.raises(TransportError, match="yard"):
             source.manifest()
-    finally:
         queryable.undeclare()
-        session.close()
 
 
 def test_tiles_of_a_circle_are_chosen_again_when_the_site_changes(site):

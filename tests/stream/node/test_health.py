@@ -232,23 +232,20 @@ def test_watchdog_is_fed_while_the_node_is_live(manager):
     given = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "40000", "WATCHDOG_PID": str(os.getpid())}
     notifier = Notifier(given)
     assert notifier.watchdog_period == pytest.approx(0.02)
-    stopping, asked, live = threading.Event(), [], [True]
-    thread = threading.Thread(target=notifier.run, args=(stopping, lambda: asked.append(1) or live[0]))
-    thread.start()
-    assert manager.recv(500) == b"WATCHDOG=1"
-    live[0] = False
-    manager.setblocking(False)
-    count = len(asked)
-    until(lambda: len(asked) > count + 1)
-    with contextlib.suppress(BlockingIOError):
-        while True:  # those from before
+    asked, live = [], [True]
+    with running(notifier.run, lambda: asked.append(1) or live[0]):
+        assert manager.recv(500) == b"WATCHDOG=1"
+        live[0] = False
+        manager.setblocking(False)
+        count = len(asked)
+        until(lambda: len(asked) > count + 1)
+        with contextlib.suppress(BlockingIOError):
+            while True:  # those from before
+                manager.recv(500)
+        count = len(asked)
+        until(lambda: len(asked) > count + 3)
+        with pytest.raises(BlockingIOError):
             manager.recv(500)
-    count = len(asked)
-    until(lambda: len(asked) > count + 3)
-    with pytest.raises(BlockingIOError):
-        manager.recv(500)
-    stopping.set()
-    thread.join(10.0)
 
 
 @pytest.mark.parametrize(

@@ -197,22 +197,21 @@ def test_queries_reply_json_and_errors(pair):
 @pytest.mark.slow
 def test_transport_recovers_after_router_is_killed(caplog):
     endpoint = free_endpoint()
-    node = open_transport(connect=[endpoint])  # both before their router
-    robot = open_transport(connect=[endpoint])
     clouds, poses = [], []
-    node.subscribe("r1/in/**", clouds.append, "newest")
-    node.answer("r1/rpc/reset", lambda _: {"ok": True})
-    node.announce("r1/alive")
-    pose = node.publisher("r1/out/pose", "realtime")
-    robot.subscribe("r1/out/pose", poses.append, "all")
-    cloud = robot.publisher("r1/in/cloud", "bulk")
 
     def works():
         cloud.put(Encoded(b"cloud"))
         pose.put(Encoded(b"pose"))
         return bool(clouds and poses and ask(robot, "r1/rpc/reset") and robot.tokens("r1/alive"))
 
-    try:
+    # both before their router
+    with closing(open_transport(connect=[endpoint])) as node, closing(open_transport(connect=[endpoint])) as robot:
+        node.subscribe("r1/in/**", clouds.append, "newest")
+        node.answer("r1/rpc/reset", lambda _: {"ok": True})
+        node.announce("r1/alive")
+        pose = node.publisher("r1/out/pose", "realtime")
+        robot.subscribe("r1/out/pose", poses.append, "all")
+        cloud = robot.publisher("r1/in/cloud", "bulk")
         assert node.connection() == Connection()
         assert any("no router" in record.getMessage() for record in caplog.records)
         for _ in range(3):
@@ -224,9 +223,6 @@ def test_transport_recovers_after_router_is_killed(caplog):
                 until(works)
             until(lambda: node.connection() == robot.connection() == Connection())
         assert b"without reader" not in [sample.payload for sample in poses]
-    finally:
-        node.close()
-        robot.close()
 
 
 @pytest.mark.slow
