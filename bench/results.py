@@ -1,23 +1,24 @@
 """Run benchmarks and write their tables into docs/results.md.
 
 ``python -m bench results [--only NAME...] [--quick]`` replaces only the tables that it runs; every table stands below
-its command, date, machine, the commit and the hash of the code (``+``: with uncommitted changes). Quick runs have
-tables of their own.
+its command, date, machine, the commit (``+``: with uncommitted changes) and two hashes: of the product, and of the
+benchmark with the modules that it imports. Quick runs have tables of their own.
 
-``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one code, for a release. The page is
-its memory: a table that is there, of this code and by the same command, is done, and one that is made goes into it at
-once, so that a release goes on in another DIR, or on another machine, for as long as the code's hash is the same (that
-of ``bench/results.py`` does not count, nor do comments, docstrings and pages; it is one minor version of Python's).
-Remove the file of the kept runs of ``integrity`` when the code has changed. The most valuable tables come first.
-Those without times run side by side, one on each core, the others alone; most keep the results of each drive or site in
-``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in one piece, begins anew). It says
-which tables are missing, and about how long they take. What a table leaves out to be done in time stands behind
-``thinned``. Once all are of one code, older tables are removed; those that no command makes are kept below the others.
-A quick release has its page in DIR.
+``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one product, for a release. The page
+is its memory: a table that is there, of both hashes and by the same command, is done, and one that is made goes into it
+at once. So a release continues in another DIR or on another machine while the product's hash is the same (comments,
+docstrings and layout do not count; it is one minor version of Python's), and a mended benchmark repeats only its own
+tables. Remove the file of the kept runs of ``integrity`` when the product has changed. The most valuable tables come
+first. Those without times run side by side, one on each core, the others alone; most keep the results of each drive or
+site in ``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in one piece, starts again). It
+says which tables are missing, and about how long they take. What a table leaves out to be done in time stands behind
+``thinned``. Once all are there, older tables are removed; those that no command makes are kept below the others. A
+quick release has its page in DIR.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import itertools
 import json
@@ -36,7 +37,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.__main__ import BUSY, parser_of, tables_of
+from bench.__main__ import BENCHMARKS, BUSY, parser_of, tables_of
 from bench.harness.files import ROOT, commit, data, environment, fingerprint
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
@@ -97,8 +98,8 @@ TABLES = {
         "ablation --only spacing --picture docs/images/spacing.png", 5, False, "ablation --only spacing --sites kitti04"
     ),
     **{
-        f"ablation, {group}": Table(f"ablation --only {group}", 8, True, f"ablation --only {group} --sites kitti04")
-        for group in ("channels", "localizer", "elsewhere")
+        f"ablation, {group}": Table(f"ablation --only {group}", 8, True, f"ablation --only {group} --sites {few}")
+        for group, few in {"channels": "kitti04", "localizer": "kitti04", "elsewhere": "kitti04 handheld_livox"}.items()
     },
     "changed ground": Table("ground", 15, True),
     "overlap": Table(
@@ -184,7 +185,7 @@ def _kill(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGKILL
 def measured(command: str, threads: int | None, children: Children) -> str:
     """Run a benchmark in a process of its own; return its tables, then its targets or all rows, without padding.
 
-    Empty if it failed, or was told to end.
+    Empty if a part of it failed, or it was told to end.
     """
     name, *words = command.split()
     with tempfile.TemporaryDirectory() as folder:
@@ -193,6 +194,9 @@ def measured(command: str, threads: int | None, children: Children) -> str:
         if children.run(line, threads) not in (0, 1) or not file.is_file():
             return ""
         rows = [Row.from_dict(values) for values in json.loads(file.read_text())]
+    if broken := [row.name for row in rows if row.target == "runs"]:
+        print(f"=== {command}: {'; '.join(broken)}", file=sys.stderr, flush=True)
+        return ""
     own = tables_of(name, rows, parser_of(name).parse_args(words))
     parts = [f"{title}\n\n{text}".strip() for title, text in own.items()]
     shown = [row for row in rows if row.target or not own]
@@ -261,7 +265,7 @@ def _part(name: str, asked: Namespace, threads: int | None, children: Children) 
     """Measure a table; return its part of the page, empty if it failed."""
     of, command = TABLES[name], _command(name, asked)
     print(f"=== {command}", file=sys.stderr, flush=True)
-    load, begin, version = os.getloadavg()[0], time.monotonic(), f"{commit()}, code {_code()}"
+    load, begin, version = os.getloadavg()[0], time.monotonic(), f"{commit()}, {_made_by(name)}"
     text = measured(command, threads, children)
     took = (time.monotonic() - begin) / 60
     print(f"=== {command}: {took:.1f} min{'' if text else ', FAILED'}", file=sys.stderr, flush=True)
@@ -291,7 +295,7 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
 
     if not any(data().glob("surveys/*.laz")):
         print(f"bench release: no surveys in {data()} (COVIEW_DATA): all sites are simulated", file=sys.stderr)
-    left = [name for name in names if name not in done(text_of(asked.page), code, asked)]
+    left = [name for name in names if name not in done(text_of(asked.page), asked)]
     print(f"code {code}: {len(left)} of {len(names)} tables to make{_about(left, asked)}", file=sys.stderr, flush=True)
     for beside, some in itertools.groupby(left, lambda name: TABLES[name].beside):
         with ThreadPoolExecutor(max(1, asked.jobs) if beside else 1) as pool:
@@ -305,7 +309,7 @@ def _release(asked: Namespace, names: Sequence[str]) -> int:
         print("bench release: the code changed meanwhile; begin again", file=sys.stderr)
         return 2
     page = text_of(asked.page)
-    there, parts = done(page, code, asked), parts_of(page)
+    there, parts = done(page, asked), parts_of(page)
     missing = [
         f"{name} (of other code)" if _title(name, asked) in parts else name for name in TABLES if name not in there
     ]
@@ -322,19 +326,19 @@ def parts_of(page: str) -> dict[str, str]:
     return {part[1]: part[0] for part in found}
 
 
-def done(page: str, code: str, asked: Namespace) -> dict[str, str]:
+def done(page: str, asked: Namespace) -> dict[str, str]:
     """Return the tables of a page that their commands of today have made of a code, by name."""
     parts = {name: parts_of(page).get(_title(name, asked), "") for name in TABLES}
     return {
         name: part for name, part in parts.items()
-        if re.search(rf"\n`python -m bench {re.escape(_command(name, asked))}`, .*, code {code}, ", part)
+        if re.search(rf"\n`python -m bench {re.escape(_command(name, asked))}`, .*, {_made_by(name)}, ", part)
     }  # fmt: skip
 
 
 def counted(page: str, code: str, asked: Namespace) -> str:
     """Return the page with a line above its tables that says how many of them are of a code."""
     head = re.sub(r"\n\d+ of \d+ tables are of code \w+\.\n", "", introduction(page)).rstrip()
-    line = f"\n\n{len(done(page, code, asked))} of {len(TABLES)} tables are of code {code}.\n"
+    line = f"\n\n{len(done(page, asked))} of {len(TABLES)} tables are of code {code}.\n"
     return head + line + page.removeprefix(introduction(page))
 
 
@@ -342,7 +346,7 @@ def _about(names: Sequence[str], asked: Namespace) -> str:
     """Say how long tables will take, as those of the page took, or else as :data:`TABLES` says."""
     parts, hours = parts_of(text_of(asked.page)), 0.0
     for name in names:
-        took = re.search(r", code \w+, ([\d.]+) min", parts.get(_title(name, asked), ""))
+        took = re.search(r", code \w+, bench \w+, ([\d.]+) min", parts.get(_title(name, asked), ""))
         minutes = float(took[1]) if took else 0.5 if asked.quick else TABLES[name].minutes
         hours += minutes / 60 / (asked.jobs if TABLES[name].beside else 1)
     return f", about {hours:.1f} h"
@@ -365,6 +369,22 @@ def introduction(page: str) -> str:
 
 
 def _code() -> str:
-    """Short hash of the product, the kernels and the benchmarks; this file only says by which commands."""
-    parts = (path.relative_to(ROOT) for path in sorted((ROOT / "bench").iterdir()) if path.name != "results.py")
-    return fingerprint("coview_stream", "coview_kernels", *map(str, parts))
+    """Short hash of the product and the kernels."""
+    return fingerprint()
+
+
+def _made_by(name: str) -> str:
+    """Name the code of a table: the product's hash, and that of the benchmark's modules with all that they import."""
+    files: list[Path] = []
+
+    def add(module: str) -> None:
+        file = ROOT / f"{module.replace('.', '/')}.py"
+        if file.is_file() and file not in files:
+            files.append(file)
+            for node in ast.walk(ast.parse(file.read_bytes())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bench"):
+                    for part in ("", *(f".{alias.name}" for alias in node.names)):
+                        add(f"{node.module}{part}")
+
+    add(f"bench.{BENCHMARKS[TABLES[name].command.split()[0]].module}")
+    return f"code {_code()}, bench {fingerprint(*sorted(str(file.relative_to(ROOT)) for file in files))}"

@@ -128,7 +128,7 @@ def sites(names: Sequence[str], data: Path) -> dict[str, Path]:
 def _simulated(below: Path, changes: Mapping[str, Any]) -> Path:
     with patch.dict(KINDS, {"rows": _ROWS}):
         dirt = parse_dirt(changes.get("dirt", ""))
-        config = SimulationConfig(**_WORLD | changes | {"dirt": dirt})
+        config = SimulationConfig(**{**_WORLD, **changes, "dirt": dirt})
         return prepare(below / "ablation", config)
 
 
@@ -200,7 +200,7 @@ def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) 
     """Row of a choice of the search over all sites: shares of keyframes; of each site that of the best place."""
 
     def share(key: str, of: str, some: Sequence[Mapping[str, Any]]) -> float:
-        return sum(each[key] for each in some) / max(1.0, sum(each[of] for each in some))
+        return float(sum(each[key] for each in some) / max(1.0, sum(each[of] for each in some)))
 
     every = list(by_site.values())
     details: dict[str, Any] = {
@@ -260,7 +260,10 @@ def options(parser: ArgumentParser) -> None:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Yield a row per variant."""
-    chosen = {group: tuple(asked.sites or SITES[group])[: 1 if asked.quick else None] for group in asked.only}
+    some = {group: 2 if group == "elsewhere" else 1 for group in asked.only}  # the other site's map is elsewhere
+    chosen = {group: tuple(asked.sites or SITES[group])[: some[group] if asked.quick else None] for group in some}
+    if len(chosen.get("elsewhere", "ab")) < 2:
+        raise InputError("--sites: the group elsewhere takes maps of other sites: name two or more")
     places = sites(list(dict.fromkeys(name for names in chosen.values() for name in names)), asked.data)
     files = (f"bench/accuracy/{part}.py" for part in ("ablation", "choices", "paper"))
     code = {"code": fingerprint(), "bench": fingerprint(*files)}

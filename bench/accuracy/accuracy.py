@@ -143,12 +143,13 @@ def figures(run: Run) -> Run:
     world, frames = run["run"], run.get("frames")
     means = [(run.get(key) or {}).get("mean") for key in ("translation", "rotation")]
     known: Run = dict.fromkeys(key for _, key, digits in COLUMNS if digits is not None)
-    return known | world | run | {
+    made: Run = known | world | run | {
         "name": run["name"] + "!" * ("error" in run), "changed": f"{world['changed']:.0%}",
         "utm": "yes" if any(world["origin"]) else "no", "map_mpts": run.get("map_points", np.nan) / 1e6,
         "success": "yes" if run["success"] else "NO", "share": 100 * run["posed"] / frames if frames else None,
         "e_t": means[0], "e_r": means[1],
     }  # fmt: skip
+    return made
 
 
 def verdicts(runs: Sequence[Run]) -> Iterator[Row]:

@@ -24,10 +24,10 @@ from bench.accuracy.scores import FALSE_DEGREES, FALSE_METRES, Track, errors
 from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged, listed
 from coview_stream import BaseMap, Localizer
-from coview_stream.basemap.ground import ground_mask
+from coview_stream.basemap.ground import Method, ground_mask
 from coview_stream.clouds import read_cloud, write_cloud
 from coview_stream.errors import InputError
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Poses
 from coview_stream.sim import SimulationConfig
 from coview_stream.sim.dirt.scene import drawn_parts
@@ -37,12 +37,12 @@ from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 from coview_stream.sim.simulate import base_map, frames, scene_of, trajectories
 
-METHODS = ("cloth", "morphological")
+METHODS: tuple[Method, ...] = ("cloth", "morphological")
 _GROUND_CLASS = 2
 _GONE = 0.25  # share of the buildings that are gone, and of those that are new
 _SITES = (("town", "vlp16"), ("campus", "mid360"), ("village", "os64"), ("industrial", "vlp16"))
 
-Change = Callable[[Floats, Floats, Floats], Floats]
+Change = Callable[..., Floats]
 """x, y (N,) and the drive's places (M, 2) -> metres by which the ground has risen (N,)."""
 
 
@@ -134,7 +134,7 @@ def _site(config: SimulationConfig) -> tuple[BaseMap, Scene, Poses, Any]:
     return site, scene, level, replace(now, built=_without(now.built, scene, gone))
 
 
-def _without(built: Sequence[Any], scene: Scene, houses: Sequence[int]) -> tuple[Any, ...]:
+def _without(built: Sequence[Any], scene: Scene, houses: Ints) -> tuple[Any, ...]:
     left = list(built)
     for house in houses:
         left[scene.houses[house]] = EMPTY
@@ -153,7 +153,7 @@ def _drive(config: SimulationConfig, case: str, of: Callable[[], tuple[BaseMap, 
     localizer, fixes = Localizer(site), []
     for k, points in enumerate(frames(scene, config, truth)):
         fixes.append(localizer.step(points, odometry[k], FRAME_PERIOD * k))
-    track = Track.of(fixes, FRAME_PERIOD * np.arange(len(fixes)))
+    track = Track.of(fixes, FRAME_PERIOD * np.arange(len(fixes), dtype=np.float64))
     posed = track.tracking
     if not posed.any():
         return dict.fromkeys(("posed", "false", "beyond in the plane", "beyond in height"), 0) | dict.fromkeys(

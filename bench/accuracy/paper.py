@@ -117,7 +117,7 @@ class Reference:
         chosen = np.array(base_map.stations) if stations is None else stations
         self.stations = chosen.astype(np.float64)
         described = describe_storeys(self.points, chosen, block, self.config)
-        descriptors = np.float32(described[self.config.channels[0]])
+        descriptors = np.asarray(described[self.config.channels[0]], dtype=np.float32)
         self.keys = cKDTree(ring_key(descriptors))
         self.columns = unit_columns(descriptors)
 

@@ -51,7 +51,7 @@ class Feed:
         """The frames from the fault on."""
         return np.arange(self.begins, len(self))
 
-    def changed(self, change: Callable[[int, Points], Points]) -> Feed:
+    def changed(self, change: Callable[[int, Points], Points | Floats]) -> Feed:
         """Return it with other clouds from the fault on: ``change`` gets the frame's number and its cloud."""
         kept = list(self.clouds[: self.begins])
         return replace(self, clouds=kept + [_cloud(change(int(k), self.clouds[k])) for k in self.later])
@@ -98,7 +98,7 @@ class Feed:
         return replace(self, odometry=odometry)
 
 
-def _cloud(points: Points) -> Points:
+def _cloud(points: Points | Floats) -> Points:
     return np.ascontiguousarray(points, dtype=np.float32)
 
 
@@ -230,7 +230,7 @@ def _standing(feed: Feed, rng: np.random.Generator) -> Feed:
 # ---- bad input, from the first frame on
 
 
-def _axes(feed: Feed, rng: np.random.Generator, matrix: Sequence[Sequence[float]]) -> Feed:
+def _axes(feed: Feed, rng: np.random.Generator, matrix: Sequence[Sequence[float]] | Floats) -> Feed:
     M = np.array(matrix)
     return replace(feed, begins=0).changed(lambda k, points: points @ M.T)
 

@@ -125,9 +125,9 @@ def scored(fault: Fault, feed: Feed, site: BaseMap) -> dict[str, Any]:
             new = (clause for clause in said if _without_numbers(clause) not in before)
             named = next(((k, clause) for clause in new if re.search(fault.named, clause)), None)
     track = Track.of(fixes, feed.stamps)
-    error, known = errors(track, feed.truth), track.tracking
-    false = known & ((error.metres > FALSE_METRES) | (error.degrees > FALSE_DEGREES))
-    over = known & ((error.metres > track.levels[:, 0]) | (error.degrees > track.levels[:, 1]))
+    off, known = errors(track, feed.truth), track.tracking
+    false = known & ((off.metres > FALSE_METRES) | (off.degrees > FALSE_DEGREES))
+    over = known & ((off.metres > track.levels[:, 0]) | (off.degrees > track.levels[:, 1]))
     since, metres = feed.clock - feed.clock[feed.begins], feed.way - feed.way[feed.begins]
     after = known.copy()
     after[: feed.begins] = False
@@ -137,8 +137,8 @@ def scored(fault: Fault, feed: Feed, site: BaseMap) -> dict[str, Any]:
         "posed_after": int(after.sum()), "frames_after": len(feed) - feed.begins,
         "first_fix_m": float(feed.way[known.argmax()]) if known.any() else None,
         "false": int(false.sum()), "over": int(over.sum()),
-        "worst_m": float(error.metres[known].max()) if known.any() else None,
-        "worst_deg": float(error.degrees[known].max()) if known.any() else None,
+        "worst_m": float(off.metres[known].max()) if known.any() else None,
+        "worst_deg": float(off.degrees[known].max()) if known.any() else None,
         "goes_on": last is not None and bool(since[-1] - since[last] < 1.0),
         "last_s": None if last is None else float(since[last]), "last_m": None if last is None else float(metres[last]),
         "named_s": None if named is None else float(since[named[0]]),

@@ -114,10 +114,9 @@ class Chain:
     """Evidence, registration, verification and decision of one keyframe, as in a search."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
-        """Register with the search's own method."""
-        registration = replace(config.registration, method="trimmed-icp")
-        self.config = replace(config, registration=registration)
-        self._base_map, self._local_maps = base_map, LocalMaps(base_map, registration.source_range)
+        """Register with the search's own configuration."""
+        self.config = config
+        self._base_map, self._local_maps = base_map, LocalMaps(base_map, config.registration.source_range)
 
     def scan(self, query: SearchRequest) -> ObservedScan:
         """Return what of a query is registered."""

@@ -47,7 +47,9 @@ _ODD: dict[str, tuple[Any, ...]] = {
     "i": (0, -1, 1, 127, -128, 32767, -32768, 2**31 - 1, -(2**31), 2**40, -(2**63)),
     "u": (0, 1, 255, 65535),
 }
-_NUMBERS = (0, -1, 1, 2, 3, 4096, 1 << 20, 1 << 31, 1 << 40, 0.001, 0.5, 1e9, 1e300, True, None, "x", "\ud800", [], {})
+_NUMBERS: tuple[Any, ...] = (  # of JSON
+    0, -1, 1, 2, 3, 4096, 1 << 20, 1 << 31, 1 << 40, 0.001, 0.5, 1e9, 1e300, True, None, "x", "\ud800", [], {},
+)  # fmt: skip
 
 
 def _points() -> npt.NDArray[np.float32]:
@@ -58,7 +60,7 @@ def _points() -> npt.NDArray[np.float32]:
         np.c_[np.full(1000, -6.0), rng.uniform(-8, 4, 1000), rng.uniform(0, 7, 1000)],
         np.c_[rng.uniform(2, 5, (600, 2)), np.full(600, 3.0)],
     ]
-    return np.concatenate([ground, *walls]).astype(np.float32)
+    return np.asarray(np.concatenate([ground, *walls]), dtype=np.float32)
 
 
 @functools.cache
@@ -291,7 +293,7 @@ class _Endpoints(SimpleNamespace):
         self.serving = False
 
 
-def _endpoints() -> _Endpoints:
+def _endpoints() -> Any:
     session = SimpleNamespace(
         site_sha256="ab" * 32, offer=lambda place: True, reset=lambda forget: None,
         last_place=lambda: LastPlace("ab" * 32, T_map_odom=np.eye(4)),

@@ -107,6 +107,7 @@ class Refined(KissMatcher):
     def answer(self, place: Place) -> Answer:
         """Match, then register."""
         coarse = super().answer(place)
+        assert coarse.T_map_submap is not None
         found = self._fine.align(self._fine.prepared(place.submap, 0.5)[0], coarse.T_map_submap)
         return Answer(np.array(found.T_target_source), coarse.vouched)
 
@@ -242,7 +243,7 @@ class Trial:
 
     def false_accepts(self) -> int:
         """Count answers that the peer vouches for and that are wrong."""
-        return sum(a["vouched"] for a in self.answers) - len(self.right())
+        return sum(bool(a["vouched"]) for a in self.answers) - len(self.right())
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the table; counts are of the queries that were answered in time."""
@@ -394,7 +395,7 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Compare ours with every peer: share of right poses, time of a query, false accepts."""
     if asked.trial:
-        yield from _asked(*asked.trial, asked.limit)
+        yield from _asked(asked.trial[0], asked.trial[1], asked.trial[2], asked.limit)
         return
     there = [*WORLDS, *(name for name in SETS if (asked.data / name).exists())]
     scenes = {name: ground_of(name, asked.data) for name in asked.worlds or (there[-1:] if asked.quick else there)}

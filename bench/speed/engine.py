@@ -19,6 +19,7 @@ import threading
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def throughput(count: int, lidars: Sequence[str]) -> Iterator[Row]:
         frames, stranger = [run.read(index) for index in range(len(run))], worlds[k - 1][0]
         fix, steps = bare(base_map, frames, count, State.TRACKING)
         _, searches = bare(stranger, frames[::_STRIDE], count // 4, State.SEARCHING)
-        figures = {"sensor": sensor, "points": float(np.mean([len(frame.points) for frame in frames]))}
+        figures: dict[str, Any] = {"sensor": sensor, "points": float(np.mean([len(frame.points) for frame in frames]))}
         figures |= {f"bare, tracking, {name}": value for name, value in spread(steps).items()}
         figures |= {f"bare, searching, {name}": value for name, value in spread(searches).items()}
         for doing, site in (("tracking", base_map), ("searching", stranger)):

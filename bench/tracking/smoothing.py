@@ -151,7 +151,7 @@ def _levels(poses: Sequence[SmoothedPose | Fix | None]) -> Floats:
 
 def _errors(poses: Floats, truth: Floats) -> Floats:
     """Errors (N, 2), metres and degrees; NaN without a pose."""
-    found = errors(Track.of_poses(np.arange(len(truth)), poses), truth)
+    found = errors(Track.of_poses(np.arange(len(truth), dtype=np.float64), poses), truth)
     return np.column_stack([found.metres, found.degrees])
 
 

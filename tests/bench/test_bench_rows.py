@@ -6,6 +6,7 @@ import re
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -110,7 +111,9 @@ def test_only_tables_that_were_run_change_the_page():
 @pytest.fixture
 def two_tables(monkeypatch, tmp_path):
     """A release of two tables, whose code and measured texts the test sets."""
-    said = SimpleNamespace(code="1", ran=[], texts={"a": "of a", "b": "of b"}, page=tmp_path / "page.md")
+    said = SimpleNamespace(
+        code="1", bench={"a": "3", "b": "4"}, ran=[], texts={"a": "of a", "b": "of b"}, page=tmp_path / "page.md"
+    )
 
     def measured(command, threads, children):
         said.ran.append((command, threads))
@@ -119,7 +122,13 @@ def two_tables(monkeypatch, tmp_path):
     monkeypatch.setattr(
         results, "TABLES", {"a": results.Table("a", 60, thinned="half"), "b, c": results.Table("b", 6, True)}
     )
-    monkeypatch.setattr(results, "fingerprint", lambda *parts: said.code)
+    for name, module in {"a": "speed.search", "b": "speed.start"}.items():
+        monkeypatch.setitem(results.BENCHMARKS, name, Benchmark(module, ""))
+
+    def fingerprint(*parts):
+        return said.bench["a" if "bench/speed/search.py" in parts else "b"] if parts else said.code
+
+    monkeypatch.setattr(results, "fingerprint", fingerprint)
     monkeypatch.setattr(results, "measured", measured)
     said.release = lambda work="one", *more: results.main(
         ["--work", str(tmp_path / work), "--page", str(said.page), "--jobs", "1", *more], release=True
@@ -147,7 +156,7 @@ def test_a_release_goes_on_from_its_page_in_any_folder_and_removes_older_tables_
     assert page.startswith("# Mine\n\n2 of 2 tables are of code 1.\n\n<!-- results: a -->")
     assert page.endswith(parts[-1])
     assert page.count("kept of") == 1
-    assert ", code 1, 0.0 min; thinned: half\n\nof a\n" in page
+    assert ", code 1, bench 3, 0.0 min; thinned: half\n\nof a\n" in page
     assert two_tables.release("third") == 0
     assert two_tables.page.read_text() == page
     two_tables.code = "2"
@@ -157,6 +166,24 @@ def test_a_release_goes_on_from_its_page_in_any_folder_and_removes_older_tables_
     results.TABLES["b, c"] = results.Table("a", 6)  # another command: the table on the page is not it
     assert two_tables.release() == 0
     assert two_tables.ran[5:] == [("a", None)]
+    two_tables.bench["b"] = "5"  # of neither
+    assert two_tables.release() == 0
+    two_tables.bench["a"] = "6"  # of both
+    assert two_tables.release() == 0
+    assert two_tables.ran[6:] == [("a", None), ("a", None)]
+
+
+def test_a_benchmark_of_which_a_part_failed_makes_no_table(capsys):
+    class Broken:
+        """A child process that writes a figure, and a row of a world that ended in an exception."""
+
+        def run(self, line, threads):
+            rows = [informs("search/town", 3, "ms"), failed("search/campus", "TypeError: no argument")]
+            Path(line[-1]).write_text(json.dumps([row.to_dict() for row in rows]))
+            return 1
+
+    assert results.measured("search", 1, Broken()) == ""
+    assert "search/campus: TypeError: no argument" in capsys.readouterr().err
 
 
 def test_a_release_refuses_two_codes_and_goes_on_after_a_table_that_fails(two_tables, capsys):
