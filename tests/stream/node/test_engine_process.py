@@ -114,14 +114,6 @@ def test_child_without_a_map_ends_when_it_is_closed(engine, adopted):
 
 
 @pytest.mark.slow
-def test_child_ends_with_its_parent():
-    code = "from coview_stream.stream.node.engine_process import EngineChild; print(EngineChild('track').process.pid)"
-    paths = os.pathsep.join(p for p in sys.path if p)
-    pid = int(subprocess.check_output([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths}))
-    until(lambda: not alive(pid), 30.0)
-
-
-@pytest.mark.slow
 def test_hung_worker_is_killed_during_send(engine, world_file, world_drive):
     process = engine("track", world_file, job_timeout=30.0)
     good = job(world_drive.clouds[0])

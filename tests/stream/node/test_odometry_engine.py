@@ -9,7 +9,7 @@ import small_world
 from fake_lidar_odometry import Told, swept
 
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import CloudError, DependencyError, RunError
+from coview_stream.errors import DependencyError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.stream.node.engine_queue import FrameJob, OdometryJob
 from coview_stream.stream.node.engines import OdometryEngine, open_engine
@@ -59,14 +59,6 @@ def test_odometry_restart_is_reported(cloud, bring_about):
     assert not engine.run(job(cloud, stamp + 0.1, epoch=again[bring_about].epoch)).restarted
 
 
-def test_implausible_motion_restarts_odometry(cloud):
-    engine = engine_of(np.eye(4), moved(40.0), moved(0.1), moved(0.2))
-    engine.run(job(cloud, 0.0))
-    with pytest.raises(CloudError, match="lost its way"):
-        engine.run(job(cloud, 0.1))
-    assert [engine.run(job(cloud, 0.1 * k)).restarted for k in (2, 3)] == [True, False]
-
-
 def test_frames_come_back_deskewed(cloud):
     step = moved(1.0, 0.05)
     engine = engine_of(np.eye(4), step, step @ step)
@@ -79,15 +71,9 @@ def test_frames_come_back_deskewed(cloud):
     assert np.allclose(inverse(step @ step) @ result.T_odom_body, np.eye(4))
 
 
-def test_invalid_frames_and_jobs_are_refused(cloud):
-    engine = engine_of()
-    with pytest.raises(CloudError, match="is the sensor covered"):
-        engine.run(job(cloud[:9], 0.0))
-    engine.run(job(cloud, 0.1))
-    with pytest.raises(RunError, match="does not come after"):
-        engine.run(job(cloud, 0.1))
+def test_job_of_another_engine_is_refused(cloud):
     with pytest.raises(TypeError, match="FrameJob"):
-        engine.run(FrameJob("r1", 1, 0, cloud, np.eye(4)))
+        engine_of().run(FrameJob("r1", 1, 0, cloud, np.eye(4)))
 
 
 def test_odometry_engine_needs_kiss_icp_but_no_map(monkeypatch):
