@@ -191,9 +191,10 @@ def transforms(tmp_path_factory):
     return TFMessage
 
 
-def test_body_that_odometry_does_not_name_is_that_of_tf_static():
+def test_cloud_waits_for_odometry_and_the_body_that_it_does_not_name_is_that_of_tf_static():
     robot, T_body_lidar = ros2_transport._Robot(KEYS, "", True), pose_from(rot_z(0.3), [0.2, 0.0, 0.5])
     seen = Sample(KEYS.cloud, ros2.encode_cloud(CloudMessage(ns(0.0), POINTS), "velodyne").payload)
+    assert "before the first odometry" in robot.check_cloud(seen).refused
     robot.odometry_ns = 0
     assert robot.check_cloud(seen).mount is None  # taken for one
     robot.frames.add(ros2_outputs.encode_transform(T_body_lidar, 0, "base_link", "velodyne"), static=True)
@@ -299,26 +300,6 @@ def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog)
     assert robot.values()["malformed"] == "4"
     assert robot.level() == b"\1"
     assert not robot.poses
-
-
-@pytest.mark.slow
-def test_cloud_before_the_first_odometry_is_refused(robot):
-    samples = []
-    with closing(Ros2Transport(start_node(()), [KEYS])) as net:
-        for key in (KEYS.cloud, KEYS.odometry):
-            net.subscribe(key, samples.append, "all")
-        robot.until(lambda: robot.clouds.get_subscription_count() and robot.odometry.get_subscription_count())
-
-        def heard(move):
-            if move:
-                robot.move(ns(0.0), message(0.0).T_odom_body)
-            robot.clouds.publish(cloud_message(ns(0.0), POINTS))
-            time.sleep(0.02)
-            return [sample.refused for sample in samples if sample.key == KEYS.cloud]
-
-        robot.until(lambda: heard(move=False))
-        assert all("before the first odometry" in reason for reason in heard(move=False))
-        robot.until(lambda: not heard(move=True)[-1])
 
 
 @pytest.mark.slow
